@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
-from calib_ros.errors import TooFewFeaturesError
-from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, p_value
+from calib_ros.datasets.positions import spread_positions
+from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.registration.acceptance.significance import LOWEST_DECOY_Z, p_value
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance
@@ -22,31 +23,23 @@ from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
-from calib_ros.registration.search.search import search_decoy
+from calib_ros.registration.search.search import search, search_decoy
 from calib_ros.result import CONVERGED, Evidence, Result
 from calib_ros_check.cameras import AsTaken, CameraGuess, camera_guesses, turned_over
-from calib_ros_check.candidate import Candidate, fit
+from calib_ros_check.candidate import Candidate, H, fit
 from calib_ros_check.causes import MIXED_UP, OFF, OTHER_FITS, distorts, instead, lens_findings, not_mixed_up, of_cameras
-from calib_ros_check.hypotheses import (
-    SLACK,
-    MixUp,
-    hypotheses,
-    of_pictures,
-    predicted,
-    says_more_than,
-    simplest,
-    upside_down,
-)
-from calib_ros_check.outcome import Cause, CauseFinding, Tolerance
-from calib_ros_check.sensors import LensFit, fit_lens, judged, lenses
+from calib_ros_check.evidence import EVEN, GivenMatch, convinces, evidence, log_odds, rare_odds
+from calib_ros_check.hypotheses import MixUp, hypotheses, of_pictures, says_more_than, simplest, upside_down
+from calib_ros_check.outcome import CauseFinding, Tolerance
+from calib_ros_check.sensors import LensChange, LensFit, fit_lens, judged, lenses
 
-Classified = Callable[[], Sequence[FrameFeatures]]
+Classified = Callable[[Sequence[int]], Sequence[FrameFeatures]]  # of the frames with these numbers
 NEAR_DEG, NEAR_M = 5.0, 0.5  # where mounts slip and hands miss
 NEAR = SearchBox(NEAR_DEG, NEAR_M)
-NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
+NOT_JUDGED = "one scene does not tell, nor do unrolled pictures of wide lenses"
 LENS, MIX_UPS = "intrinsics", "causes"  # stages that progress tells of, besides those of an estimate
-OF_PICTURES = {Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE}
 CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
+FEW_FRAMES = 3  # tell which camera may have taken the pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +61,22 @@ class CheckInputs:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What the scenes show. T: (4, 4), the extrinsic; covariance: (6, 6) of a left twist. T_corrected: the extrinsic that was
-    checked, with what was mixed up put right. result: of the estimate."""
+    """What the scenes show. T: (4, 4), the extrinsic, an optimum of the score; covariance: (6, 6) of a left twist; shared: the
+    part of it that intrinsics and clocks leave open. T_corrected: the extrinsic that was checked, with what was mixed up put
+    right. result: of the estimate."""
 
+    score: PointScore
     T: Transform
     covariance: Covariance
     T_corrected: Transform
     result: Result
     causes: tuple[CauseFinding, ...] = ()
+    shared: Covariance | None = None
+
+    @property
+    def own_covariance(self) -> Covariance:
+        """What the scenes tell with these intrinsics and clocks."""
+        return self.covariance if self.shared is None else self.covariance - self.shared
 
 
 class Alternatives:
@@ -89,68 +90,104 @@ class Alternatives:
         self.config = calibrator.config
 
     def cameras(
-        self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], inputs: CheckInputs, offset_s: float = 0.0
+        self,
+        guesses: Iterable[CameraGuess],
+        starts: Sequence[Matrix],
+        inputs: CheckInputs,
+        offset_s: float = 0.0,
+        frames: Sequence[int] | None = None,
     ) -> Iterator[Candidate[CameraGuess]]:
-        """The matches of other cameras near any of the starts (4, 4), one after the other; none without the pictures. offset_s:
-        of the clocks, as found."""
+        """The matches of other cameras near any of the starts (4, 4), one after the other; none without the pictures. Guesses
+        with which no picture can be rectified are left out. offset_s: of the clocks, as found. frames: None = all."""
         if inputs.as_taken is None:
             return
         for guess in guesses:
-            with suppress(TooFewFeaturesError):
-                features = inputs.as_taken(guess.camera)
+            with suppress(TooFewFeaturesError, BadInputError):
+                features = inputs.as_taken(guess.camera, frames)
                 if offset_s:
                     features = [at_time_offset(f, offset_s) for f in features]
                 own = starts if guess.start is None else (guess.start,)
                 yield max((fit(guess, self.score(features, T), T) for T in own), key=_z_score)
 
+    def as_given(self, features: Sequence[FrameFeatures], T: Transform, optima: Sequence[Matrix]) -> GivenMatch | None:
+        """The best match of the sensors as they are given: the optimum near T (4, 4), as of every hypothesis, or one of the
+        optima that were met, beyond chance or not. None if all of them see too few points."""
+        matches: list[GivenMatch] = []
+        atlas: Atlas | None = None
+        for start in (T, *optima):
+            with suppress(TooFewFeaturesError):
+                score = self.score(features, start, atlas)
+                atlas = score.atlas
+                end = fit(LensChange(), score, start).T if start is T else start
+                matches.append(GivenMatch(score, end))
+        return max(matches, key=evidence, default=None)
+
     def mixed_up(
-        self, features: Sequence[FrameFeatures], inputs: CheckInputs, tried: Sequence[Candidate[MixUp]]
+        self,
+        features: Sequence[FrameFeatures],
+        inputs: CheckInputs,
+        tried: Sequence[Candidate[MixUp]],
+        given: GivenMatch | None,
     ) -> Explanation | None:
-        """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance. tried:
-        all hypotheses about these features, see `hypotheses`."""
-        sure = bool(tried) and tried[0].z_score >= UNDOUBTED_Z
-        lens = None if sure else self._other_lens(features, inputs)
-        for one in tried[:CONFIRMED]:
-            if lens is not None and lens.z_score >= one.z_score:
+        """The explanation by something that was mixed up, if one matches beyond chance, and convinces against the extrinsic being
+        off. tried: all hypotheses about these features, see `hypotheses`. given: see `as_given`."""
+        for best in tried[:CONFIRMED]:
+            if not self._beyond_chance(best, len(tried)):
                 break
-            if self._beyond_chance(one, len(tried)):
-                return _explained(simplest(one, tried), features, inputs)
-        changes = list(lenses(features[0].camera, wide=True))
-        if lens is not None and self._beyond_chance(lens, len(tried) + len(changes)):
+            for one in (simplest(best, tried), best):
+                odds = EVEN if _is_only_off(one, inputs) else rare_odds(len(tried))
+                if self._stands(found := self._searched(one), given, len(tried), odds):
+                    return _explained(found, features, inputs)
+        return None
+
+    def _stands(self, candidate: Candidate[Any], given: GivenMatch | None, tried: int, odds: float) -> bool:
+        """Does one of so many that were tried match beyond chance, and convince against the sensors as they are given, at these
+        odds in advance?"""
+        return self._beyond_chance(candidate, tried) and convinces(log_odds(candidate, given), odds)
+
+    def _searched(self, candidate: Candidate[H]) -> Candidate[H]:
+        """The same at the best optimum that one round of a search near it finds: the sensors as given are searched as well."""
+        box, limits = SearchBox(NEAR_DEG, NEAR_M, rounds=1), unlimited(candidate.T)
+        T = search(candidate.score, candidate.T, box, self.config.search, limits, self.config.refine.max_p_value).T
+        other = replace(candidate, T=T)
+        return max(candidate, other, key=evidence)
+
+    def another_camera(
+        self, features: Sequence[FrameFeatures], inputs: CheckInputs, given: GivenMatch | None, tried: int
+    ) -> Explanation | None:
+        """The explanation by a camera that is quite another, by the same standard. tried: hypotheses so far.
+
+        Which one it may be a few of the frames tell, and all of them whether it is: each takes all pictures anew.
+        """
+        some = spread_positions(FEW_FRAMES, len(features))
+        lens, changes = self._other_lens(features, some, inputs), list(lenses(features[0].camera, wide=True))
+        count = tried + len(changes)
+        if lens is not None and self._stands(lens, given, count, rare_odds(count)):
             return _other_camera(lens, features, inputs, lens_findings(lens, NOT_JUDGED, self.camera))
         guesses = list(camera_guesses(self.camera))
-        count = len(tried) + len(changes) + len(guesses)
+        count += len(guesses)
         # One after the other: each holds the maps of all frames.
-        other = max(self.cameras(guesses, (inputs.T,), inputs), key=_z_score, default=None)
-        if other is not None and self._beyond_chance(other, count):
+        other = max(self.cameras(guesses, (inputs.T,), inputs, frames=some), key=_z_score, default=None)
+        if other is not None and len(some) < len(features):
+            other = next(self.cameras([other.hypothesis], (inputs.T,), inputs), None)
+        if other is not None and self._stands(other, given, count, rare_odds(count)):
             return _other_camera(other, features, inputs, instead(other.hypothesis.finding, of_cameras(self.camera)))
         return None
 
-    def undoubted(
-        self, features: Sequence[FrameFeatures], inputs: CheckInputs, tried: Sequence[Candidate[MixUp]]
-    ) -> Explanation | None:
-        """The explanation by transforms that were mixed up, if it leaves no doubt without any search.
-
-        Beyond all doubt, and about where a hypothesis predicts it, a match far from the extrinsic is where the sensors are.
-        Mirrored and turned pictures are not among them: a symmetric scene matches its mirror image, and an extrinsic that is off
-        may match better. tried: all hypotheses about these features, see `hypotheses`.
-        """
-        if not tried or tried[0].z_score < UNDOUBTED_Z:
-            return None
-        one = simplest(tried[0], tried)
-        deg, m = se3.rotation_error_deg(inputs.T, one.T), se3.translation_error_m(inputs.T, one.T)
-        near = deg <= NEAR_DEG and m <= NEAR_M
-        in_doubt = near or predicted(one) > SLACK or OF_PICTURES & {tried[0].hypothesis.cause, one.hypothesis.cause}
-        return None if in_doubt else _explained(one, features, inputs)
-
-    def hypotheses(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> list[Candidate[MixUp]]:
-        """All that may have been mixed up and says more than that the extrinsic is off, the best match first."""
-        poses = [f.points.pose for f in features]
-        tried = self._tried(features, hypotheses(inputs.T, features[0].camera, poses, inputs.vehicle_frames), inputs.progress)
-        if inputs.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
-            with suppress(TooFewFeaturesError):
+    def hypotheses(
+        self, features: Sequence[FrameFeatures], inputs: CheckInputs, only_pictures: bool = False
+    ) -> list[Candidate[MixUp]]:
+        """All that may have been mixed up and says more than that the extrinsic is off, the best match first. only_pictures: not
+        transforms."""
+        camera, poses = features[0].camera, [f.points.pose for f in features]
+        of_all = partial(hypotheses, inputs.T, camera, poses, inputs.vehicle_frames)
+        tried = self._tried(features, list(of_pictures(inputs.T, camera)) if only_pictures else of_all(), inputs.progress)
+        if (
+            not only_pictures and inputs.as_taken is not None and distorts(self.camera)
+        ):  # rectified upside down, a picture is bent
+            with suppress(TooFewFeaturesError, BadInputError):
                 guess = upside_down(inputs.T)
-                tried.append(_fit_mix_up(guess, self.score(inputs.as_taken(turned_over(self.camera)), guess.T)))
+                tried.append(_fit_mix_up(guess, self.score(inputs.as_taken(turned_over(self.camera), None), guess.T)))
         return sorted((own for own in tried if says_more_than(own, inputs.T)), key=lambda own: -own.z_score)
 
     def _tried(
@@ -166,28 +203,28 @@ class Alternatives:
                 tried.append(_fit_mix_up(guess, score))
         return sorted(tried, key=lambda own: -own.z_score)
 
-    def best_picture(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> float:
-        """z-score of the best match of a mirrored or turned picture."""
-        tried = self._tried(features, list(of_pictures(inputs.T, features[0].camera)), inputs.progress)
-        return tried[0].z_score if tried else -np.inf
-
-    def _other_lens(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> LensFit | None:
-        """The best match of another camera near the extrinsic; None if none matches clearly better, or it cannot be judged."""
+    def _other_lens(self, features: Sequence[FrameFeatures], some: Sequence[int], inputs: CheckInputs) -> LensFit | None:
+        """The best match of another camera near the extrinsic; None if none matches clearly better, or it cannot be judged.
+        some: numbers of the frames that it is fitted to."""
         try:
-            score = self.score(features, inputs.T)
+            of_all = self.score(features, inputs.T)
+            if not judged(of_all):
+                return None
+            score = self.score([features[k] for k in some], inputs.T)
+            best = fit_lens(score, inputs.T, wide=True, progress=Progress(inputs.progress, LENS))
+            return replace(best, score=best.hypothesis.seen_by(of_all)) if best.significant else None
         except TooFewFeaturesError:
             return None
-        if not judged(score):
-            return None
-        best = fit_lens(score, inputs.T, wide=True, progress=Progress(inputs.progress, LENS))
-        return replace(best, score=best.hypothesis.seen_by(score)) if best.significant else None
 
     def _beyond_chance(self, best: Candidate[Any], tried: int) -> bool:
         """Does the best match of so many that were tried exceed what a decoy reaches?"""
-        if best.z_score >= UNDOUBTED_Z:
+        largest = self.config.refine.max_p_value
+        if p_value(best.z_score, None, tried) <= largest:
             return True
+        if p_value(best.z_score, LOWEST_DECOY_Z, tried) > largest:
+            return False
         decoy = search_decoy(best.score, best.T, NEAR, self.config.search, unlimited(best.T))
-        return p_value(best.z_score, decoy, tried) <= self.config.refine.max_p_value
+        return p_value(best.z_score, decoy, tried) <= largest
 
     def score(self, features: Sequence[FrameFeatures], T: Transform, atlas: Atlas | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
@@ -208,16 +245,21 @@ def _other_camera(
     match: Candidate[Any], features: Sequence[FrameFeatures], inputs: CheckInputs, findings: Iterable[CauseFinding]
 ) -> Explanation:
     causes = (*findings, *not_mixed_up(OTHER_FITS))
-    return Explanation(match.T, covariance_of(match.score, match.T), inputs.T, _matched(match, features), causes)
+    return Explanation(match.score, match.T, covariance_of(match.score, match.T), inputs.T, _matched(match, features), causes)
+
+
+def _is_only_off(one: Candidate[MixUp], inputs: CheckInputs) -> bool:
+    """Whether an optimum near what holds on most vehicles says no more than that the extrinsic is off."""
+    return one.hypothesis.usual and not inputs.tolerance.covers(one.hypothesis.T, one.T)
 
 
 def _explained(one: Candidate[MixUp], features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation:
     """What a hypothesis says. One that holds on most vehicles, nearly, has to hold exactly; else its optimum tells how far the
     extrinsic is off."""
     C = covariance_of(one.score, one.T)
-    if one.hypothesis.usual and not inputs.tolerance.covers(one.hypothesis.T, one.T):
-        return Explanation(one.T, C, inputs.T, _matched(one, features), not_mixed_up(OFF))
-    return Explanation(one.T, C, one.hypothesis.T, _matched(one, features), instead(one.hypothesis.finding, MIXED_UP))
+    if _is_only_off(one, inputs):
+        return Explanation(one.score, one.T, C, inputs.T, _matched(one, features), not_mixed_up(OFF))
+    return Explanation(one.score, one.T, C, one.hypothesis.T, _matched(one, features), instead(one.hypothesis.finding, MIXED_UP))
 
 
 def _matched(match: Candidate[Any], features: Sequence[FrameFeatures]) -> Result:

@@ -14,7 +14,7 @@ import numpy as np
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.nuisance.parameters import MIN_FRAMES, REACH, noise_of
+from calib_ros.registration.nuisance.parameters import REACH, noise_of
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros_check.candidate import Candidate, H
@@ -31,7 +31,8 @@ from calib_ros_check.sensors import SIZES, LensChange
 
 FOCAL = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # shares of the focal length: each takes new edges of all pictures
 LEAST_DISTORTION = 1e-9  # coefficient of an ideal fisheye: with none at all, a camera is a pinhole
-AsTaken = Callable[[Camera], Sequence[FrameFeatures]]  # features of the frames, had this camera taken them
+# Features of frames with these numbers, None = of all, had this camera taken them. Raises BadInputError if it cannot have.
+AsTaken = Callable[[Camera, Sequence[int] | None], Sequence[FrameFeatures]]
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,10 @@ class CameraGuess:
     min_relative_gain = 0.02  # a rolling shutter may gain 1 %
 
 
-def gain_over(given: PointScore, T_given: Transform, candidate: Candidate[H]) -> Candidate[H]:
-    """A candidate with what it gains over the camera as it is given, at its optimum T_given (4, 4)."""
+def gain_over(given: PointScore, T_given: Transform, candidate: Candidate[H], tried: int) -> Candidate[H]:
+    """A candidate, the best of so many, with what it gains over the camera as it is given, at its optimum T_given (4, 4)."""
     noise = noise_of(given, T_given, Limits(T_given, REACH))
-    at_optimum = replace(candidate, value=candidate.score.at(-1).value(candidate.T))
+    at_optimum = replace(candidate, value=candidate.score.at(-1).value(candidate.T), tried=tried)
     return at_optimum.against(given.at(-1).value(T_given), noise)
 
 
@@ -97,11 +98,6 @@ def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:
 
 def _found(cause: Cause, message: str) -> CauseFinding:
     return CauseFinding(cause, CauseState.FOUND, message)
-
-
-def has_enough_frames(score: PointScore) -> bool:
-    """Whether a guess can be compared with the camera as it is given: one frame may gain much by chance."""
-    return len(score.frames) >= MIN_FRAMES
 
 
 def turned_over(camera: Camera) -> Camera:

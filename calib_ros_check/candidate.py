@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from calib_ros.arrays import Transform
 from calib_ros.registration.acceptance.significance import null_distribution
-from calib_ros.registration.nuisance.parameters import LEVELS, POINTS, REACH, SIGNIFICANT_Z, TOLERANCE_DEG, refined
+from calib_ros.registration.nuisance.parameters import LEVELS, POINTS, REACH, TOLERANCE_DEG, refined
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 
@@ -71,7 +71,7 @@ class Candidate(Generic[H]):
     def significant(self) -> bool:
         """True if it is clearly better than what is claimed."""
         by_chance = -float(ndtri(FALSE_ALARMS / self.tried))
-        enough = self.deviations > max(SIGNIFICANT_Z, by_chance) and self.relative_gain > self.hypothesis.min_relative_gain
+        enough = self.deviations > by_chance and self.relative_gain > self.hypothesis.min_relative_gain
         return self.hypothesis.unknowns > 0 and enough
 
     def against(self, value: float, noise: float) -> Candidate[H]:

@@ -18,8 +18,10 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
+from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
+from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, at_time_offset
@@ -28,13 +30,13 @@ from calib_ros.registration.nuisance.parameters import noise_of
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.registration.search.search import FRUITLESS_ROUNDS
 from calib_ros.result import CONVERGED, RefusalCode, Result
 from calib_ros_check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, CheckInputs, Classified, Explanation, covariance_of
 from calib_ros_check.cameras import (
     AsTaken,
     CameraGuess,
     gain_over,
-    has_enough_frames,
     other_centre,
     other_focal_lengths,
     rectified_already,
@@ -56,13 +58,15 @@ from calib_ros_check.causes import (
     of_cameras,
     possible_causes,
 )
-from calib_ros_check.hypotheses import MixUp
+from calib_ros_check.evidence import freedom, is_off, shows_noise
+from calib_ros_check.looks import Looks, match_of
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.sensors import LensChange, LensFit, centre_instead, centre_of, fit_lens, judged, moves_by, without_change
-from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, unknown
+from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, undecided, unknown
 
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
+CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
 CENTRES = 3  # principal points that are tried, one after the other
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
 
@@ -81,16 +85,19 @@ class Checker:
     """
 
     def __init__(self, camera: Camera, config: Config | None = None, segmentation: Segmentation | None = None) -> None:
+        config = config or Config()
         refine = {"tolerance_deg": NO_LIMIT_DEG, "tolerance_m": NO_LIMIT_M, "objective": "fast"}
-        self.config = update(config or Config(), {"refine": refine})
+        # Three searches look further than one would: more rounds of each hardly find another optimum.
+        search = {"rounds": min(config.search.rounds, FRUITLESS_ROUNDS)}
+        self.config = update(config, {"refine": refine, "search": search})
         self.camera = camera
         self._calibrator = Calibrator(camera, self.config, segmentation)
         self._alternatives = Alternatives(self._calibrator, camera)
         as_stamped = update(self.config, {"motion": {"time_offset": "fixed"}})
         self._at_stamps = Calibrator(camera, as_stamped, self._calibrator.segmentation)
-        # Another look is another chance of being wrong; halving its limit keeps that of both to one and a half times the limit.
-        again = {"search": {"seed": self.config.search.seed ^ 1}, "refine": {"max_p_value": self.config.refine.max_p_value / 2}}
-        self._again = Calibrator(camera, update(self.config, again), self._calibrator.segmentation)
+        # Another look is another chance of being wrong; with another seed, since a search misses an optimum now and then.
+        further = {"search": {"seed": self.config.search.seed ^ 1}, "refine": {"max_p_value": self.config.refine.max_p_value / 2}}
+        self._further = Calibrator(camera, update(self.config, further), self._calibrator.segmentation)
 
     def check(
         self,
@@ -131,13 +138,14 @@ class Checker:
         calibrator = self._calibrator
         used, notes = usable_frames(frames, calibrator.extract, None, Progress(progress, "features"))
 
-        def classified() -> Sequence[FrameFeatures]:
-            watch = Progress(progress, "classes")
-            return with_classes(used, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
+        def classified(numbers: Sequence[int]) -> Sequence[FrameFeatures]:
+            watch, chosen = Progress(progress, "classes"), [used[k] for k in numbers]
+            return with_classes(chosen, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
 
-        def as_taken(camera: Camera) -> Sequence[FrameFeatures]:
+        def as_taken(camera: Camera, numbers: Sequence[int] | None) -> Sequence[FrameFeatures]:
             extract = FeatureExtractor(camera, self.config)
-            return [extract(replace(frame, camera=camera)) for frame, _ in used]
+            chosen = used if numbers is None else [used[k] for k in numbers]
+            return [extract.seen_anew(own, frame.image) for frame, own in chosen]
 
         features = [own for _, own in used]
         in_doubt = classified if calibrator.segmentation.active else None
@@ -177,53 +185,24 @@ class Checker:
 
     def _find(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation | None:
         """What the scenes show; None if nothing matches beyond chance."""
-        tried: list[Candidate[MixUp]] | None = None
-        near = self._best(features, inputs, (None,))
-        if near is None:
-            tried = self._alternatives.hypotheses(features, inputs)
-            sure = self._alternatives.undoubted(features, inputs, tried)
-            if sure is not None:
-                return sure
-        searched = self._best(features, inputs, (NEAR,))
-        if near is None and searched is None:
-            # A search misses the optimum now and then, and another camera may seem to be the reason.
-            searched = self._best(features, inputs, (NEAR,), self._again)
-        near = max((own for own in (near, searched) if own is not None), key=_match, default=None)
-        # A symmetric scene matches its mirror image as well, though not as well as itself.
-        if near is not None and self._alternatives.best_picture(features, inputs) <= _match(near):
-            return self._at_optimum(features, near, inputs)
-        if tried is None:
-            tried = self._alternatives.hypotheses(features, inputs)
-        mixed_up = self._alternatives.mixed_up(features, inputs, tried)
-        if mixed_up is not None:
-            return mixed_up
-        if near is not None:
-            return self._at_optimum(features, near, inputs)
-        # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
-        far = self._best(features, inputs, (FAR,))
-        if far is None and inputs.classified is not None:
-            features = inputs.classified()
-            far = self._best(features, inputs, (NEAR, FAR))
-        return None if far is None else self._at_optimum(features, far, inputs)
-
-    def _best(
-        self,
-        features: Sequence[FrameFeatures],
-        inputs: CheckInputs,
-        boxes: Sequence[SearchBox | None],
-        calibrator: Calibrator | None = None,
-    ) -> Result | None:
-        """The best match of refinements (None) and searches from the extrinsic; None if none is beyond chance. Far away is
-        searched only where nothing is near."""
-        accepted: list[Result] = []
-        calibrator = calibrator or self._calibrator
-        for box in boxes:
-            if accepted and box is FAR:
-                break
-            result = calibrator.estimate(features, inputs.T, box, inputs.progress)
-            if result.converged or (result.refusal is RefusalCode.WRONG_TIMES and _is_match(result, calibrator)):
-                accepted.append(result)
-        return max(accepted, key=_match, default=None)
+        looks, alternatives = Looks(inputs), self._alternatives
+        both = [looks.match(self._calibrator, features, box) for box in (None, NEAR)]
+        near = max((own for own in both if own is not None), key=match_of, default=None)
+        # What is off by more than NEAR is as rare as something mixed up, and is looked for afterwards.
+        given = alternatives.as_given(features, inputs.T, looks.optima)
+        # Where the scenes match beyond doubt, only a picture can be another one: a transform would lead elsewhere.
+        tried = alternatives.hypotheses(features, inputs, near is not None and match_of(near) >= UNDOUBTED_Z)
+        explained = alternatives.mixed_up(features, inputs, tried, given)
+        if explained is None and near is None:
+            explained = alternatives.another_camera(features, inputs, given, len(tried))
+        if explained is not None:
+            return explained
+        found = near or looks.match(self._further, features, FAR)
+        if found is None and inputs.classified is not None:
+            # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
+            features = inputs.classified(spread_positions(CLASSIFIED_FRAMES, len(features)))
+            found = looks.match(self._further, features, FAR)
+        return None if found is None else self._at_optimum(features, found, inputs)
 
     def _at_optimum(self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs) -> Explanation:
         """Clocks and intrinsics at the optimum of an estimate."""
@@ -253,12 +232,13 @@ class Checker:
         elif fit is not None and clocks.state is not CauseState.FOUND and not inputs.tolerance.covers(inputs.T, found):
             own = self._possible_centre(score, found, inputs, others)
             lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
+        shared = None if C is None else result.shared_covariance
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *lens)
         why = AS_GIVEN if inputs.tolerance.covers(inputs.T, found) else OFF
         if any(own.state is CauseState.FOUND for own in causes):
             why = OTHER_FITS
-        return Explanation(found, C, inputs.T, result, (*causes, *not_mixed_up(why)))
+        return Explanation(score, found, C, inputs.T, result, (*causes, *not_mixed_up(why)), shared)
 
     def _other_lens(self, score: PointScore, found: Matrix, inputs: CheckInputs) -> LensFit:
         """The change of the camera that matches best around the optimum (4, 4) of a score. One within the tolerance, like an
@@ -275,7 +255,7 @@ class Checker:
         self, score: PointScore, found: Matrix, inputs: CheckInputs, offset_s: float
     ) -> list[Candidate[CameraGuess]]:
         """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""
-        if not has_enough_frames(score):
+        if not shows_noise(score):
             return []
         off = se3.rotation_error_deg(inputs.T, found) > inputs.tolerance.deg
         guesses = [*rectified_already(self.camera)]
@@ -286,7 +266,7 @@ class Checker:
         others = list(self._alternatives.cameras(guesses, (found, inputs.T), inputs, offset_s))
         others += self._other_centres(found, inputs, offset_s) if off else []
         best_first = sorted(others, key=lambda own: -own.z_score)
-        return [gain_over(score, found, own) for own in best_first]
+        return [gain_over(score, found, own, len(others)) for own in best_first]
 
     def _other_centres(self, found: Matrix, inputs: CheckInputs, offset_s: float) -> list[Candidate[CameraGuess]]:
         """Principal points that look like the rotation to the optimum (4, 4), each better than the one before it: at first, the
@@ -357,7 +337,9 @@ class Checker:
 
     def _judged(self, found: Explanation, T: Transform, tolerance: Tolerance) -> CheckResult:
         """The verdict about what was found."""
-        judgement = judge(found.T_corrected, found.T, found.covariance, tolerance)
+        judgement = judge(found.T_corrected, found.T, found.covariance, tolerance, freedom(found.score), found.shared)
+        if judgement.verdict is CheckVerdict.FAIL and not is_off(found, found.own_covariance, found.T_corrected, tolerance):
+            judgement = undecided(judgement)
         cause = next((own for own in found.causes if own.state is CauseState.FOUND), None)
         result, evidence = found.result, found.result.evidence
         return CheckResult(
@@ -379,12 +361,3 @@ class Checker:
         causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
         known = {"tolerance": tolerance, "T_checked": T, "T_estimated": None, "covariance": None}
         return CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)
-
-
-def _is_match(result: Result, calibrator: Calibrator) -> bool:
-    """Whether an optimum that is refused for another reason matches beyond chance."""
-    return result.evidence is not None and result.evidence.p_value <= calibrator.config.refine.max_p_value
-
-
-def _match(result: Result) -> float:
-    return result.evidence.z_score if result.evidence is not None else -np.inf

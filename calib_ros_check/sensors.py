@@ -20,11 +20,12 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.registration.nuisance.lens import CENTRE, FOCAL
-from calib_ros.registration.nuisance.parameters import LEVELS, MIN_FRAMES, MIN_RELATIVE_GAIN, NEAR_LEVELS, POINTS, REACH, noise_of
+from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, REACH, noise_of
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros_check.candidate import PARAMETER_PENALTY, Candidate, fit
+from calib_ros_check.evidence import shows_noise
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.tolerance import CONFIDENCE
 
@@ -36,6 +37,7 @@ BEST = 3  # of quite different cameras, how many are followed: which one is best
 STEPS = (0.02, 0.01, 0.005)  # of a joint descent: shares of the focal length, of the image width, of the radius
 NAMES = ("focal", "u", "v", "barrel")
 ROUNDS = 4
+MIN_RELATIVE_GAIN = 0.05  # share of the score; a rolling shutter may gain some per cent
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,9 @@ def scaled(camera: Camera, scale: float) -> LensChange:
 
 
 def judged(score: PointScore) -> bool:
-    """Whether intrinsics can be judged: by several frames, one may gain much by chance, and not on unrolled pictures, where a
+    """Whether intrinsics can be judged: by several scenes, one may gain much by chance, and not on unrolled pictures, where a
     shift is a rotation and lenses of another focal length are unrolled otherwise."""
-    return len(score.frames) >= MIN_FRAMES and not score.camera.is_cylinder
+    return shows_noise(score) and not score.camera.is_cylinder
 
 
 def fit_lens(

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -24,6 +25,7 @@ AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Scales of the prior, as multiples of the tolerance.
 SCALES = 2.0 ** np.arange(-4, 9)
 SAMPLES = 20000
+QUANTILES = (np.arange(8) + 0.5) / 8  # of the variances that make up Student's distribution
 CONFIDENCE = 0.9  # probability from which a verdict is one
 INTERVAL = 0.95
 MORE_FRAMES = "use more frames of other scenes, with objects in view of both sensors"
@@ -53,16 +55,28 @@ def unknown() -> Judgement:
     )
 
 
-def judge(T_checked: Transform, T_estimated: Transform, covariance: Covariance, tolerance: Tolerance) -> Judgement:
-    """Verdict about T_checked (4, 4), from an estimate of the true one (4, 4) and its covariance (6, 6), of a left twist."""
+def judge(
+    T_checked: Transform,
+    T_estimated: Transform,
+    covariance: Covariance,
+    tolerance: Tolerance,
+    freedom: float = math.inf,
+    shared: Covariance | None = None,
+) -> Judgement:
+    """Verdict about T_checked (4, 4), from an estimate of the true one (4, 4) and its covariance (6, 6), of a left twist.
+
+    freedom: degrees of freedom of the covariance. shared: (6, 6), the part of it that intrinsics and clocks leave open; more
+    scenes would not help, so that they need not show it.
+    """
     error, C = deviation(T_checked, T_estimated, covariance)
-    samples = posterior_samples(error, C, tolerance)
+    samples = posterior_samples(error, C, tolerance, freedom)
     limits = np.array([np.deg2rad(tolerance.deg)] * 3 + [tolerance.m] * 3)
     sizes = np.stack([np.linalg.norm(samples[:, :3], axis=1), np.linalg.norm(samples[:, 3:], axis=1)], axis=1)
     in_tolerance = sizes <= limits[[0, 3]]
     p_within = float(in_tolerance.all(axis=1).mean())
     # Axes share the scale of the prior; what is known of one must not stand for another that the scenes do not show.
-    shown = np.sqrt(np.diag(C)) <= limits
+    own = C if shared is None else deviation(T_checked, T_estimated, covariance - shared)[1]
+    shown = np.sqrt(np.maximum(np.diag(own), 0)) <= limits
     axes = tuple(
         _deviation(name, samples[:, k], float((np.abs(samples[:, k]) <= limits[k]).mean()), DEGREES[k], bool(shown[k]))
         for k, name in enumerate(AXES)
@@ -70,6 +84,17 @@ def judge(T_checked: Transform, T_estimated: Transform, covariance: Covariance, 
     rotation = _deviation("rotation", sizes[:, 0], float(in_tolerance[:, 0].mean()), DEGREES[0], bool(shown[:3].all()))
     translation = _deviation("translation", sizes[:, 1], float(in_tolerance[:, 1].mean()), 1.0, bool(shown[3:].all()))
     return Judgement(verdict_of(p_within, bool(shown.all())), p_within, rotation, translation, axes)
+
+
+def undecided(judgement: Judgement) -> Judgement:
+    """The same where nothing is said to fail."""
+    parts = (judgement.rotation, judgement.translation, *judgement.axes)
+    rotation, translation, *axes = (replace(own, verdict=_open(own.verdict)) for own in parts)
+    return Judgement(_open(judgement.verdict), judgement.p_within, rotation, translation, tuple(axes))
+
+
+def _open(verdict: CheckVerdict) -> CheckVerdict:
+    return CheckVerdict.INCONCLUSIVE if verdict is CheckVerdict.FAIL else verdict
 
 
 def verdict_of(p_within: float, shown: bool = True) -> CheckVerdict:
@@ -88,28 +113,29 @@ def deviation(T_checked: Transform, T_estimated: Transform, covariance: Covarian
     return error, A @ covariance @ A.T
 
 
-def posterior_samples(error: Matrix, C: Matrix, tolerance: Tolerance) -> Matrix:
-    """Samples (n, 6) of the true error, given its estimate (6,) and covariance (6, 6).
+def posterior_samples(error: Matrix, C: Matrix, tolerance: Tolerance, freedom: float = math.inf) -> Matrix:
+    """Samples (n, 6) of the true error, given its estimate (6,) and covariance (6, 6), by so many degrees of freedom: errors of
+    Student's distribution are normal ones of several covariances.
 
     The prior is a mixture of normal distributions, whose posterior is one as well: a Kalman update per component, weighted by how
     well the component predicts the estimate. Deterministic.
     """
-    means, roots, logs = [], [], []
-    for turn in np.deg2rad(tolerance.deg) * SCALES:
-        for shift in tolerance.m * SCALES:
-            prior = np.diag([turn**2] * 3 + [shift**2] * 3)
-            L = np.linalg.cholesky(C + prior)
-            whitened = np.linalg.solve(L, error)
-            logs.append(-0.5 * whitened @ whitened - np.log(np.diag(L)).sum())
-            gain = np.linalg.solve(C + prior, prior).T
-            left = np.eye(6) - gain
-            means.append(gain @ error)
-            roots.append(np.linalg.cholesky(left @ prior @ left.T + gain @ C @ gain.T + 1e-18 * np.eye(6)))
-    weight = np.exp(np.array(logs) - max(logs))
+    variances = [[turn**2] * 3 + [shift**2] * 3 for turn in np.deg2rad(tolerance.deg) * SCALES for shift in tolerance.m * SCALES]
+    noises = freedom / chi2.ppf(QUANTILES, freedom) if np.isfinite(freedom) else np.ones(1)
+    prior = np.tile(np.array([np.diag(own) for own in variances]), (len(noises), 1, 1))
+    noise = np.repeat(noises, len(variances))[:, None, None] * C
+    L = np.linalg.cholesky(noise + prior)
+    whitened = np.linalg.solve(L, np.broadcast_to(error[:, None], (len(L), 6, 1)))[..., 0]
+    logs = -0.5 * np.sum(whitened**2, axis=1) - np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
+    gain = np.swapaxes(np.linalg.solve(noise + prior, prior), 1, 2)
+    left = np.eye(6) - gain
+    after = left @ prior @ np.swapaxes(left, 1, 2) + gain @ noise @ np.swapaxes(gain, 1, 2)
+    means, roots = gain @ error, np.linalg.cholesky(after + 1e-18 * np.eye(6))
+    weight = np.exp(logs - logs.max())
     weight /= weight.sum()
     component = np.searchsorted(np.cumsum(weight), (np.arange(SAMPLES) + 0.5) / SAMPLES * (1 - 1e-12))
     normal = np.random.default_rng(0).standard_normal((SAMPLES, 6))
-    return np.asarray(np.array(means)[component] + np.einsum("nij,nj->ni", np.array(roots)[component], normal))
+    return np.asarray(means[component] + np.einsum("nij,nj->ni", roots[component], normal))
 
 
 def _deviation(name: str, samples: Matrix, p_within: float, unit: float, shown: bool) -> Deviation:

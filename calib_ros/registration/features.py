@@ -137,6 +137,11 @@ class FeatureExtractor:
             return features
         return replace(features, own=self._other.extract(frame, image, features, semantics, self))
 
+    def seen_anew(self, features: FrameFeatures, image: NDArray[np.uint8]) -> FrameFeatures:
+        """Features of the same scan, had this camera taken the image; without semantics."""
+        levels = edge_levels(self.working_image(image), float(self.camera.K[0, 0]), self.config.image, used=self.used)
+        return replace(features, levels=levels, camera=self.camera, plain=None, view=None)
+
     def _with_semantics(
         self, features: FrameFeatures, frame: Frame, image: NDArray[np.uint8], semantics: FrameSemantics
     ) -> FrameFeatures:

@@ -118,7 +118,7 @@ def check_keyframes(
         [features.plain or features for features in chosen],
         T,
         request.tolerance,
-        (lambda: chosen) if has_classes else None,
+        (lambda numbers: [chosen[k] for k in numbers]) if has_classes else None,
         progress,
         vehicle_frames,
     )

@@ -29,7 +29,7 @@ NO_SPREAD = 1e-6  # a picture without any edge scores 0 everywhere: its z-score 
 
 # Significance. A z-score that no decoy comes near: the best optimum of a decoy has 1 to 6.3 on five vehicles and on synthetic
 # streets of 16 to 64 rings, from one frame to ten.
-UNDOUBTED_Z, HIGHEST_DECOY_Z = 10.0, 6.3
+UNDOUBTED_Z, HIGHEST_DECOY_Z, LOWEST_DECOY_Z = 10.0, 6.3, 1.0
 # The best of many optima of chance follows Gumbel's distribution, with the scale by which their z-scores exceed a high one:
 # 0.6 to 0.9 on average over the optima of single searches, 0.2 to 0.7 from search to search in the same decoy.
 GUMBEL_SCALE = 0.65

@@ -37,9 +37,8 @@ SIGNIFICANCE = 1e-3  # largest probability of a false refusal, of all unknowns t
 GROSSLY = 0.01  # share of what is given that is plainly wrong, as the intrinsics of another image size are
 OPEN_PROBABILITY = 0.1  # of being plainly wrong: a search must reach its tolerance with 90 %
 
-# Of `check` and the clocks alone: gain from which another value is preferred, in standard deviations of the score and as a share
-# of it, and the frames it takes.
-SIGNIFICANT_Z, MIN_RELATIVE_GAIN, MIN_FRAMES = 2.5, 0.05, 3
+# Of the clocks alone: gain from which another offset is preferred, in standard deviations of the score, and the frames it takes.
+SIGNIFICANT_Z, MIN_FRAMES = 2.5, 3
 
 
 @dataclass(frozen=True, eq=False)

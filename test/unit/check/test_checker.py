@@ -15,12 +15,16 @@ from calib_ros.camera import Camera
 from calib_ros.cli import main
 from calib_ros.config import Config, SearchConfig
 from calib_ros.errors import BadInputError
+from calib_ros.frame import PointCloud
 from calib_ros.lidar.scanner_pose import ScannerPose
+from calib_ros.registration.features import FeatureExtractor
 from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
-from calib_ros_check.alternatives import NEAR, CheckInputs
+from calib_ros_check.alternatives import FEW_FRAMES, NEAR, CheckInputs
+from calib_ros_check.cameras import camera_guesses
 from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
 from calib_ros_check.hypotheses import axis_rotations, distinct_poses, hypotheses, says_more_than
+from calib_ros_check.looks import Looks
 from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
 from calib_ros_check.recording import CheckOptions, check_source
 
@@ -90,16 +94,19 @@ def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypa
 
 
 @pytest.mark.parametrize(("p_value", "taken"), [(0.004, True), (0.008, False)])
-def test_the_second_look_is_at_half_the_p_value_whatever_the_clocks(drive, monkeypatch, p_value, taken):
+def test_further_looks_are_at_half_the_p_value_whatever_the_clocks(drive, monkeypatch, p_value, taken):
     """The limit is 0.01, which holds for an optimum that is refused for its time stamps as well."""
     frames, truth = drive
     checker = Checker(frames[0].camera)
-    late = Result(truth, REFUSED, "late", refusal=RefusalCode.WRONG_TIMES, evidence=Evidence(5.0, None, p_value, 1.0))
-    for calibrator in (checker._calibrator, checker._again):
+    late = Result(
+        truth, REFUSED, "late", refusal=RefusalCode.WRONG_TIMES, evidence=Evidence(5.0, None, p_value, 1.0), optimum=truth
+    )
+    for calibrator in (checker._calibrator, checker._further):
         monkeypatch.setattr(calibrator, "estimate", lambda *_: late)
-    inputs = CheckInputs(truth, Tolerance(), None, None, {}, None)
-    assert checker._best([], inputs, (NEAR,)) is late
-    assert (checker._best([], inputs, (NEAR,), checker._again) is late) == taken
+    looks = Looks(CheckInputs(truth, Tolerance()))
+    assert looks.match(checker._calibrator, [], NEAR) is late
+    assert (looks.match(checker._further, [], NEAR) is late) == taken
+    assert len(looks.optima) == 2, "what is not taken competes all the same"
 
 
 def test_a_check_may_be_ended_in_every_stage(made, checker):
@@ -125,12 +132,12 @@ def test_a_check_may_be_ended_in_every_stage(made, checker):
 def test_what_edges_find_far_away_needs_no_classes(drive, quick, monkeypatch):
     """A scene with few objects matches less by its classes than by its edges."""
     frames, truth = drive
-    for mix_up in ("undoubted", "mixed_up"):  # this mount is nearly that of a cloud in the camera's body frame
-        monkeypatch.setattr(quick._alternatives, mix_up, lambda *_: None)
+    # This mount is nearly that of a cloud in the camera's body frame.
+    monkeypatch.setattr(quick._alternatives, "mixed_up", lambda *_: None)
     features = [quick._calibrator.extract(frame) for frame in frames]
     asked: list[str] = []
     checked = se3.perturb(truth, [0, 16.0, 6.0], [0, 0, 0])
-    result = quick.check_features(features, checked, classified=lambda: asked.append("classes") or features)
+    result = quick.check_features(features, checked, classified=lambda numbers: asked.append("classes") or features)
     assert result.verdict is CheckVerdict.FAIL, result.reason
     assert result.rotation.error == pytest.approx(np.hypot(16, 6), abs=0.3)
     assert not asked
@@ -195,6 +202,73 @@ def test_pictures_of_elsewhere_are_inconclusive(drive, quick):
     assert all(finding.state is CauseState.NOT_JUDGED for finding in result.causes)
     assert Cause.ALREADY_RECTIFIED not in {finding.cause for finding in result.causes}, "CameraInfo has no distortion"
     assert "more frames" in result.reason
+
+
+def test_where_nothing_matches_the_effort_is_bounded(made, quick, monkeypatch):
+    """Searches do not depend on the number of frames; pictures are taken anew of a few, and of all for the best guess alone."""
+    barrel = replace(made.camera, D=np.array([-0.3, 0.08, 0.0, 0.0, 0.0]))
+    checker = Checker(barrel, quick.config)
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, made[0].image.shape, dtype=np.uint8) for _ in range(4)]
+    frames = [replace(made[k % 4], camera=barrel, image=noise[k % 4]) for k in range(6)]
+    features = [checker._calibrator.extract(frame) for frame in frames]
+    taken: list[int] = []
+    searches: list[object] = []
+
+    def as_taken(camera, numbers):
+        taken.append(len(features) if numbers is None else len(numbers))
+        return features if numbers is None else [features[k] for k in numbers]
+
+    for calibrator in (checker._calibrator, checker._further):
+        estimate = calibrator.estimate
+        monkeypatch.setattr(
+            calibrator, "estimate", lambda *given, estimate=estimate: searches.append(given[2]) or estimate(*given)
+        )
+    result = checker.check_features(features, made.reference, as_taken=as_taken)
+    assert result.verdict is CheckVerdict.INCONCLUSIVE, result.reason
+    assert len(searches) == 3
+    assert sum(count > FEW_FRAMES for count in taken) <= 2
+
+
+@pytest.fixture(scope="module")
+def symmetric(made):
+    """A scene that is its own mirror image, seen by a camera without an offset to the side."""
+    out = []
+    for frame in (made[0], made[2]):
+        P = se3.transform(made.reference, frame.cloud.xyz.astype(float))
+        P = np.concatenate([P[P[:, 0] < 0], P[P[:, 0] < 0] * [-1, 1, 1]])
+        half = frame.image[:, : made.camera.width // 2]
+        cloud = PointCloud(se3.transform(se3.inverse(made.reference), P).astype(np.float32))
+        out.append(replace(frame, cloud=cloud, image=np.concatenate([half, half[:, ::-1]], axis=1), compensated=True))
+    return out, made.reference
+
+
+@pytest.mark.parametrize("deg", [0.0, 1.5])
+def test_a_mix_up_under_which_the_scene_is_symmetric_is_not_named(symmetric, quick, deg):
+    frames, truth = symmetric
+    result = quick.check(frames, se3.perturb(truth, [0, deg, 0], [0, 0, 0]))
+    assert result.cause is None, result.reason
+
+
+def test_a_camera_model_that_a_guess_makes_impossible_is_left_out():
+    """The lens of an image four times the size cannot be rectified: its focal length would be negative."""
+    D = np.array([-0.37013, 0.164153, -0.000204, -0.000744, -0.038527])
+    barrel = Camera(np.array([[332.77, 0, 303.2], [0, 333.6, 175.3], [0, 0, 1]]), 640, 360, D=D)
+    checker = Checker(barrel)
+    asked: list[str] = []
+
+    def as_taken(camera, numbers):
+        try:
+            FeatureExtractor(camera, checker.config)
+        except BadInputError as error:
+            asked.append(str(error))
+            raise
+        return []
+
+    inputs = CheckInputs(BODY, Tolerance(), as_taken=as_taken)
+    guesses = list(camera_guesses(barrel))
+    assert list(checker._alternatives.cameras(guesses, (BODY,), inputs)) == []
+    assert any("must be positive" in said for said in asked)
 
 
 def test_every_hypothesis_is_another_one_and_none_is_the_extrinsic_itself():

@@ -6,11 +6,12 @@ from fnmatch import fnmatch
 
 import numpy as np
 import pytest
+from scipy.special import stdtr
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
 from calib_ros_check.outcome import CheckVerdict, Tolerance
-from calib_ros_check.tolerance import deviation, judge
+from calib_ros_check.tolerance import deviation, judge, posterior_samples, undecided
 
 TRUTH = se3.from_parts(se3.OPTICAL_FROM_BODY, [0.1, -0.3, -0.2])
 SHARP = np.diag([np.deg2rad(0.03) ** 2] * 3 + [0.01**2] * 3)
@@ -41,6 +42,35 @@ def test_what_the_scenes_do_not_show_is_inconclusive_on_that_axis_only():
 
 def test_a_blurred_estimate_never_passes_or_fails_an_extrinsic_it_cannot_tell():
     assert judge(se3.perturb(TRUTH, [0.4, 0, 0], [0.05, 0, 0]), TRUTH, BLURRED, Tolerance()).verdict is CheckVerdict.INCONCLUSIVE
+
+
+@pytest.mark.parametrize(("freedom", "verdict"), [(np.inf, CheckVerdict.FAIL), (3.0, CheckVerdict.INCONCLUSIVE)])
+def test_a_covariance_of_few_degrees_of_freedom_fails_less(freedom, verdict):
+    """What three standard deviations are worth depends on how well these are known."""
+    C = np.diag([np.deg2rad(0.3) ** 2] * 3 + [0.03**2] * 3)
+    assert judge(se3.perturb(TRUTH, [1.3, 0, 0], [0, 0, 0]), TRUTH, C, Tolerance(), freedom).verdict is verdict
+
+
+def test_samples_of_few_degrees_of_freedom_have_students_tails():
+    C = np.diag([np.deg2rad(0.01) ** 2] * 3 + [0.001**2] * 3)  # far below the prior: as the noise itself
+    sharp, few = (posterior_samples(np.zeros(6), C, Tolerance(90.0, 10.0), freedom) for freedom in (np.inf, 4.0))
+    beyond = [float((np.abs(samples[:, 0]) > 3 * np.deg2rad(0.01)).mean()) for samples in (sharp, few)]
+    assert beyond[0] == pytest.approx(0.0027, abs=0.001)
+    assert beyond[1] == pytest.approx(2 * stdtr(4, -3), rel=0.35)
+
+
+def test_what_intrinsics_leave_open_need_not_be_shown_by_the_scenes():
+    shared = np.zeros((6, 6))
+    shared[5, 5] = 0.12**2
+    found = judge(TRUTH, TRUTH, SHARP + shared, Tolerance(), shared=shared)
+    assert found.verdict is CheckVerdict.PASS
+    assert judge(TRUTH, TRUTH, SHARP + shared, Tolerance()).verdict is CheckVerdict.INCONCLUSIVE
+
+
+def test_an_undecided_judgement_fails_nowhere():
+    found = undecided(judge(se3.perturb(TRUTH, [0, 3.0, 0], [0, 0, 0]), TRUTH, SHARP, Tolerance()))
+    assert CheckVerdict.FAIL not in {found.verdict, found.rotation.verdict, *(axis.verdict for axis in found.axes)}
+    assert found.axes[3].verdict is CheckVerdict.PASS
 
 
 def test_verdicts_keep_their_probability():
