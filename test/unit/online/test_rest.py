@@ -202,8 +202,8 @@ def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(street: list[Frame],
 
     def stand(seconds: float, deg: float) -> list[str]:
         found = []
-        for _ in range(round(seconds / 0.25)):
-            parade.n += 0.25 - 1  # frames come four times a second now
+        for _ in range(round(seconds / 0.1)):
+            parade.n += 0.1 - 1  # frames come ten times a second now
             parade.show(turned(standing, deg))
             found.append(parade.recalibrator.current.result.status)
         return found
@@ -211,6 +211,6 @@ def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(street: list[Frame],
     assert set(stand(5, 0.0)) == {CONVERGED}
     keyframes = len(parade.keyframes)
     after = stand(3, 1.5)
-    assert SUSPECT in after[:4]
+    assert SUSPECT in after[:10]
     assert MOVED in after
     assert len(parade.keyframes) <= keyframes + 1
