@@ -66,8 +66,7 @@ class MatchEvidence:
 
     def reset(self) -> None:
         """The extrinsic was replaced."""
-        self._before, self._newest = 0.0, 0.0
-        self._count_before, self.count = 0, 0
+        self._before, self._newest, self.count = 0.0, 0.0, 0
 
     @property
     def evidence(self) -> float:
@@ -75,7 +74,7 @@ class MatchEvidence:
         return self._before + self._newest
 
     def learn(self, z_score: float, points: float) -> None:
-        """A keyframe that fits has this z-score, by so many effective points."""
+        """A keyframe that fits has this z-score, by so many effective points; neither has a unit."""
         self._usual.append(z_score / np.sqrt(points))
 
     def add(self, z_score: float, points: float, same_scene: bool) -> None:
@@ -85,8 +84,7 @@ class MatchEvidence:
             self._newest = max(self._newest, ratio)
             return
         self._before = max(self.evidence, 0.0)
-        self._count_before = self.count if self._before > 0 else 0
-        self._newest, self.count = ratio, self._count_before + 1
+        self._newest, self.count = ratio, (self.count if self._before > 0 else 0) + 1
 
     def ratio(self, z_score: float, points: float) -> float:
         """Of one keyframe: as far above decoys as they are among themselves, or as far as keyframes are here usually. 0 while

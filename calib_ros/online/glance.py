@@ -1,4 +1,4 @@
-"""A look at frames between keyframes: do they still match at the current extrinsic? At a tenth of the cost of a keyframe.
+"""A look at frames between keyframes: do they still match at the current extrinsic? At a quarter of the cost of a keyframe.
 
 The edges of the part of the scan that is in view are laid over the edges of a small picture at the current extrinsic, and shifted
 by some pixels each way. At a right extrinsic nothing matches much better than no shift. How much better something may is learnt

@@ -112,6 +112,7 @@ class Recalibrator:
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
         self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
+        self._test_wanted = False  # a look has struck, and the load has not allowed for a test yet
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
         # The nominal extrinsic is a placeholder until there is a first guess.
         self._nominal_start = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
@@ -241,26 +242,28 @@ class Recalibrator:
             if is_keyframe:
                 self.selector.reset()  # the scene is still wanted: the next frame may show it with a good scan
             raise
-        if not is_keyframe:
-            self._monitor_extrinsic(features)
-            return False
         with self._lock:
-            if generation == self.keyframes.generation:  # else: reset or configured meanwhile
+            current = generation == self.keyframes.generation  # else: reset or configured meanwhile
+            if current and is_keyframe:
                 if self.needs_classes:  # classes may come for one keyframe in many, and a first guess needs several
                     self.keyframes.add(features, lambda f: f.view is not None)
                 else:
                     self.keyframes.add(features)
                 if self.segments_keyframes:
                     self.segmenter.put(frame_with_twist, features)
-        self._monitor_extrinsic()
-        return True
+        if current or is_keyframe:
+            self._monitor_extrinsic(None if is_keyframe else features)
+        return is_keyframe
 
     def _worth_a_test(self, frame: Frame) -> bool:
         """Whether a frame that is no keyframe is to be tested by the monitor: it matches worse than others, or there is doubt."""
         if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(frame.stamp)):
             return False
-        strikes = self.glance.strikes(frame, self.tracker.T, self.config)
-        return strikes or self.monitor.in_doubt or self.tracker.suspect
+        if self._test_wanted or self.monitor.in_doubt or self.tracker.suspect:
+            self.glance.put_off(frame.stamp)  # no need to look, nor to get used to what may be a knock
+            return True
+        self._test_wanted = self.glance.strikes(frame, self.tracker.T, self.config)
+        return self._test_wanted
 
     def _motion_limits(self) -> tuple[float, tuple[float, float]]:
         """Half the time, s, in which the scan sweeps the image, and how far (rad, m) the vehicle may move in it unknown: as far
@@ -303,6 +306,7 @@ class Recalibrator:
         has moved, keyframes from before are dropped."""
         if not self.config.monitor.enabled:
             return
+        self._test_wanted = False
         with self._lock:
             generation, tracker, keyframes = self.keyframes.generation, self.tracker, list(self.buffer)
             if self._restart_monitor or not tracker.monitored or not keyframes:

@@ -214,3 +214,22 @@ def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(street: list[Frame],
     assert SUSPECT in after[:10]
     assert MOVED in after
     assert len(parade.keyframes) <= keyframes + 1
+
+
+def test_a_look_that_struck_is_followed_by_a_test_once_the_load_allows_for_it(street: list[Frame], start: np.ndarray) -> None:
+    parade = Parade(street, start, monitor={"frozen_images": 0})
+    parade(8)
+    parade.settle()
+    recalibrator, standing = parade.recalibrator, street[parade.n % len(street)]
+
+    def show(seconds: float, deg: float, permit: bool) -> str:
+        for _ in range(round(seconds / 0.1)):
+            parade.n += 0.1
+            stamp = round((1000 + parade.n * GAP_S) * NANOSECONDS)
+            frame = dataclasses.replace(turned(standing, deg), stamp=stamp, cloud_stamp=stamp, compensated=True)
+            recalibrator.ingest(frame, permit=lambda: permit)
+        return recalibrator.current.result.status
+
+    assert show(6, 0.0, True) == CONVERGED
+    assert show(3, 1.5, False) == CONVERGED  # no CPU time is left
+    assert show(0.5, 1.5, True) == SUSPECT
