@@ -1,14 +1,14 @@
-"""A look at frames between keyframes: do they still match at the current extrinsic? At a quarter of the cost of a keyframe.
+"""A look at frames between keyframes: do they still match at the current extrinsic? At a small part of the cost of a keyframe.
 
-The edges of the part of the scan that is in view are laid over the edges of a small picture at the current extrinsic, and shifted
-by some pixels each way. At a right extrinsic nothing matches much better than no shift. How much better something may is learnt
-from the looks before: one that is worse than all of them says nothing about the extrinsic, but is worth a test of the monitor.
+The points in view are drawn into a small picture at the current extrinsic, and the edges of their depth are laid over the edges
+of the image, shifted by some pixels each way. At a right extrinsic nothing matches much better than no shift. How much better
+something may is learnt from the looks before: one that is worse than all of them says nothing about the extrinsic, but is worth a
+test of the monitor. Neither rings nor an order of the points are needed.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,11 +19,9 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
-from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH, blurred_levels, oriented_edges
-from calib_ros.lidar.deskew import deskewed_edges
-from calib_ros.lidar.edges import UPWARD, edge_points
-from calib_ros.lidar.range_image import range_image
+from calib_ros.lidar.deskew import image_times, moved, used_twist
 
 EVERY_S = 0.35  # between looks, by the data's stamps: every fourth frame at 10 Hz, for a knock is to be told within a second
 KEPT = 50  # looks that tell what is usual: of as many more, one is by chance worse than all of these, in a quarter of a minute
@@ -31,9 +29,12 @@ LEAST_KEPT = 10
 WIDTH = 320  # px of the small picture: a pixel is a quarter of a degree of usual lenses
 BLUR = 1.5  # px; edges that are up to two pixels apart meet
 REACH = 12  # px, to which edges are shifted each way: three degrees of usual lenses
-DENSE_RINGS = 32  # of scanners with as many rings every second one is enough
-BORDER = np.deg2rad(3.0)  # around the field of view, from which edges in it are told
-LEAST_EDGES = 50  # in view; fewer tell nothing
+BORDER = np.deg2rad(3.0)  # around the field of view, from which points in it are told
+LEAST_POINTS = 50  # in view; fewer tell nothing
+GAPS = 75.0  # percentile of the gaps between points, up to which they are closed: those of rings, or of a rosette
+MOST_CLOSED = 15  # px
+# Of the logarithm of depth: from pixel to pixel, that of the ground changes by less than FLAT from 3 deg below the horizon on.
+FLAT, JUMP = 0.08, 0.25  # what is that much more counts as a full edge
 
 Map = NDArray[np.float32]
 
@@ -73,48 +74,86 @@ class Glance:
 
 def match_loss(frame: Frame, T: Transform, config: Config) -> float | None:
     """By how much some shift of the edges of a scan over those of the image matches better than none at T (4, 4), in standard
-    deviations over all shifts. None where there are too few edges, or the scan has no rings: its edges take too long."""
-    cloud = in_view(frame.cloud, T, frame.camera)
-    if len(cloud) < LEAST_EDGES:
+    deviations over all shifts. None where there are too few points in view, or no edges."""
+    nearness = nearness_picture(frame, T, config)
+    if np.count_nonzero(nearness) < LEAST_POINTS:
         return None
-    scan = range_image(cloud, config.lidar)
-    if scan.layout != "rings":
-        return None
-    points = deskewed_edges(edge_points(scan, config.lidar), frame, config.motion)
-    pixels, inside = frame.camera.project(se3.transform(T, points.xyz.astype(float)))
-    if np.count_nonzero(inside) < LEAST_EDGES:
-        return None
-    upward, strength = np.isin(points.kind[inside], UPWARD), points.strength[inside]
-    maps = small_edges(frame.image, config)
-    height, width = maps.shape[1:]
-    scale = width / frame.camera.width
-    at = np.rint((pixels[inside] + 0.5) * scale - 0.5).astype(int)
-    at = np.clip(at, 0, (width - 1, height - 1))
     matches = np.zeros((2 * REACH + 1,) * 2)
-    for channel, own in enumerate((~upward, upward)):
-        drawn = np.zeros((height, width), np.float32)
-        np.add.at(drawn, (at[own, 1], at[own, 0]), strength[own] / max(float(strength[own].sum()), 1e-6))
-        around = cv2.copyMakeBorder(maps[channel], *(REACH,) * 4, cv2.BORDER_CONSTANT)
-        matches += cv2.matchTemplate(around, drawn, cv2.TM_CCORR)
+    for of_image, of_scan in zip(image_edges(frame.image, config), depth_edges(nearness), strict=True):
+        if (total := float(of_scan.sum())) > 0:
+            around = cv2.copyMakeBorder(of_image, *(REACH,) * 4, cv2.BORDER_CONSTANT)
+            matches += cv2.matchTemplate(around, of_scan, cv2.TM_CCORR) / total
     spread = float(matches.std())
     return (float(matches.max()) - float(matches[REACH, REACH])) / spread if spread > 0 else None
 
 
-def in_view(cloud: PointCloud, T: Transform, camera: Camera) -> PointCloud:
-    """The part of a cloud that a camera at T (4, 4) sees, and a little around it; of many rings every second one. Without
-    intensities: their edges take as long as half of the others, and tell less."""
-    along = cloud.xyz @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
-    distance = np.sqrt(np.einsum("ij,ij->i", cloud.xyz, cloud.xyz))
-    seen = along > np.float32(np.cos(min(np.deg2rad(camera.field_deg) / 2 + BORDER, np.pi))) * distance
-    if cloud.ring is not None and len(cloud) and int(cloud.ring.max()) >= DENSE_RINGS - 1:
-        seen &= cloud.ring % 2 == 0
-    return replace(cloud, intensity=None, label=None).select(np.flatnonzero(seen))
+def nearness_picture(frame: Frame, T: Transform, config: Config) -> Map:
+    """Inverse distance (h, WIDTH), 1/m, of the nearest point in every pixel of a small picture at T (4, 4); 0 = none."""
+    camera, xyz = frame.camera, frame.cloud.xyz
+    width = min(WIDTH, camera.width)
+    scale = width / camera.width
+    height = max(round(camera.height * scale), 1)
+    seen = in_view(xyz, T, camera, config.lidar.min_range)
+    points = xyz[seen].astype(float)
+    if (twist := used_twist(frame, config.motion)) is not None:
+        time = None if frame.cloud.time is None else frame.cloud.time[seen]
+        points = moved(points, twist, image_times(frame, points, time, config.motion))
+    points = se3.transform(T, points)
+    pixels, inside = camera.project(points)
+    column, row = np.minimum(((pixels[inside] + 0.5) * scale).astype(np.intp), (width - 1, height - 1)).T
+    picture = np.zeros(height * width, np.float32)
+    np.maximum.at(picture, row * width + column, (1 / np.linalg.norm(points[inside], axis=1)).astype(np.float32))
+    return picture.reshape(height, width)
 
 
-def small_edges(image: NDArray[np.uint8], config: Config) -> Map:
+def in_view(xyz: NDArray[np.float32], T: Transform, camera: Camera, min_range: float) -> NDArray[np.intp]:
+    """Which points (n, 3) a camera at T (4, 4) sees, or nearly so, from min_range on. Lost returns are not among them."""
+    centre = (-T[:3, :3].T @ T[:3, 3]).astype(np.float32)
+    z = xyz @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
+    square = (xyz * xyz) @ np.ones(3, np.float32)
+    distance = np.sqrt(np.maximum(square - 2 * (xyz @ centre) + centre @ centre, 0))  # from the camera
+    least = np.float32(np.cos(min(np.deg2rad(camera.field_deg) / 2 + BORDER, np.pi)))
+    return np.flatnonzero((z > least * distance) & (square >= min_range**2))
+
+
+def depth_edges(nearness: Map) -> tuple[Map, Map]:
+    """Edges of depth, two (h, w) in 0..1, from inverse distances (h, w): across and down, on the nearer side of each jump."""
+    gap = usual_gap(nearness.T)
+    level = cv2.morphologyEx(nearness, cv2.MORPH_CLOSE, np.ones((closing(gap), closing(usual_gap(nearness))), np.uint8))
+    np.log(level, out=level, where=level > 0)
+    across, down = np.zeros_like(level), np.zeros_like(level)
+    _mark_jumps(level, FLAT, across)
+    if gap <= 2 * BLUR:  # rings farther apart do not tell where between them an edge lies
+        _mark_jumps(level.T, FLAT * gap, down.T)
+    return across, down
+
+
+def _mark_jumps(level: Map, flat: float, edges: Map) -> None:
+    """Along the rows of logarithms (h, w), where 0 is unknown: those beyond `flat`, into edges (h, w)."""
+    jump = np.where((level[:, 1:] != 0) & (level[:, :-1] != 0), np.diff(level), 0)
+    strength = np.clip((np.abs(jump) - flat) / JUMP, 0, 1)
+    edges[:, 1:] = np.where(jump > 0, strength, 0)
+    np.maximum(edges[:, :-1], np.where(jump < 0, strength, 0), out=edges[:, :-1])
+
+
+def usual_gap(picture: Map) -> int:
+    """How far apart, px, drawn pixels of the same row usually are at most."""
+    row, column = np.nonzero(picture)
+    gaps = np.diff(column)[np.diff(row) == 0]
+    return int(np.percentile(gaps, GAPS)) if len(gaps) else 1
+
+
+def closing(gap: int) -> int:
+    """Size of the kernel, px, that closes such gaps."""
+    return min(max(gap | 1, 3), MOST_CLOSED)
+
+
+def image_edges(image: NDArray[np.uint8], config: Config) -> Map:
     """Edges (2, h, w) of an image (H, W[, 3]) at a width of WIDTH, blurred: of horizontal and of vertical gradients."""
-    grey = image if image.ndim == 2 else image[:, :, 1]
-    width = min(WIDTH, grey.shape[1])
-    small = cv2.resize(grey, (width, max(round(grey.shape[0] * width / grey.shape[1]), 1)), interpolation=cv2.INTER_AREA)
+    height, width = image.shape[:2]
+    step = max(width // (2 * WIDTH), 1)  # two samples a pixel are enough
+    grey = np.ascontiguousarray(image[::step, ::step] if image.ndim == 2 else image[::step, ::step, 1])
+    own = min(WIDTH, width)
+    small = cv2.resize(grey, (own, max(round(height * own / width), 1)), interpolation=cv2.INTER_AREA)
     edges = oriented_edges(np.asarray(small, np.uint8), config.image)
     return blurred_levels(edges, REFERENCE_FOCAL_LENGTH, (BLUR,), local_contrast=True)[0].maps

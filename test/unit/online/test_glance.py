@@ -11,7 +11,7 @@ from scenes import RenderedDrive, Scene
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.online.glance import EVERY_S, LEAST_KEPT, Glance, in_view, match_loss
+from calib_ros.online.glance import EVERY_S, LEAST_KEPT, Glance, depth_edges, in_view, match_loss, nearness_picture
 
 CONFIG = Config()
 KNOCKS = {"1.5 deg": ([0.9, 0.9, 0.8], [0, 0, 0]), "15 cm": ([0, 0, 0], [0.1, -0.1, 0.05])}
@@ -66,17 +66,34 @@ def test_what_cannot_be_looked_at_says_nothing(scene):
     nan = replace(frame, cloud=replace(frame.cloud, xyz=np.full_like(frame.cloud.xyz, np.nan)))
     assert [match_loss(f, scene.truth, CONFIG) for f in (empty, black, nan)] == [None] * 3
     assert match_loss(frame, behind, CONFIG) != 0.0  # whatever is there: no exception
-    rosette = RenderedDrive(seed=1, frames=1, rings=0, width=320, height=120)
-    assert match_loss(rosette[0], rosette.reference, CONFIG) is None  # a scanner without rings
 
 
-def test_only_what_is_in_view_is_looked_at(scene):
-    cloud = scene.frames[0].cloud
-    part = in_view(cloud, scene.truth, scene.camera)
-    assert 0.05 * len(cloud) < len(part) < 0.25 * len(cloud)
-    if cloud.ring is not None:
-        assert not np.any(part.ring % 2)
-    _, inside = scene.camera.project(se3.transform(scene.truth, cloud.xyz.astype(float)))
-    _, of_part = scene.camera.project(se3.transform(scene.truth, part.xyz.astype(float)))
-    rings = 2 if cloud.ring is not None else 1
-    assert np.count_nonzero(of_part) == pytest.approx(np.count_nonzero(inside) / rings, rel=0.1)
+def test_neither_rings_nor_an_order_of_points_are_needed(scene):
+    frame = scene.frames[0]
+    cloud = replace(frame.cloud, ring=None).select(np.random.default_rng(0).permutation(len(frame.cloud)))
+    assert match_loss(replace(frame, cloud=cloud), scene.truth, CONFIG) == match_loss(frame, scene.truth, CONFIG)
+    rosette = RenderedDrive(seed=1, frames=1, rings=0)
+    off = se3.perturb(rosette.reference, [0, 2, 0], [0, 0, 0])
+    losses = [match_loss(rosette[0], T, CONFIG) for T in (rosette.reference, off)]
+    assert losses[1] > losses[0] + 0.5
+
+
+def test_only_what_is_in_view_is_drawn(scene):
+    xyz = scene.frames[0].cloud.xyz
+    seen = in_view(xyz, scene.truth, scene.camera, 1.0)
+    _, inside = scene.camera.project(se3.transform(scene.truth, xyz.astype(float)))
+    assert len(seen) < 0.25 * len(xyz)
+    assert set(np.flatnonzero(inside & (np.linalg.norm(xyz, axis=1) >= 1.0))) <= set(seen)
+    nearness = nearness_picture(scene.frames[0], scene.truth, CONFIG)
+    assert 1 / nearness[nearness > 0].min() <= np.linalg.norm(xyz[seen], axis=1).max() + 3.0
+
+
+def test_depth_edges_lie_on_the_nearer_side():
+    nearness = np.full((40, 60), 1 / 20, np.float32)
+    nearness[10:30, 20:40] = 1 / 5
+    nearness[::2] = 0  # every second row is empty
+    across, down = depth_edges(nearness)
+    assert np.array_equal(np.unique(np.nonzero(across)[1]), [20, 39])
+    assert np.array_equal(np.unique(np.nonzero(down)[0]), [11, 29]) or np.array_equal(np.unique(np.nonzero(down)[0]), [10, 29])
+    sparse = np.where(np.arange(40)[:, None] % 8 == 0, nearness + 0.05, 0).astype(np.float32)
+    assert not depth_edges(sparse)[1].any()
