@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import fdtri, gammaln, logsumexp
 
 from calib_ros.arrays import Covariance, Matrix
 from calib_ros.registration.covariance import free_axes
@@ -19,6 +19,7 @@ SIZES_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)
 M_PER_DEG = 0.1
 REMEMBERED = 50  # keyframes that tell how well a right extrinsic matches here
 MIN_REMEMBERED = 3  # of these, needed to judge
+TAIL = 0.9  # quantile of shifts by which covariances are scaled: of REMEMBERED ones five lie beyond
 LOWEST = -20.0  # of one keyframe; what matches as usual does not make up for all that comes after it
 
 
@@ -50,6 +51,28 @@ def shift_evidence(shift: Matrix, covariance: Covariance, freedom: float) -> flo
     shifts = [np.r_[[0.0] * 3, [(M_PER_DEG * deg) ** 2 / 3] * 3] for deg in SIZES_DEG]
     moved = [log_density(added) for added in turns + shifts]
     return float(logsumexp(moved) - np.log(len(moved)) - log_density(np.zeros(6)))
+
+
+class ShiftNoise:
+    """How large shifts are here while the extrinsic is right, in units of their covariances: learnt from keyframes that fit.
+
+    A covariance is made to be safe on one keyframe of any scene; the shifts of many of a drive tell how far it is. What counts is
+    their tail, from which false alarms come. Not thread-safe.
+    """
+
+    def __init__(self) -> None:
+        self._usual: deque[float] = deque(maxlen=REMEMBERED)
+
+    def learn(self, squared: float, axes: int, freedom: float) -> None:
+        """A keyframe that fits has this squared Mahalanobis distance (see `covariance.distance`) by a covariance of `freedom`."""
+        if axes:
+            self._usual.append(squared / axes / float(fdtri(axes, freedom, TAIL)))
+
+    @property
+    def scale(self) -> float:
+        """Factor of covariances; before anything is known 1, which counts as MIN_REMEMBERED keyframes."""
+        n = len(self._usual)
+        return (MIN_REMEMBERED + n * float(np.quantile(self._usual, TAIL))) / (MIN_REMEMBERED + n) if n else 1.0
 
 
 class MatchEvidence:

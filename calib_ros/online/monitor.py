@@ -14,7 +14,7 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.config import MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, shift_evidence
+from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, ShiftNoise, shift_evidence
 from calib_ros.online.glance import EVERY_S
 from calib_ros.registration.acceptance.significance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.acceptance.split_half import disagreement
@@ -83,7 +83,8 @@ class ShiftTest:
     optimum, rad and m. z_score: how far the score at the extrinsic lies above the null distribution of its surroundings, in
     standard deviations, median of the keyframes. conclusive: the keyframes constrain the extrinsic. score: at the optimum.
     points: edge points that a keyframe's z-score rests on, those that weigh little counted less. significant: the optimum is
-    better than those that decoys reach by chance, so that its place means something. keyframes: how many took part.
+    better than those that decoys reach by chance, so that its place means something. keyframes: how many took part. squared,
+    axes, freedom: of the shift, by a covariance that is not scaled: see ShiftNoise.
     """
 
     p_value: float
@@ -95,6 +96,9 @@ class ShiftTest:
     significant: bool = True
     keyframes: int = 1
     evidence: float = 0.0
+    squared: float = 0.0
+    axes: int = 0
+    freedom: float = 1.0
 
     @property
     def deg(self) -> float:
@@ -142,7 +146,7 @@ class Monitor:
 
     def __init__(self, config: MonitorConfig) -> None:
         self.config = config
-        self._match = MatchEvidence()
+        self._match, self._noise = MatchEvidence(), ShiftNoise()
         self._counts: deque[int] = deque(maxlen=REMEMBERED)  # of the edge points that keyframes had in view
         self.reset()
 
@@ -174,7 +178,7 @@ class Monitor:
         To be called once per keyframe. anchor: see ObjectiveMaker.of_edges. same_scene: the newest one shows what the one before
         it has shown.
         """
-        alone = measure_shift(calibrator, keyframes[-1:], T, spread, anchor)
+        alone = measure_shift(calibrator, keyframes[-1:], T, spread, anchor, self._noise.scale)
         if alone.conclusive:
             self._match.add(alone.z_score, alone.points, same_scene)
         self._suspects = self._suspects + 1 if self._suspects else 0
@@ -182,7 +186,7 @@ class Monitor:
         window = min(window, self.config.confirm if self._out_of_sync else FAILED_WINDOWS * WINDOW)
         newest = keyframes[-window:]
         informative = self.informative(newest, T) or newest[-1:]
-        together = alone if window == 1 else measure_shift(calibrator, informative, T, spread, anchor)
+        together = alone if window == 1 else measure_shift(calibrator, informative, T, spread, anchor, self._noise.scale)
         if self._suspects:
             several = together.keyframes >= min(self.config.confirm, len(newest))  # not one of them, tested again and again
             return self._decide(calibrator, informative, T, together, window, several)
@@ -200,6 +204,7 @@ class Monitor:
             return Assessment(Verdict.SUSPECT, self._describe(test, count), test.p_value, count)
         if alone.conclusive and alone.significant and not same_scene:
             self._match.learn(alone.z_score, alone.points)
+            self._noise.learn(alone.squared, alone.axes, alone.freedom)
             self._counts.append(points_in_view(keyframes[-1], T))
         # An optimum that may be chance speaks neither against the extrinsic nor for it.
         if not (together.conclusive and together.significant) or self.in_doubt:
@@ -269,12 +274,13 @@ def measure_shift(
     T: Transform,
     spread: Covariance | None = None,
     anchor: Transform | None = None,
+    scale: float = 1.0,
 ) -> ShiftTest:
     """Optimise from T (4, 4) on the keyframes alone: how far does the optimum lie, in units of the uncertainty?
 
-    spread: covariance (6, 6) of T itself; None = T is exact. anchor: see ObjectiveMaker.of_edges. A test of this kind finds
-    smaller errors than the share of worse neighbours (Levinson and Thrun 2013), since it uses the shape of the score and not
-    only its order.
+    spread: covariance (6, 6) of T itself; None = T is exact. anchor: see ObjectiveMaker.of_edges. scale: of both covariances, see
+    ShiftNoise. A test of this kind finds smaller errors than the share of worse neighbours (Levinson and Thrun 2013), since it
+    uses the shape of the score and not only its order.
     """
     try:
         objective = calibrator.objectives.of_edges(keyframes, T, anchor)
@@ -289,10 +295,12 @@ def measure_shift(
     shift = se3.log(X @ se3.inverse(T))
     known = np.zeros((6, 6)) if spread is None else spread
     freedom, together = REGIONS * effective_frames(score), C + known  # see noise_level: its prior makes up for the unknowns
+    squared, axes = distance(shift, together)
+    together *= scale
     p_value = _p_value(shift, together, freedom)
     if p_value < IN_DOUBT:  # a biased optimum shows in halves that disagree; they take longer than all the rest
         halves = disagreement(score, X, objective.constraints.limits)
-        together = max(halves, 1.0) * C + known
+        together = scale * (max(halves, 1.0) * C + known)
         p_value = _p_value(shift, together, freedom)
     conclusive = bool(sigma[:3].max() < np.deg2rad(MAX_SIGMA_DEG) and sigma[3:].max() < MAX_SIGMA_M)
     z_score = float(np.nanmedian(null.z_scores)) if np.isfinite(null.z_scores).any() else 0.0
@@ -300,7 +308,8 @@ def measure_shift(
     points = effective_points(score) / max(len(np.unique(score.frame)), 1)
     significant = null.z_score_of(reached) > HIGHEST_DECOY_Z
     evidence = shift_evidence(shift, together, freedom)
-    return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes), evidence)
+    of_all = (evidence, squared, axes, freedom)
+    return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes), *of_all)
 
 
 def clock_covariance(keyframes: Sequence[FrameFeatures], T: Transform, sigma_s: float) -> Covariance:

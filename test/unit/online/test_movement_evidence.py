@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from calib_ros.online.evidence import MatchEvidence, log_student, shift_evidence
+from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, ShiftNoise, log_student, shift_evidence
 
 C = np.diag(np.r_[[np.deg2rad(0.1)] * 3, [0.02] * 3] ** 2)
 
@@ -41,6 +41,24 @@ def test_fixed_axes_say_nothing():
     x = np.r_[np.deg2rad(1.0), 0.0, 0.0, 0.3, 0.0, 0.0]
     assert shift_evidence(x, fixed, 12.0) == shift_evidence(np.r_[x[:3], 0, 0, 0], fixed, 12.0) > 5
     assert shift_evidence(x, np.zeros((6, 6)), 12.0) == 0.0
+
+
+@pytest.mark.parametrize("factor", [0.25, 1.0, 3.0])
+def test_covariances_are_scaled_by_the_shifts_of_a_right_extrinsic(factor):
+    noise, freedom = ShiftNoise(), 12.0
+    assert noise.scale == 1.0
+    shifts = multivariate_t(np.zeros(6), C, freedom, seed=2).rvs(20 * REMEMBERED)
+    squared = factor * np.einsum("ij,jk,ik->i", shifts, np.linalg.inv(C), shifts)
+    scales = []
+    for k, own in enumerate(squared):
+        noise.learn(own, 6, freedom)
+        scales += [noise.scale] * (k >= REMEMBERED)
+    expected = (MIN_REMEMBERED + REMEMBERED * factor) / (MIN_REMEMBERED + REMEMBERED)  # what was thought before counts a little
+    assert np.median(scales) == pytest.approx(expected, rel=0.15)
+    few = ShiftNoise()
+    few.learn(0.0, 6, freedom)
+    few.learn(0.0, 0, freedom)  # all axes are fixed: nothing is learnt
+    assert few.scale == MIN_REMEMBERED / (MIN_REMEMBERED + 1)
 
 
 def matching(z_scores: list[float], points: float = 400.0) -> MatchEvidence:
