@@ -9,7 +9,7 @@ import numpy as np
 
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.config import Config, MotionConfig
-from calib_ros.errors import TooFewFeaturesError
+from calib_ros.errors import CalibrationError
 from calib_ros.intrinsics import IntrinsicEstimate
 from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, Refusal, joined, outliers_note, unobservable_note
 from calib_ros.registration.acceptance.significance import NullDistribution, null_distribution
@@ -92,7 +92,7 @@ class Estimate:
         if clocks is None or active.any():  # else it is that of the same optimum
             clocks = offset.effect(moving[0], T, limits)
         effect = replace(clocks, information=0.0) if known else clocks  # these scenes count only once
-        shared += offset.added_covariance(effect, constraints, covariance)
+        shared += effect.constrained(constraints, covariance, sigma_s).covariance(sigma_s)
         return Nuisance(shared, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s))
 
     def result(self, nuisance: Nuisance, refusal: Refusal | None, motion: MotionConfig, notes: Sequence[str]) -> Result:
@@ -101,7 +101,8 @@ class Estimate:
         names = [f.name or str(k) for k, f in enumerate(features)]
         outliers, clocks, largest_s = [names[k] for k in self.alignment.outliers], nuisance.clocks, motion.max_time_offset_s
         used = len(features) - len(outliers)
-        known = None if refusal or not self.offset_is_known(motion) else self.optimised
+        offset = self.optimised.offset
+        known = None if refusal or offset is None or not offset.observable(motion) else self.optimised
         reasons = [
             str(refusal) if refusal else "",
             *notes,
@@ -137,17 +138,13 @@ class Estimate:
             stamping=None if known is None else known.stamping,
         )
 
-    def offset_is_known(self, motion: MotionConfig) -> bool:
-        """Whether the scenes tell the offset of the clocks."""
-        return self.optimised.offset is not None and self.optimised.offset.observable(motion)
-
 
 def _intrinsic(estimate: NuisanceEstimate) -> IntrinsicEstimate:
     unit = estimate.parameter.unit
     return IntrinsicEstimate(unit * estimate.value, unit * estimate.sigma, estimate.is_observable)
 
 
-def insufficient(error: TooFewFeaturesError, initial: Transform, frames: int, notes: Sequence[str]) -> Result:
+def insufficient(error: CalibrationError, initial: Transform, frames: int, notes: Sequence[str] = ()) -> Result:
     """The Result where the frames show too little to estimate anything."""
     reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
     return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)

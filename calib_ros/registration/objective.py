@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +20,7 @@ from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective, views_of
 from calib_ros.registration.progress import SILENT, Observer, Progress
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import MARGIN, FastScore, PointScore, Score, SmoothScore
+from calib_ros.registration.score.point_score import MARGIN, FastScore, PointScore, SmoothScore
 from calib_ros.registration.search.constraints import (
     REFINEMENT_DEG,
     REFINEMENT_M,
@@ -216,18 +216,6 @@ class FastObjective:
             self.observer.reached(T)
 
 
-@dataclass(frozen=True, eq=False)
-class WithPrior:
-    """A score less the cost of a prior, for optimisers that know of no prior; a Score."""
-
-    score: Score
-    constraints: PoseConstraints
-
-    def value(self, T: Transform) -> float:
-        """At T (4, 4)."""
-        return self.score.value(T) - self.constraints.cost(T)
-
-
 def optimise_smooth(
     score: SmoothScore,
     T: Transform,
@@ -237,12 +225,12 @@ def optimise_smooth(
     tolerance_deg: float = TOLERANCE_DEG,
 ) -> Transform:
     """The optimum from T (4, 4) by ``refine.optimizer``, which is Levenberg-Marquardt where nothing is asked for."""
-    evaluations, prior = 4 * SIMPLEX_EVALUATIONS, constraints.prior
-    if config.refine.optimizer == "nelder_mead":
-        return nelder_mead(score, T, step_deg, evaluations, None if prior is None else prior.value, constraints.limits)[0]
-    if config.refine.optimizer == "barzilai_borwein":
-        return barzilai_borwein(WithPrior(score, constraints), T, step_deg, evaluations=evaluations, limits=constraints.limits)[0]
-    return levenberg_marquardt(score, T, ITERATIONS, prior, constraints.limits, tolerance_deg, near=True)[0]
+    evaluations, limits, optimizer = 4 * SIMPLEX_EVALUATIONS, constraints.limits, config.refine.optimizer
+    if optimizer == "nelder_mead":
+        return nelder_mead(score, T, step_deg, evaluations, constraints.cost, limits)[0]
+    if optimizer == "barzilai_borwein":
+        return barzilai_borwein(score, T, step_deg, evaluations=evaluations, limits=limits, penalty=constraints.cost)[0]
+    return levenberg_marquardt(score, T, ITERATIONS, constraints.prior, limits, tolerance_deg, near=True)[0]
 
 
 def trust_region(box: SearchBox | None = None) -> tuple[float, float]:

@@ -22,10 +22,11 @@ from calib_ros.registration.acceptance.refusal import (
     wrong_times,
 )
 from calib_ros.registration.acceptance.significance import (
+    RATIO_CONSISTENT,
+    RATIO_INCONSISTENT,
     UNDOUBTED_Z,
     check_significance,
     check_uncertainty,
-    is_borderline,
     p_value,
     semantic_likelihood_ratio,
 )
@@ -83,7 +84,7 @@ class Acceptance:
         """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
         T, evidence = found.alignment.T, found.evidence
         largest, ratio = self.config.refine.max_p_value, 1.0
-        if is_borderline(evidence.p_value, largest):
+        if largest * RATIO_INCONSISTENT < evidence.p_value <= largest * RATIO_CONSISTENT:  # they can change the verdict
             kept = [f for k, f in enumerate(found.optimised.features) if k not in found.alignment.outliers]
             ratio = semantic_likelihood_ratio(consistency_score(views_of(kept)), T)
         score = found.objective.edges.score.at(-1).value(T)

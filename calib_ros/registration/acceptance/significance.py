@@ -116,11 +116,6 @@ def check_significance(
     return not_significant(z_score, HIGHEST_DECOY_Z if decoy_z is None else decoy_z, p, largest * ratio, ratio < 1)
 
 
-def is_borderline(p: float, largest: float) -> bool:
-    """Can the classes change the verdict on a p value?"""
-    return largest * RATIO_INCONSISTENT < p <= largest * RATIO_CONSISTENT
-
-
 def leaves_doubt(result: Result) -> bool:
     """Can classes change this result of an estimate without them? They help to find an optimum, and to tell it from chance."""
     if result.refusal in (RefusalCode.WRONG_INTRINSICS, RefusalCode.WRONG_TIMES):

@@ -8,15 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.classes import Hypothesis
+from calib_ros.registration.estimate import insufficient
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import MOTION, SEMANTIC, nominal
 from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, SearchBox
-from calib_ros.result import INSUFFICIENT, InitialSource, RefusalCode, Result
+from calib_ros.result import InitialSource, Result
 
 Matrix = NDArray[np.float64]
 # To the best score; a hypothesis near the truth had 0.92 or more (in 75 of 80 sets of 1 to 10 KITTI frames, 68 times first).
@@ -76,7 +77,7 @@ class Guesser:
         try:
             guess = motion_guess(self.consecutive, self.extract, self.extract.config.search.seed)
         except TooFewFeaturesError as error:
-            return self._insufficient(error)
+            return insufficient(error, nominal(), self.frames)
         hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
         result, _ = best_registration(hypotheses, self.register, self.box or guess.box)
         return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
@@ -88,7 +89,7 @@ class Guesser:
         try:
             tried[MOTION] = self.from_motion()
         except (BadInputError, MissingDependencyError) as error:
-            tried[MOTION] = self._insufficient(error)
+            tried[MOTION] = insufficient(error, nominal(), self.frames)
         if not tried[MOTION].converged and self.has_classes:
             tried[SEMANTIC] = self.register(SEMANTIC, self.box)
         if not any(result.converged for result in tried.values()):
@@ -97,7 +98,3 @@ class Guesser:
         best = better(list(tried.values()))
         others = [f"not by {name}: {result.reason}" for name, result in tried.items() if result is not best]
         return replace(best, reason=joined([best.reason, *others]))
-
-    def _insufficient(self, error: CalibrationError) -> Result:
-        code = RefusalCode.TOO_FEW_FEATURES
-        return Result(nominal(), INSUFFICIENT, str(error), frames_used=self.frames, initial=nominal(), refusal=code)

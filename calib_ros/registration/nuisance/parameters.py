@@ -115,10 +115,6 @@ class NuisanceParameter(ABC):
         fallen = max(values[1] - 0.5 * (values[0] + values[2]), 0.0)
         return Effect(direction, 2 * fallen / self.step**2 / noise_of(part, T, limits))
 
-    def added_covariance(self, effect: Effect, constraints: PoseConstraints, covariance: Covariance) -> Covariance:
-        """Covariance (6, 6) that it adds to an optimum whose own is `covariance`."""
-        return effect.constrained(constraints, covariance, self.sigma).covariance(self.sigma)
-
     def scores_at(self, score: PointScore, T: Transform, values: Iterable[float]) -> list[float]:
         """Score with each value, the extrinsic held at T (4, 4)."""
         return [self.changed(score, T, float(x))[0].at(-1).value(T) for x in values]

@@ -190,21 +190,26 @@ def barzilai_borwein(
     epsilon_deg: float = 0.1,
     evaluations: int = 240,
     limits: Limits | None = None,
+    penalty: Callable[[Matrix], float] | None = None,
 ) -> tuple[Matrix, float]:
     """Gradient ascent with the step length of Barzilai and Borwein (1988), eq. 3.13 and 3.14 of the thesis.
 
     epsilon_deg: half width of the central differences, deg (METRES_PER_RADIAN times that in translation). step_deg: first step,
-    and the longest one. Steps may lower the score: the best extrinsic seen (4, 4) is returned, with its score. Ends after
-    `evaluations`, or when a step falls below a twentieth of epsilon.
+    and the longest one. Steps may lower the score: the best extrinsic seen (4, 4) is returned, with its score less the penalty.
+    Ends after `evaluations`, or when a step falls below a twentieth of epsilon.
     """
     epsilon, longest = np.deg2rad(epsilon_deg), np.deg2rad(step_deg)
     limits = limits or unlimited(T)
     T = limits.clip(T)
-    here, best, best_value = T, T, score.value(T)
+
+    def value_at(X: Matrix) -> float:
+        return score.value(X) - (penalty(X) if penalty else 0.0)
+
+    here, best, best_value = T, T, value_at(T)
     used, step, gradient = 1, np.zeros(6), np.zeros(6)
     while used + 13 <= evaluations:
-        ahead = [score.value(se3.exp(epsilon * AXES * axis) @ here) for axis in np.eye(6)]
-        behind = [score.value(se3.exp(-epsilon * AXES * axis) @ here) for axis in np.eye(6)]
+        ahead = [value_at(se3.exp(epsilon * AXES * axis) @ here) for axis in np.eye(6)]
+        behind = [value_at(se3.exp(-epsilon * AXES * axis) @ here) for axis in np.eye(6)]
         last, gradient = gradient, (np.array(ahead) - np.array(behind)) / (2 * epsilon)
         gradient = np.where(limits.movable(here, gradient), gradient, 0.0)
         used += 12
@@ -218,7 +223,7 @@ def barzilai_borwein(
             break
         step = alpha * gradient / steepness
         here = limits.clip(se3.exp(step * AXES) @ here)
-        value = score.value(here)
+        value = value_at(here)
         used += 1
         if value > best_value:
             best, best_value = here, value

@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy_sampler import NumpySampler
 from scenes import FAR, NEAR, Scene, assert_not_used, same
 
 from calib_ros import se3
@@ -21,7 +20,6 @@ from calib_ros.registration.acceptance.significance import check_uncertainty, nu
 from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import SILENT, Progress
-from calib_ros.registration.score import point_score
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import levenberg_marquardt
@@ -213,18 +211,6 @@ def test_any_number_of_threads_finds_the_same_to_the_last_bit(scene):
     assert results[1] == results[2] == results[5]
     assert reports[1] == reports[2] == reports[5]
     assert np.diff(reports[1]).min() > -1e-9
-
-
-def test_an_estimate_is_the_same_with_the_kernel_and_its_reference(scene, monkeypatch):
-    calibrator = Calibrator(scene.camera, Config(search=replace(RANKED, threads=2)))
-    compiled = calibrator.estimate(scene.features, scene.off(FAR), LARGE)
-    scene.assert_found(compiled)
-    monkeypatch.setattr(point_score, "Sampler", NumpySampler)
-    by_numpy = calibrator.estimate(scene.features, scene.off(FAR), LARGE)
-    assert by_numpy.T_camera_lidar == pytest.approx(compiled.T_camera_lidar, abs=1e-6)
-    one = Calibrator(scene.camera, Config(search=RANKED)).estimate(scene.features, scene.off(FAR), LARGE)
-    assert one.T_camera_lidar.tobytes() == by_numpy.T_camera_lidar.tobytes()
-    assert one.covariance.tobytes() == by_numpy.covariance.tobytes()
 
 
 @pytest.mark.parametrize(("threads", "after"), [(1, 0.2), (2, 0.0), (2, 0.4)])
