@@ -14,7 +14,7 @@ from calib_ros.image.edges import SIGMAS
 from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.registration.classes import OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros.registration.objective import AFTER_SEARCH, FIRST_STEP_DEG, FastObjective, WithPrior, optimise_smooth
+from calib_ros.registration.objective import AFTER_SEARCH, FIRST_STEP_DEG, FastObjective, optimise_smooth
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import PointScore, Score
 from calib_ros.registration.search.optimizers import barzilai_borwein, nelder_mead
@@ -122,9 +122,8 @@ class ThesisObjective:
         score = _Reporting(self.score.at(level), evaluations, progress.of("refinement"))
         step, limits = FIRST_SIMPLEX_DEG / 2 ** (level % self.score.n_levels), self.constraints.limits
         if optimizer == "barzilai_borwein":
-            return barzilai_borwein(WithPrior(score, self.constraints), T, step, evaluations=evaluations, limits=limits)[0]
-        prior = self.constraints.prior
-        return nelder_mead(score, T, step, evaluations, None if prior is None else prior.value, limits)[0]
+            return barzilai_borwein(score, T, step, evaluations=evaluations, limits=limits, penalty=self.constraints.cost)[0]
+        return nelder_mead(score, T, step, evaluations, self.constraints.cost, limits)[0]
 
     def _attached_level(self, level: int, T: Matrix, step_deg: float) -> Matrix:
         """The optimum on one level with edges attached at T."""

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,23 +26,19 @@ from calib_ros.registration.acceptance.checks import Acceptance
 from calib_ros.registration.acceptance.refusal import joined, semantic_note
 from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.acceptance.split_half import inflation
-from calib_ros.registration.alignment import observable_pose, refine_start, reject_outlier_frames
 from calib_ros.registration.camera_rounds import refined_with_camera
-from calib_ros.registration.classes import Hypothesis, Segmentation, class_models
+from calib_ros.registration.classes import Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
-from calib_ros.registration.estimate import Estimate, insufficient
+from calib_ros.registration.estimate import Estimate, insufficient, observable_pose, refine_start, reject_outlier_frames
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective, views_of
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
-from calib_ros.registration.joint import optimise_jointly, seen_from_optimum
-from calib_ros.registration.motion_guess.hypotheses import best_registration
-from calib_ros.registration.motion_guess.registration import Guesser
-from calib_ros.registration.nuisance.covariance import nuisance_covariance
+from calib_ros.registration.joint import JointSearch
+from calib_ros.registration.motion_guess.registration import Guesser, best_registration
 from calib_ros.registration.nuisance.refinement import joint_optimum
-from calib_ros.registration.objective import Objective
-from calib_ros.registration.objective_maker import ObjectiveMaker
+from calib_ros.registration.objective import ObjectiveMaker
 from calib_ros.registration.progress import SILENT, Callback, Observer, Progress
-from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SEMANTIC_BOX, SearchBox
+from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result
 
 
@@ -60,8 +56,7 @@ class Calibrator:
     observer : Observer, optional
         Watches the optimisation of every estimate and does not change it.
     given : Camera, optional
-        The intrinsics that were stated, where `camera` is one that corrects them: what they leave open is then not a matter of
-        single estimates, but of the joint one.
+        The intrinsics that were stated, where `camera` corrects them: what they leave open is then told by the joint estimate.
     """
 
     def __init__(
@@ -94,15 +89,13 @@ class Calibrator:
             At least one. A frame whose scan is empty, or whose times are impossible, is left out and named in the reason.
         initial : array_like, shape (4, 4), or "semantic", "motion" or "auto"
             T_camera_lidar to start from; "semantic" finds one from the classes of points and pixels (see `guess`), "motion" from
-            the motion in consecutive frames (hand-eye calibration, calib_ros/registration/motion_guess/guess.py); "auto" tries
-            motion, then classes, then the nominal extrinsic, until one converges.
+            consecutive frames (hand-eye calibration); "auto" tries motion, classes and the nominal one, until one converges.
         search : SearchBox, optional
             Box of the global search around it; None = refine only.
         progress : callable, optional
             Called with the name of a stage and the share of it that is done, 0..1.
         consecutive : sequence of Frame, optional
-            For "motion" and "auto": some seconds of frames that follow each other, in the order of their stamps; by default
-            `frames` themselves.
+            For "motion" and "auto": some seconds of frames, in the order of their stamps; by default `frames` themselves.
 
         Returns
         -------
@@ -117,7 +110,12 @@ class Calibrator:
         """
         if self.config.camera.intrinsics != REFINE:
             return self._calibrated(frames, initial, search, progress, consecutive)
-        self._check_pictures()
+        if self.extract.camera.is_cylinder:
+            raise BadInputError(
+                "camera.intrinsics: refine needs pictures that show the intrinsics, and those of this lens are unrolled, where "
+                "another focal length or principal point is not observable: set image.projection: pinhole, or camera.intrinsics: "
+                "given"
+            )
         if search is None and not isinstance(initial, str):
             search = SearchBox(0.0, 0.0)  # as None, but intrinsics are searched
         first = self._calibrated(frames, initial, search, progress, consecutive)
@@ -139,15 +137,6 @@ class Calibrator:
         result = refined_with_camera(first, self.extract.source_camera, near, whole, self.config.camera, limits)
         return replace(result, origin=first.origin, elapsed_s=first.elapsed_s + time.perf_counter() - started)
 
-    def _check_pictures(self) -> None:
-        """BadInputError where they cannot show the intrinsics."""
-        if self.extract.camera.is_cylinder:
-            raise BadInputError(
-                "camera.intrinsics: refine needs pictures that show the intrinsics, and those of this lens are unrolled, where "
-                "another focal length or principal point is not observable: set image.projection: pinhole, or camera.intrinsics: "
-                "given"
-            )
-
     def _with_camera(self, camera: Camera) -> Calibrator:
         return Calibrator(camera, self.config, self.segmentation, self.objectives.observer, self.extract.source_camera)
 
@@ -168,7 +157,10 @@ class Calibrator:
             raise BadInputError("no frames given; give at least one")
         _check_same_reference(frames)
         if T0 is None and initial != SEMANTIC:
-            register = partial(self._registered, frames, progress)
+
+            def register(start: Matrix | str, box: SearchBox | None) -> Result:
+                return self._calibrated(frames, start, box, progress, ())
+
             guesser = Guesser(register, len(frames), consecutive or frames, self.extract, search, self.segmentation.active)
             result = guesser.from_motion() if initial == MOTION else guesser.from_anything()
             return replace(result, elapsed_s=time.perf_counter() - started)
@@ -185,15 +177,6 @@ class Calibrator:
             result = self.estimate(features, T0, search, progress, notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
 
-    def _registered(self, frames: Sequence[Frame], progress: Callback | None, initial: Any, box: SearchBox | None) -> Result:
-        return self._calibrated(frames, initial, box, progress, ())
-
-    def _hypotheses(self, views: Sequence[Any]) -> list[Hypothesis]:
-        models = class_models()
-        if models is None:
-            raise TooFewFeaturesError(self.segmentation.missing())
-        return models.first_guess(views, self.config.guess, self.config.search.seed)
-
     def guess(
         self,
         features: Sequence[FrameFeatures],
@@ -201,13 +184,14 @@ class Calibrator:
         progress: Callback | None = None,
         notes: Sequence[str] = (),
     ) -> Result:
-        """Estimate without an initial extrinsic: hypotheses from the classes of points and pixels, then the registration from the
-        best of them (thesis 3.5). box: around each; None = SEMANTIC_BOX. A failure is a Result, its transform nominal.
-        """
+        """Estimate without an initial extrinsic: the registration from the best hypotheses that the classes of points and pixels
+        give (thesis 3.5). box: around each; None = SEMANTIC_BOX. A failure is a Result, its transform nominal."""
         started = time.perf_counter()
-        views = views_of(features)
+        views, models = views_of(features), class_models()
         try:
-            hypotheses = self._hypotheses(views)
+            if models is None:
+                raise TooFewFeaturesError(self.segmentation.missing())
+            hypotheses = models.first_guess(views, self.config.guess, self.config.search.seed)
         except TooFewFeaturesError as error:
             return insufficient(error, nominal(), len(features), notes)
         result, tried = best_registration(
@@ -225,18 +209,16 @@ class Calibrator:
         notes: Sequence[str] = (),
         anchor: Transform | None = None,
     ) -> Result:
-        """The same as `calibrate` from features. A failure is a Result with a status and a reason, whose transform is
-        the initial one.
+        """The same as `calibrate` from features. A failure is a Result whose transform is the initial one.
 
-        notes: for the reason of the Result. anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None =
-        initial.
+        notes: for its reason. anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None = initial.
         """
         started, watch = time.perf_counter(), Progress(progress)
         origin = initial if anchor is None else anchor
         make = partial(self.objectives, T_prior=initial, anchor=origin, box=box)
         try:
             # Optimise: the extrinsic, and the clocks' offset where the frames show it.
-            optimised = seen_from_optimum(optimise_jointly(features, make, initial, box, self.config, watch), make, watch)
+            optimised = JointSearch(make, initial, box, self.config, watch).optimum(features)
             objective, start = optimised.objective, optimised.objective.constraints.limits.clip(initial)
             # Reject outlier frames, and refine.
             alignment = reject_outlier_frames(objective, optimised.T, watch)
@@ -245,36 +227,26 @@ class Calibrator:
             acceptance = Acceptance(self.config, self.extract.source_camera.width, box)
             evidence = acceptance.evidence(objective, alignment, optimised.search)
             inflated = inflation(evidence.disagreement)
-            pose = observable_pose(objective, alignment.T, start, self._expected(box), inflated, optimised.nearby)
+            pose = observable_pose(objective, alignment.T, start, box, inflated, optimised.nearby)
             intrinsics = acceptance.intrinsics(objective, alignment, evidence)
-            nuisance = nuisance_covariance(
-                optimised.features,
-                objective.smooth_score(pose.T),
-                pose.T,
-                pose.covariance,
-                objective.constraints,
-                self.config,
-                intrinsics if self._given is None else (),
-                *optimised.clocks(self.config.motion),
-            )
+            found = Estimate(initial, start, optimised, alignment, evidence, pose, intrinsics)
+            nuisance = found.nuisance(self.config, intrinsics if self._given is None else ())
             # Accept, or say why not.
-            refusal = acceptance.refusal(objective, initial, start, optimised, alignment, evidence, pose, intrinsics, watch)
-            found = Estimate(initial, start, optimised, alignment, evidence, pose, intrinsics, nuisance, refusal)
-            result = found.result(objective, self.config.motion, notes)
+            result = found.result(nuisance, acceptance.refusal(found, watch), self.config.motion, notes)
             if self.config.camera.intrinsics == REFINE:
-                result = replace(result, refined_camera=self._refined(objective, found, acceptance))
+                result = replace(result, refined_camera=self._refined(found, acceptance))
             self.objectives.keep_maps(objective)
         except TooFewFeaturesError as error:
             result = insufficient(error, initial, len(features), notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
 
-    def _refined(self, objective: Objective, found: Estimate, acceptance: Acceptance) -> RefinedCamera | None:
+    def _refined(self, found: Estimate, acceptance: Acceptance) -> RefinedCamera | None:
         """What the scenes tell of the camera at an optimum, all intrinsics at once."""
-        camera, limits = self.extract.source_camera, objective.constraints.limits
+        objective, camera, limits = found.objective, self.extract.source_camera, found.objective.constraints.limits
         inflated, search = inflation(found.evidence.disagreement), acceptance.box is not None and self._given is None
         score, prior, T = objective.edges.score, objective.constraints.prior, found.alignment.T
-        joint = joint_optimum(score, T, limits, prior, camera, self.config.camera, inflated, search, self._given)
-        return None if joint is None else joint.refined(camera, found.pose.covariance)
+        extrinsic = found.pose.covariance
+        return joint_optimum(score, T, limits, prior, camera, self.config.camera, inflated, extrinsic, search, self._given)
 
     def estimate_in_doubt(
         self,
@@ -285,12 +257,8 @@ class Calibrator:
         progress: Callback | None = None,
         notes: Sequence[str] = (),
     ) -> Result:
-        """`estimate` from features without classes, and where that leaves doubt, again from those with classes and the
-        notes that come with them.
-
-        What edges alone are sure of is not refused for want of evidence at the same place: classes halve the weight of many
-        edges, and so take evidence away.
-        """
+        """`estimate` from features without classes, and where that leaves doubt, again from those with classes and their notes.
+        What edges alone are sure of is not refused for want of evidence there: classes halve the weight of many edges."""
         result = self.estimate(plain, initial, box, progress, notes)
         if not plain or not self.segmentation.active or not leaves_doubt(result):
             return result
@@ -314,11 +282,6 @@ class Calibrator:
         """Whether classes wait until an estimate without them leaves doubt."""
         other = other_objective(self.config)
         return self.config.semantics.in_doubt_only and (other is None or not other.needs_classes)
-
-    def _expected(self, box: SearchBox | None) -> Matrix:
-        """How far (6,) from the start the extrinsic is expected along every axis, rad and m."""
-        deg, m = box.reach if box is not None and not box.is_empty else (0.0, 0.0)
-        return np.array([np.deg2rad(deg or REFINEMENT_DEG)] * 3 + [m or REFINEMENT_M] * 3)
 
 
 def _seen_by(camera: Camera, frames: Sequence[Frame]) -> list[Frame]:

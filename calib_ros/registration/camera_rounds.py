@@ -1,7 +1,6 @@
 """Extrinsic and intrinsics in rounds: pictures are rectified by the corrected camera, and what is left to correct is estimated.
 
-The first estimate, by the camera that was given, tells where the sensors are and roughly what is wrong; the last one is that of
-the corrected camera, from the same start, and is accepted or refused like any other.
+The last estimate is that of the corrected camera, from the same start, and is accepted or refused like any other.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig, RefineConfig
 from calib_ros.intrinsics import CENTRE, FOCAL, IntrinsicEstimate, RefinedCamera, change_between
-from calib_ros.registration.acceptance.refusal import TooUncertain, joined
+from calib_ros.registration.acceptance.refusal import Refusal, joined
 from calib_ros.registration.acceptance.significance import check_uncertainty
 from calib_ros.result import REFUSED, Result
 
@@ -82,7 +81,7 @@ def _about(camera: Camera, T: Transform, left: RefinedCamera, changes: dict[str,
     return RefinedCamera(camera, T, changes, left.covariance + np.outer(both, both))
 
 
-def _uncertain(left: RefinedCamera, given: Camera, camera: CameraConfig, limits: RefineConfig) -> TooUncertain | None:
+def _uncertain(left: RefinedCamera, given: Camera, camera: CameraConfig, limits: RefineConfig) -> Refusal | None:
     """Is the extrinsic known well enough, with those intrinsics open that were corrected, but are known less well than usual?
     What usual calibrations leave open is not asked for, as with intrinsics that are given."""
     usual = {FOCAL: camera.focal_sigma, **dict.fromkeys(CENTRE, camera.centre_sigma * given.width)}

@@ -1,7 +1,6 @@
-"""Classes of points and pixels, as far as the core knows them: what it asks of a package that recognises some.
+"""Classes of points and pixels: what the core asks of a package that recognises some, and works without.
 
-The core works without: `segmentation` then gives one that has no models. A package joins by the entry point
-``calib_ros.classes``, see extensions.py; the built-in one is calib_ros_semantics.
+A package joins by the entry point ``calib_ros.classes``, see extensions.py; the built-in one is calib_ros_semantics.
 """
 
 from __future__ import annotations
@@ -34,12 +33,9 @@ EDGE_SHARE = 0.5  # of the edges of Segment Anything's masks in the edge maps of
 class FrameSemantics:
     """Semantics of a frame at the size of the recorded image; None = unknown.
 
-    Attributes
-    ----------
-    edges : (2, H, W) float32 in 0..1, semantic edges with horizontal [0] and vertical [1] gradients; their sum is the strength.
-    classes : (H, W) uint8, SemanticClass of the pixels. labels : (n,) uint8, SemanticClass of the points of the cloud.
-    problems : a line per model that failed. seconds : (kind of model, time taken).
-    edges_of : OF_MASKS or OF_CLASSES, what the edges are the boundaries of.
+    edges: (2, H, W) float32 in 0..1, semantic edges with horizontal [0] and vertical [1] gradients; their sum is the strength.
+    classes: (H, W) uint8, SemanticClass of the pixels. labels: (n,) uint8, of the points. problems: a line per model that failed.
+    seconds: (kind of model, time taken). edges_of: OF_MASKS or OF_CLASSES, what the edges are the boundaries of.
     """
 
     edges: NDArray[np.float32] | None = None
@@ -52,10 +48,8 @@ class FrameSemantics:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A guess of T_camera_lidar (4, 4), from whatever source.
-
-    score: of the guess, comparable within one source; 0 = as good as chance. margin: by how much it beats the next hypothesis of
-    another viewing direction. kind: where it came from. inliers: objects of the images that meet one in the cloud.
+    """A guess of T_camera_lidar (4, 4). score: comparable within one source; 0 = as good as chance. margin: by how much it beats
+    the next hypothesis of another viewing direction. kind: its source. inliers: objects of the images that meet one in the cloud.
     """
 
     T: Transform
@@ -73,23 +67,18 @@ class Segmentation(Protocol):
     @property
     def active(self) -> bool:
         """Whether any model is configured and not switched off."""
-        ...
 
     def in_use(self) -> list[str]:
         """A text per model that is not switched off."""
-        ...
 
     def missing(self, *kinds: str) -> str:
         """Which of the kinds is not configured or off, and what to do; empty if all of them work."""
-        ...
 
     def load(self) -> list[str]:
         """Load all models now; a line per model that runs otherwise than configured."""
-        ...
 
     def describe(self) -> list[str]:
         """What is off and what is in use, for people; empty where no models are configured."""
-        ...
 
     def __call__(
         self,
@@ -98,12 +87,8 @@ class Segmentation(Protocol):
         kinds: Sequence[str] = ...,
         points: NDArray[np.intp] | None = None,
     ) -> FrameSemantics:
-        """Semantics of a frame. Errors are in FrameSemantics.problems.
-
-        cancelled: polled; returns True to stop. kinds: of the models to run. points: indices of the points whose classes are
-        asked for, None = all.
-        """
-        ...
+        """Semantics of a frame, with errors in its problems. cancelled: polled, True to stop. kinds: of the models to run.
+        points: indices of the points whose classes are asked for, None = all."""
 
 
 class ClassModels(Protocol):
@@ -112,22 +97,18 @@ class ClassModels(Protocol):
 
     def segmentation(self, config: SemanticsConfig) -> Segmentation:
         """The models of a configuration."""
-        ...
 
     def view(self, cloud: PointCloud, classes: NDArray[np.uint8], camera: Camera) -> Any:
         """Of a labelled cloud and the classes (h, w) of a rectified image of `camera`, a pinhole."""
-        ...
 
     def consistency(self, views: Sequence[Any]) -> PointScore | None:
         """How well labelled points meet pixels of their class; None where the frames show too little in common."""
-        ...
 
     def first_guess(self, views: Sequence[Any], config: GuessConfig, seed: int) -> list[Hypothesis]:
         """Hypotheses of the extrinsic, best first (thesis 3.5). TooFewFeaturesError where the views show too little."""
-        ...
 
 
-class NoModels:
+class _NoModels:
     """A segmentation without models: nothing is ever known."""
 
     def __init__(self, config: SemanticsConfig) -> None:
@@ -136,23 +117,14 @@ class NoModels:
     active = False
 
     def in_use(self) -> list[str]:
-        """None."""
         return []
+
+    load = describe = in_use
 
     def missing(self, *kinds: str) -> str:
-        """What is missing is the package."""
         return "no package that recognises classes is installed, which a first guess from classes needs; set initial.method"
 
-    def load(self) -> list[str]:
-        """Nothing to load."""
-        return []
-
-    def describe(self) -> list[str]:
-        """No models."""
-        return []
-
     def __call__(self, frame: Frame, *_: Any, **__: Any) -> FrameSemantics:
-        """Nothing."""
         return FrameSemantics()
 
 
@@ -166,7 +138,7 @@ def class_models() -> ClassModels | None:
 def segmentation(config: SemanticsConfig) -> Segmentation:
     """The models of a configuration; none where no package brings any."""
     models = class_models()
-    return NoModels(config) if models is None else models.segmentation(config)
+    return _NoModels(config) if models is None else models.segmentation(config)
 
 
 def consistency_score(views: Sequence[Any]) -> PointScore | None:

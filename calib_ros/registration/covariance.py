@@ -18,17 +18,13 @@ from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import PoseConstraints
 
-# Systematic error, rad and m, that no number of frames averages out: what the placing of edges within a pixel and an azimuth step
-# leaves on synthetic streets of 16 to 64 rings, whose truth is exact.
+# rad and m; what the placing of edges within a pixel and an azimuth step leaves on synthetic streets, of any length
 SYSTEMATIC_ERROR = np.array([np.deg2rad(0.01)] * 3 + [0.004] * 3)
 REGIONS = 12  # of equal weight, side by side in the image; the slopes of regions and frames vary independently of each other
-# Noise of a score in units of its curvature, per frame, that counts as much as that of so many cells: few cells tell it badly.
-# Seven sets of five scanners have 0.002 to 0.01, from single frames to ten; 16 rings in a narrow lens 0.02.
+# Noise of a score in units of its curvature, per frame (0.002 to 0.02 of five scanners), that counts as that of so many cells.
 USUAL_NOISE, USUAL_CELLS = 0.005, 6
 # Effective points. Where a frame has fewer, its noise is at least so many times the usual one, as that of a mean; where all
-# frames together have fewer, once more, since their top is more often one of chance beside the truth. Normalised errors squared
-# of single frames of 16 rings in a narrow lens (280 points), a side camera (420) and open roads (180 to 380) fall from 15, 12 and
-# 70 to 5, 6 and 20.
+# frames together have fewer, once more: their top is more often one of chance. Normalised errors squared fall from 15 to 5.
 FEW_POINTS = 700.0
 DUPLICATE_LEVEL = 1  # of the edge maps; their correlation tells whether frames show the same place
 STEP = np.array([np.deg2rad(0.1)] * 3 + [0.01] * 3)  # rad, m; the top of the score is as narrow as that
@@ -40,10 +36,8 @@ NO_NOISE = 1e-9  # of a score
 POINTS = 8000  # points that tell the curvature; more cost time and change nothing
 LEAST_VARIANCE = 1e-18  # rad^2, m^2; less is what rounding leaves of an axis that is fixed
 
-# Names of the axes of a twist, and how small a component of a direction may be to be named: a share of the largest one, each in
-# units of its limit.
-AXIS_NAMES = ("pitch", "yaw", "roll", "sideways shift", "vertical shift", "forward shift")
-TAKES_PART = 0.4
+AXIS_NAMES = ("pitch", "yaw", "roll", "sideways shift", "vertical shift", "forward shift")  # of a twist
+TAKES_PART = 0.4  # share of the largest component of a direction, in units of the limits, from which an axis is named
 
 
 def covariance(
@@ -61,9 +55,8 @@ def covariance(
     have variance 0, and a prior adds its information. inflation: of the variance, by the disagreement of halves.
     others: optima (4, 4) nearby that a search has met; they count as far as the noise lets them be the right one.
 
-    Inverse curvature of the score times its noise, which the data tell (see `noise_level`), plus the systematic error. The
-    curvature is that of the score itself: the Gauss-Newton scale cannot tell a peak from a ridge of noise, which has slopes just
-    as steep. Its size along every direction follows from how far away the score has fallen by its noise (see `_profiled`).
+    Inverse curvature of the score itself (the Gauss-Newton scale cannot tell a peak from a ridge of noise) times its noise, see
+    `noise_level`, plus the systematic error; its size along every direction as `_profiled` has it.
     """
     axes = np.flatnonzero(constraints.limits.open_axes) if constraints else np.arange(6)
     C = np.zeros((6, 6))
@@ -83,12 +76,8 @@ def covariance(
 
 
 def _profiled(score: PointScore, T: Transform, level: int, axes: NDArray[np.intp], C: Matrix, noise: float) -> Matrix:
-    """The covariance C (k, k) of the axes (k,) with every principal direction as wide as the score itself says: its standard
-    deviation is where the score has fallen by half of its noise, as on a profile of the likelihood.
-
-    The curvature at the very top is that of its finest structure: on rough tops it is anything, and says little of how far the
-    optimum may move. Single frames of OS1-64 and HDL-32E come out half as uncertain, at normalised errors between 3 and 10.
-    """
+    """The covariance C (k, k) of the axes (k,), the standard deviation of every principal direction where the score has fallen by
+    half of its noise, as on a profile of the likelihood: the curvature at the very top is that of its finest structure."""
     part = score.subset(POINTS, np.random.default_rng(0)).at(level)
     k = len(axes)
     scale = part.linearise(T)[1][np.ix_(axes, axes)] + np.diag(max(noise, NO_NOISE) / UNKNOWN[axes] ** 2)
@@ -109,8 +98,7 @@ def _profiled(score: PointScore, T: Transform, level: int, axes: NDArray[np.intp
 
 
 def _spread(score: PointScore, T: Transform, level: int, others: Sequence[Matrix], noise: float) -> Covariance:
-    """Second moment (6, 6) about T (4, 4) of the optima nearby, each as probable as its score lets it be beside T's: a score less
-    by its noise is exp(-1) times as probable, as it is on the flank of T's own peak."""
+    """Second moment (6, 6) about T (4, 4) of optima nearby; one that scores less by the noise is exp(-1) times as probable."""
     top, moment, weight = score.at(level).value(T), np.zeros((6, 6)), 1.0
     kept = [np.zeros(6)]
     for other in others:
@@ -135,11 +123,10 @@ def noise_covariance(score: PointScore, T: Transform, level: int, axes: NDArray[
 
 
 def noise_level(score: PointScore, T: Transform, level: int, bread: Matrix, axes: NDArray[np.intp]) -> float:
-    """Noise of the score at its optimum T (4, 4), in units of its curvature: the dispersion of the slopes of cells, which are the
-    regions of all frames. bread: inverse curvature (k, k) of the axes (k,).
+    """Noise of the score at its optimum T (4, 4), in units of its curvature: the dispersion of the slopes of cells, the regions
+    of all frames, pooled over all directions, of which the sandwich H^-1 (sum g g^T) H^-1 (White 1980) has some far too small.
 
-    The dispersion is pooled over all directions: the sandwich H^-1 (sum g g^T) H^-1 of a few cells (White 1980) has directions
-    that come out far too small. Frames of one place count as fewer.
+    bread: inverse curvature (k, k) of the axes (k,). Frames of one place count as fewer.
     """
     frames = score.frames
     cell = np.searchsorted(frames, score.frame) * REGIONS + _regions(score, T)
@@ -161,8 +148,8 @@ def effective_points(score: PointScore) -> float:
 
 
 def effective_frames(score: PointScore) -> float:
-    """How many independent frames the frames of a score are worth, 1..n: those that show the same place, by the correlation r of
-    their edge maps, count as one. n^2 / sum of all r, as for the mean of correlated measurements."""
+    """How many independent frames those of a score are worth, 1..n: n^2 / sum of all correlations of their edge maps, as for the
+    mean of correlated measurements."""
     frames = score.frames
     if len(frames) < 2:
         return float(len(frames))
@@ -240,19 +227,13 @@ def free_axes(covariance: Covariance) -> NDArray[np.bool_]:
 
 
 def distance(xi: Matrix, covariance: Covariance) -> tuple[float, int]:
-    """Squared Mahalanobis distance of a twist (6,) by its covariance (6, 6), and its degrees of freedom: a chi squared variable.
-
-    Fixed axes are left out: two extrinsics with such an axis differ along it by the second order of the others.
-    """
+    """Squared Mahalanobis distance of a twist (6,) by its covariance (6, 6), fixed axes left out, and its degrees of freedom."""
     return float(xi @ _information(covariance) @ xi), int(free_axes(covariance).sum())
 
 
 def fused(T: Transform, covariance: Covariance, T_prior: Transform, prior: Matrix) -> tuple[Matrix, Matrix]:
     """Kalman update on SE(3): the extrinsic (4, 4) and its covariance (6, 6) from an estimate T with `covariance` and from what
-    was known before, T_prior with covariance `prior`.
-
-    Along a direction that the scenes do not show, the covariance is large and the prior stays.
-    """
+    was known before, T_prior with covariance `prior`."""
     xi = se3.log(T @ se3.inverse(T_prior))
     gain = prior @ _information(prior + covariance)
     left = np.eye(6) - gain
@@ -261,18 +242,14 @@ def fused(T: Transform, covariance: Covariance, T_prior: Transform, prior: Matri
 
 
 def _information(covariance: Covariance) -> Matrix:
-    """Information (6, 6) of a covariance; 0 along fixed axes. In units in which all axes vary alike: beside an axis that is
-    unknown, one that is known well would else count as rounding."""
+    """Information (6, 6) of a covariance; 0 along fixed axes. In units of the axes: a well known one would else be rounding."""
     free = free_axes(covariance)
     sigma = np.where(free, np.sqrt(np.maximum(np.diag(covariance), LEAST_VARIANCE)), np.inf)
     return np.asarray(np.linalg.pinv(covariance / np.outer(sigma, sigma), rcond=1e-12, hermitian=True) / np.outer(sigma, sigma))
 
 
 def _inverse(H: Matrix, scale: Matrix, least: float) -> Matrix:
-    """Inverse of a curvature that may be indefinite: its eigenvalues relative to `scale` are raised to LEAST_CURVATURE.
-
-    least: added to `scale`, which has no slope at all along what no point shows, or less than none by rounding.
-    """
+    """Inverse of a curvature that may be indefinite: its eigenvalues relative to `scale` plus `least` rise to LEAST_CURVATURE."""
     values, vectors = np.linalg.eigh(scale)
     root = vectors / np.sqrt(np.maximum(values, 0) + least)
     values, vectors = np.linalg.eigh(root.T @ H @ root)

@@ -1,27 +1,64 @@
-"""What an estimate found, and the Result that reports it."""
+"""The steps of an estimate after its optimum: leave outlier frames out, compare with the start, covariance, and its Result."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from calib_ros.arrays import Transform
-from calib_ros.config import MotionConfig
-from calib_ros.errors import TooFewFeaturesError
+import numpy as np
+
+from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.config import Config, MotionConfig
+from calib_ros.errors import CalibrationError
 from calib_ros.intrinsics import IntrinsicEstimate
 from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, Refusal, joined, outliers_note, unobservable_note
-from calib_ros.registration.alignment import Alignment, ObservablePose
+from calib_ros.registration.acceptance.significance import NullDistribution, null_distribution
+from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.joint import Optimised
-from calib_ros.registration.nuisance.covariance import Nuisance
-from calib_ros.registration.nuisance.parameters import NuisanceEstimate
-from calib_ros.registration.objective import Objective
+from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate
+from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
+from calib_ros.registration.objective import Objective, penalised
+from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SearchBox
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, RefusalCode, Result
+
+UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
+NEGLIGIBLE = 3e-5  # of the score: what steps of a thousandth of a degree leave of an optimum
+OUTLIER_ROUNDS = 3  # an outlier frame may hide another
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """An optimum T (4, 4) without the outlier frames, whose indices are in `outliers`. null: the null distribution around T."""
+
+    T: Transform
+    outliers: tuple[int, ...]
+    null: NullDistribution
+
+
+@dataclass(frozen=True, eq=False)
+class ObservablePose:
+    """An extrinsic T (4, 4), its covariance (6, 6), and the directions that no scene shows, along which T is the start."""
+
+    T: Transform
+    covariance: Covariance
+    unobservable: tuple[Direction, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisance:
+    """What intrinsics and clocks leave open of an optimum, however many such scenes there are.
+
+    covariance: (6, 6). clocks: effect of an offset as large as motion.max_time_offset_s; None where the motion is not known.
+    """
+
+    covariance: Covariance
+    clocks: Effect | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it. refusal: None
-    = accepted."""
+    """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it."""
 
     initial: Transform
     start: Transform
@@ -30,16 +67,42 @@ class Estimate:
     evidence: Evidence
     pose: ObservablePose
     intrinsics: Sequence[NuisanceEstimate]
-    nuisance: Nuisance
-    refusal: Refusal | None
 
-    def result(self, objective: Objective, motion: MotionConfig, notes: Sequence[str]) -> Result:
+    @property
+    def objective(self) -> Objective:
+        """Of the features that the optimum is one of."""
+        return self.optimised.objective
+
+    def nuisance(self, config: Config, intrinsics: Sequence[NuisanceEstimate]) -> Nuisance:
+        """What these intrinsics and the clocks leave open of the optimum."""
+        T, covariance, constraints = self.pose.T, self.pose.covariance, self.objective.constraints
+        score = self.objective.smooth_score(T)
+        sigma_s, clocks = self.optimised.clocks(config.motion)
+        active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
+        limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
+        shared = np.zeros((6, 6))
+        if not limits.open_axes.any():
+            return Nuisance(shared)
+        for estimate in intrinsics:
+            shared += estimate.added_covariance(constraints, covariance)
+        moving = with_known_motion(self.optimised.features, score)
+        if moving is None:
+            return Nuisance(shared)
+        known, offset = clocks is not None, ClockOffset(sigma_s, moving[1])
+        if clocks is None or active.any():  # else it is that of the same optimum
+            clocks = offset.effect(moving[0], T, limits)
+        effect = replace(clocks, information=0.0) if known else clocks  # these scenes count only once
+        shared += effect.constrained(constraints, covariance, sigma_s).covariance(sigma_s)
+        return Nuisance(shared, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s))
+
+    def result(self, nuisance: Nuisance, refusal: Refusal | None, motion: MotionConfig, notes: Sequence[str]) -> Result:
         """The Result, with the extrinsic that it started from where it is refused. notes: for its reason."""
-        features, refusal, search = self.optimised.features, self.refusal, self.optimised.search
+        objective, features, search = self.objective, self.optimised.features, self.optimised.search
         names = [f.name or str(k) for k, f in enumerate(features)]
-        outliers, clocks, largest_s = [names[k] for k in self.alignment.outliers], self.nuisance.clocks, motion.max_time_offset_s
+        outliers, clocks, largest_s = [names[k] for k in self.alignment.outliers], nuisance.clocks, motion.max_time_offset_s
         used = len(features) - len(outliers)
-        known = None if refusal or not self.offset_is_known(motion) else self.optimised
+        offset = self.optimised.offset
+        known = None if refusal or offset is None or not offset.observable(motion) else self.optimised
         reasons = [
             str(refusal) if refusal else "",
             *notes,
@@ -66,8 +129,8 @@ class Estimate:
             frame_scores=tuple(float(s) for s in objective.frame_scores(self.pose.T)),
             starts=None if search is None else (search.agreed, search.optimised),
             intrinsics={e.parameter.name: _intrinsic(e) for e in self.intrinsics},
-            covariance=None if refusal else self.pose.covariance + self.nuisance.covariance,
-            shared_covariance=None if refusal else self.nuisance.covariance,
+            covariance=None if refusal else self.pose.covariance + nuisance.covariance,
+            shared_covariance=None if refusal else nuisance.covariance,
             clock_covariance=None if refusal or clocks is None else clocks.covariance(largest_s),
             clock_sigma_s=None if refusal or clocks is None else clocks.sigma(largest_s),
             time_offset_s=None if known is None else motion.time_offset_s + known.seconds,
@@ -75,17 +138,72 @@ class Estimate:
             stamping=None if known is None else known.stamping,
         )
 
-    def offset_is_known(self, motion: MotionConfig) -> bool:
-        """Whether the scenes tell the offset of the clocks."""
-        return self.optimised.offset is not None and self.optimised.offset.observable(motion)
-
 
 def _intrinsic(estimate: NuisanceEstimate) -> IntrinsicEstimate:
     unit = estimate.parameter.unit
     return IntrinsicEstimate(unit * estimate.value, unit * estimate.sigma, estimate.is_observable)
 
 
-def insufficient(error: TooFewFeaturesError, initial: Transform, frames: int, notes: Sequence[str]) -> Result:
+def insufficient(error: CalibrationError, initial: Transform, frames: int, notes: Sequence[str] = ()) -> Result:
     """The Result where the frames show too little to estimate anything."""
     reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
     return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)
+
+
+def reject_outlier_frames(objective: Objective, T: Transform, progress: Progress = SILENT) -> Alignment:
+    """The optimum without the frames that match no better than chance, which the objective leaves out from then on."""
+    outliers: list[int] = []
+    null = null_distribution(objective.edges.score, T)
+    for _ in range(OUTLIER_ROUNDS):
+        bad = null.outlier_frames()
+        if not len(bad):
+            break
+        outliers += [int(j) for j in bad]
+        objective.exclude(bad)
+        T = objective.optimise(T, searched=True, progress=progress)
+        null = null_distribution(objective.edges.score, T)
+    return Alignment(T, tuple(sorted(outliers)), null)
+
+
+def refine_start(objective: Objective, alignment: Alignment, start: Transform, progress: Progress = SILENT) -> Alignment:
+    """The alignment; or, if it scores less than the start, which coarse levels may move to another optimum, the better of it and
+    the optimum right at the start."""
+    T = alignment.T
+    if not penalised(objective, T) < penalised(objective, start):
+        return alignment
+    near = objective.refine(start, progress)
+    better = near if penalised(objective, near) >= penalised(objective, T) else T
+    alignment = reject_outlier_frames(objective, better, progress)
+    missing = penalised(objective, start) - penalised(objective, alignment.T)
+    return replace(alignment, T=start) if 0 < missing < NEGLIGIBLE else alignment
+
+
+def observable_pose(
+    objective: Objective, T: Transform, start: Transform, box: SearchBox | None, inflated: float, others: Sequence[Matrix] = ()
+) -> ObservablePose:
+    """The optimum T (4, 4) with its covariance; directions that no scene shows are kept from the start.
+
+    box: that was searched, whose half widths are the standard deviations of a start that is fused. inflated: factor of the
+    variance. others: optima (4, 4) nearby.
+    """
+    score, constraints, held = objective.smooth_score(T), objective.constraints, np.zeros(6)
+    bias = objective.systematic_error
+    C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
+    active = constraints.active_limits(T, score.at(-1).linearise(T)[0])
+    if active.any():
+        # At a limit the score is not at its maximum and its curvature means nothing: the limit gives the variance of that axis.
+        held = np.where(active, np.minimum(np.diag(C), constraints.limits.half**2), 0.0)
+        limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
+        constraints = replace(constraints, limits=limits)
+        C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
+    optimum = ObservablePose(T, C + np.diag(held))
+    unobservable = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
+    if not unobservable:
+        return optimum
+    deg, m = box.reach if box is not None else (0.0, 0.0)
+    reach = [np.deg2rad(deg or REFINEMENT_DEG)] * 3 + [m or REFINEMENT_M] * 3
+    kept, narrower = fused(T, C, start, np.diag(np.square(reach) * constraints.limits.open_axes))
+    kept = objective.constraints.limits.clip(kept)  # composed rotations and translations exceed them by terms of second order
+    if penalised(objective, kept) < penalised(objective, start):  # the score does observe them farther from the optimum
+        return optimum
+    return ObservablePose(kept, narrower + np.diag(held), tuple(unobservable))

@@ -41,16 +41,11 @@ def other_objective(config: Config) -> ObjectiveKind | None:
 class FrameFeatures:
     """What is kept of one frame. points: LiDAR frame. levels: coarse to fine. camera: pinhole, or cylinder, of the maps.
 
-    has_reflectivity: False if the source gave no usable intensity, so that reflectivity edges are missing. twist: (6,) the
-    LiDAR's velocity, rad/s and m/s in its own frame, by which the points were moved to the image's moment; None = they were not.
-
-    timed_by_azimuth: the times of its points come from their azimuth, by the stage ``motion``.
-
-    unknown_motion_s: half the time in which the scan sweeps the image, s, where nothing is known of the motion meanwhile: the
-    points at the sides are then off by that time; 0 where they were moved, or the source says that they need not be.
-
-    plain: the same frame without semantics, where it has some, which is what the monitor compares with other frames. view: its
-    classes as `ClassModels` keeps them, where points and pixels have some. own: what another objective keeps of the frame.
+    has_reflectivity: False if the source gave no usable intensity. twist: (6,) the LiDAR's velocity, rad/s and m/s in its own
+    frame, by which the points were moved to the image's moment; None = they were not. timed_by_azimuth: the times of its points
+    come from their azimuth, by the stage ``motion``. unknown_motion_s: half the time in which the scan sweeps the image, s, by
+    which points at the sides are off where nothing is known of the motion; else 0. plain: the same frame without semantics, where
+    it has some. view: its classes as `ClassModels` keeps them. own: what another objective keeps of the frame.
     """
 
     points: EdgePoints
@@ -85,24 +80,18 @@ class FeatureExtractor:
     @cached_property
     def used(self) -> NDArray[np.bool_] | None:
         """(h, w) of the working image, False in what ``image.mask`` and ``image.ignored_boxes`` leave out; None = all is used.
-
-        BadInputError if the mask cannot be read or does not fit the camera; raised with the first frame.
-        """
+        BadInputError if the mask cannot be read or does not fit the camera."""
         used = used_pixels(self.config.image, self.source_camera.width, self.source_camera.height)
         masked = None if used is None else np.asarray(self.working(used.astype(np.uint8) * 255) == 255)
         seen = self._rectify.seen()
-        if seen is None:
-            return masked
-        shown = np.asarray(self._shrunk(seen.astype(np.uint8) * 255) == 255)
-        return shown if masked is None else shown & masked
+        shown = None if seen is None else np.asarray(self._shrunk(seen.astype(np.uint8) * 255) == 255)
+        return shown & masked if shown is not None and masked is not None else (shown if masked is None else masked)
 
     def __call__(
         self, frame: Frame, semantics: FrameSemantics | None = None, plain: FrameFeatures | None = None
     ) -> FrameFeatures:
         """Features of a frame. semantics: of the frame. plain: its features without them, whose edge maps are taken over.
-
-        BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty.
-        """
+        BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty."""
         if frame.camera != self.source_camera:
             raise BadInputError(
                 f"frame {frame.name or frame.stamp} carries another camera calibration than the others; "
@@ -182,10 +171,8 @@ def with_semantics(
     config: Config,
     used: NDArray[np.bool_] | None = None,
 ) -> FrameFeatures:
-    """Features with semantic edges and weights of classes, as far as they are known.
-
-    image: (h, w[, 3]) of plain.camera. edges: (2, h, w) in 0..1 of masks in that image. used: see FeatureExtractor.
-    """
+    """Features with semantic edges and weights of classes, as far as they are known. image: (h, w[, 3]) of plain.camera. edges:
+    (2, h, w) in 0..1 of masks in that image. used: see FeatureExtractor."""
     points, levels = plain.points, plain.levels
     if points.label is not None:
         points = replace(points, strength=points.strength * edge_weights(points.label))

@@ -24,8 +24,7 @@ BESIDE = 0.1  # of the image width: objects at the border have to be seen as a w
 def usable_frames(
     frames: Sequence[Frame], extract: FeatureExtractor, segmentation: Segmentation | None, progress: Progress
 ) -> tuple[list[Used], list[str]]:
-    """The frames that can be used with their features, and notes on the others and on models that failed. segmentation: None =
-    without semantics."""
+    """The frames that can be used with their features, and notes on others and on failed models. segmentation: None = without."""
     used: list[Used] = []
     notes: list[str] = []
     for k, frame in enumerate(frames):
@@ -48,8 +47,8 @@ def with_classes(
     box: SearchBox | None,
     progress: Progress,
 ) -> tuple[list[FrameFeatures], list[str]]:
-    """Features of the same frames with classes, as far as points may come into view from T (4, 4), anywhere in the box, the same
-    where nothing was found; and notes on models that failed."""
+    """Features with classes of points that may come into view from T (4, 4), anywhere in the box, the same where nothing was
+    found; and notes on models that failed."""
     out: list[FrameFeatures] = []
     notes: list[str] = []
     for k, (frame, plain) in enumerate(used):

@@ -12,8 +12,7 @@ from calib_ros.config import GuessConfig
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.result import INITIAL, InitialSource, Result
 
-# Instead of an extrinsic: it is to be found from the classes of points and pixels, from the motion in consecutive frames, or by
-# whatever is available.
+# Instead of an extrinsic: to be found from the classes of points and pixels, the motion in consecutive frames, or either.
 SEMANTIC, MOTION, AUTO = "semantic", "motion", "auto"
 GUESSES = (SEMANTIC, MOTION, AUTO)
 

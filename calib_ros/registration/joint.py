@@ -1,15 +1,13 @@
 """The first step of an estimate: the optimum of the extrinsic, and of the clocks' offset where the frames show it.
 
-The search takes the clocks as they are configured, since what all frames have in common of their motion only moves its optimum.
-Frames that move differently then disagree by what the offset moves them; if that hides the match, the search is repeated with the
-points a scan period earlier and later, which is how drivers err that stamp a scan at its other end.
+The search takes the clocks as they are configured. Frames that move differently then disagree by what the offset moves them; if
+that hides the match, it is repeated a scan period earlier and later, as drivers err that stamp a scan at its other end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -17,7 +15,6 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import ESTIMATE
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
-from calib_ros.registration.alignment import optimise
 from calib_ros.registration.features import FrameFeatures, at_time_offset, other_objective
 from calib_ros.registration.nuisance.parameters import MIN_FRAMES, Effect
 from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, restamped, stamped_by_azimuth
@@ -28,24 +25,17 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult
 from calib_ros.result import Stamping
 
-
-class MakeObjective(Protocol):
-    """The objective of some frames. T_rows: (4, 4), where points fall in the image, for a rolling shutter."""
-
-    def __call__(self, features: Sequence[FrameFeatures], /, *, T_rows: Transform | None = None) -> Objective: ...
-
-
+MakeObjective = Callable[..., Objective]  # of features; T_rows: (4, 4), where points fall in the image, for a rolling shutter
 # Frames whose optima a scan period would move apart by more hide their match from a search: what counts as one optimum there.
 APART_RAD, APART_M = np.deg2rad(0.5), 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Optimised:
-    """An optimum T (4, 4) of the features, which are at the offset that was found.
+    """An optimum T (4, 4) of the objective of features at the offset that was found.
 
-    objective: of these features. search: None without one. offset: what is known of the clocks; None if they are not estimated,
-    or the frames tell nothing. seconds: by which the features were moved to get there, as a change of motion.time_offset_s.
-    stamping: of scans without point times, if it is another way than configured.
+    offset: what is known of the clocks; None if they are not estimated, or the frames tell nothing. seconds: by which the
+    features were moved, as a change of motion.time_offset_s. stamping: of scans without point times, if not as set.
     """
 
     features: Sequence[FrameFeatures]
@@ -69,38 +59,69 @@ class Optimised:
         return sigma, self.offset.effect
 
 
-def seen_from_optimum(found: Optimised, make_objective: MakeObjective, progress: Progress) -> Optimised:
-    """The same with points where the rows of the image see them from the optimum, if its shutter is a rolling one."""
-    if not found.objective.edges.config.motion.readout_s:
-        return found
-    objective = make_objective(found.features, T_rows=found.T)
-    return replace(found, objective=objective, T=objective.optimise(found.T, searched=True, progress=progress))
+@dataclass(frozen=True, eq=False)
+class JointSearch:
+    """Looks for the optimum in a search box around the initial extrinsic (4, 4), or from that itself."""
 
+    make_objective: MakeObjective
+    initial: Transform
+    box: SearchBox | None
+    config: Config
+    progress: Progress
 
-def optimise_jointly(
-    features: Sequence[FrameFeatures],
-    make_objective: MakeObjective,
-    initial: Transform,
-    box: SearchBox | None,
-    config: Config,
-    progress: Progress,
-) -> Optimised:
-    """The optimum in a search box around the initial extrinsic (4, 4), or from that itself."""
-    found = _optimised(features, make_objective, initial, box, config, progress)
-    if found.search is None or not estimates_offset(features, config) or not _move_apart(features, config):
-        return found
-    tried, best, highest = 1, found, _z_score(found)
-    for seconds in (-config.motion.scan_period_s, config.motion.scan_period_s):
-        if _is_significant(highest, best, tried, config):
-            break
-        tried += 1
-        found = _optimised(_moved(features, seconds), make_objective, initial, box, config, progress)
-        z_score = _z_score(found)
-        if z_score > highest:
-            best, highest = replace(found, seconds=found.seconds + seconds), z_score
-    if best.search is None or tried == 1:
-        return best
-    return replace(best, search=replace(best.search, rounds=tried * best.search.rounds))  # as many more optima of chance
+    def optimum(self, features: Sequence[FrameFeatures]) -> Optimised:
+        """Of the features; with points where the rows of the image see them from it, if its shutter is a rolling one."""
+        found = self._at_any_offset(features)
+        if not self.config.motion.readout_s:
+            return found
+        objective = self.make_objective(found.features, T_rows=found.T)
+        return replace(found, objective=objective, T=objective.optimise(found.T, searched=True, progress=self.progress))
+
+    def _at_any_offset(self, features: Sequence[FrameFeatures]) -> Optimised:
+        config, found = self.config, self._near(features)
+        if found.search is None or not estimates_offset(features, config) or not _move_apart(features, config):
+            return found
+        tried, best, highest = 1, found, _z_score(found)
+        for seconds in (-config.motion.scan_period_s, config.motion.scan_period_s):
+            if _is_significant(highest, best, tried, config):
+                break
+            tried += 1
+            found = self._near(_moved(features, seconds))
+            z_score = _z_score(found)
+            if z_score > highest:
+                best, highest = replace(found, seconds=found.seconds + seconds), z_score
+        if best.search is None or tried == 1:
+            return best
+        return replace(best, search=replace(best.search, rounds=tried * best.search.rounds))  # as many more optima of chance
+
+    def _near(self, features: Sequence[FrameFeatures]) -> Optimised:
+        """The optimum of features near the offset that they are at."""
+        motion, objective = self.config.motion, self.make_objective(features)
+        search = None if self.box is None or self.box.is_empty else objective.edges.search(self.initial, self.box, self.progress)
+        begin = self.initial if search is None else search.T
+        T = objective.optimise(begin, searched=search is not None, progress=self.progress)
+        moving = with_known_motion(features, objective.edges.score) if estimates_offset(features, self.config) else None
+        if moving is None:
+            return Optimised(features, objective, T, search)
+        limits, prior = objective.constraints.limits, objective.constraints.prior
+        offset = estimate_time_offset(moving[0], T, limits, prior, moving[1], motion, search is not None)
+        stamping = None
+        if offset is not None and search is not None and stamped_by_azimuth(features, motion):
+            for other in CONVENTIONS:
+                if at_stamping(motion, other) == motion:
+                    continue
+                score = self.make_objective(_restamped(features, motion, other)).edges.score
+                found = estimate_time_offset(score, T, limits, prior, moving[1], motion, search=True)
+                if found is not None and found.better_than(offset, len(CONVENTIONS) - 1):
+                    offset, stamping = found, other
+        if offset is None or not (offset.exists(motion) or stamping):
+            return Optimised(features, objective, T, search, offset)
+        if stamping is not None:
+            features = _restamped(features, motion, stamping)
+        features = _moved(features, offset.seconds)
+        objective = self.make_objective(features)
+        T = objective.optimise(limits.clip(offset.T), searched=True, progress=self.progress)
+        return Optimised(features, objective, T, search, offset, offset.seconds, stamping)
 
 
 def clocks_are_estimated(config: Config) -> bool:
@@ -115,45 +136,9 @@ def estimates_offset(features: Sequence[FrameFeatures], config: Config) -> bool:
     return clocks_are_estimated(config) and moving >= MIN_FRAMES and all(f.own is None for f in features)
 
 
-def _optimised(
-    features: Sequence[FrameFeatures],
-    make_objective: MakeObjective,
-    initial: Transform,
-    box: SearchBox | None,
-    config: Config,
-    progress: Progress,
-) -> Optimised:
-    objective = make_objective(features)
-    T, search = optimise(objective, initial, box, progress)
-    if not estimates_offset(features, config):
-        return Optimised(features, objective, T, search)
-    moving = with_known_motion(features, objective.edges.score)
-    if moving is None:
-        return Optimised(features, objective, T, search)
-    limits, prior = objective.constraints.limits, objective.constraints.prior
-    offset = estimate_time_offset(moving[0], T, limits, prior, moving[1], config.motion, search is not None)
-    stamping = None
-    if offset is not None and search is not None and stamped_by_azimuth(features, config.motion):
-        for other in CONVENTIONS:
-            if at_stamping(config.motion, other) == config.motion:
-                continue
-            score = make_objective(_restamped(features, config, other)).edges.score
-            found = estimate_time_offset(score, T, limits, prior, moving[1], config.motion, search=True)
-            if found is not None and found.better_than(offset, len(CONVENTIONS) - 1):
-                offset, stamping = found, other
-    if offset is None or not (offset.exists(config.motion) or stamping):
-        return Optimised(features, objective, T, search, offset)
-    if stamping is not None:
-        features = _restamped(features, config, stamping)
-    features = _moved(features, offset.seconds)
-    objective = make_objective(features)
-    T = objective.optimise(limits.clip(offset.T), searched=True, progress=progress)
-    return Optimised(features, objective, T, search, offset, offset.seconds, stamping)
-
-
-def _restamped(features: Sequence[FrameFeatures], config: Config, stamping: Stamping) -> list[FrameFeatures]:
-    after = at_stamping(config.motion, stamping)
-    return [restamped(f, config.motion, after) for f in features]
+def _restamped(features: Sequence[FrameFeatures], before: MotionConfig, stamping: Stamping) -> list[FrameFeatures]:
+    after = at_stamping(before, stamping)
+    return [restamped(f, before, after) for f in features]
 
 
 def _moved(features: Sequence[FrameFeatures], seconds: float) -> list[FrameFeatures]:

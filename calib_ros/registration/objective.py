@@ -1,25 +1,34 @@
-"""What the calibrator knows of an objective, and the fast form: oriented edges of sparse points on multi-level edge maps."""
+"""Objectives, as the calibrator knows them; the fast form, oriented edges of sparse points on multi-level maps; their making."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import Frame
+from calib_ros.lidar.deskew import moved
 from calib_ros.registration.classes import FrameSemantics, consistency_score
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, views_of
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective, views_of
 from calib_ros.registration.progress import SILENT, Observer, Progress
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import MARGIN, FastScore, PointScore, Score, SmoothScore
-from calib_ros.registration.search.constraints import PoseConstraints, SearchBox, unlimited
+from calib_ros.registration.score.point_score import MARGIN, FastScore, PointScore, SmoothScore
+from calib_ros.registration.search.constraints import (
+    REFINEMENT_DEG,
+    REFINEMENT_M,
+    PoseConstraints,
+    SearchBox,
+    pose_constraints,
+    unlimited,
+)
 from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 from calib_ros.registration.search.search import MIDDLE_POINTS, SIMPLEX_EVALUATIONS, SearchResult
 from calib_ros.registration.search.search import search as global_search
@@ -32,15 +41,16 @@ LAST_OF_FEW = 3  # up to this level some of the points are enough; the finer one
 COARSE_TOLERANCE_DEG = 0.01  # where a level need not be optimised to the very top, since a finer one follows
 TOLERANCE_DEG = 0.001
 ITERATIONS = 20  # of Levenberg-Marquardt per level, which ends most often after 3 to 7
+BEYOND_BOX = 1.5  # half widths of the search box; beyond, an optimum is none of the box
 
 
 class Objective(Protocol):
     """What is maximised over the extrinsic, near an optimum that the edges have found. T is T_camera_lidar (4, 4) throughout.
 
     edges: the score of edges of the same frames, which searches, and tests whether LiDAR and image match at all. constraints:
-    limits and prior, which search and optimisation obey. systematic_error: standard deviations (6,) of its bias, rad and m.
-    agreement: deg and m within which the edges' own optimum has to lie for this one to be trusted, instead of its covariance;
-    None = its covariance is validated. Every method may raise TooFewFeaturesError if too little falls into the image.
+    limits and prior, which it obeys. systematic_error: standard deviations (6,) of its bias, rad and m. agreement: deg and m
+    within which the edges' own optimum has to lie for this one to be trusted; None = its covariance is validated. Every method
+    may raise TooFewFeaturesError if too little falls into the image.
     """
 
     systematic_error: Matrix
@@ -52,35 +62,26 @@ class Objective(Protocol):
 
     def value(self, T: Transform) -> float:
         """The score."""
-        ...
 
     def frame_scores(self, T: Transform) -> Matrix:
         """The score frame by frame (n_frames,); NaN for a frame without edge points, or excluded."""
-        ...
 
     def optimise(self, T: Transform, searched: bool = False, progress: Progress = SILENT) -> Transform:
         """The local optimum from T, coarse to fine. searched: T is the result of a search, and near."""
-        ...
 
     def refine(self, T: Transform, progress: Progress = SILENT) -> Transform:
         """The local optimum from T on the finest level alone, with all frames again."""
-        ...
 
     def exclude(self, frames: NDArray[np.intp]) -> None:
         """Leave frames out of the score from now on; those of `edges` too."""
-        ...
 
     def smooth_score(self, T: Transform) -> PointScore:
         """A score with a slope that equals, or approximates, the objective near T: for the covariance."""
-        ...
 
 
 class ObjectiveKind(Protocol):
-    """Another objective than that of the edges, which joins by the entry point ``calib_ros.objectives``.
-
-    pinholes_only: it cannot project onto cylinders. moves_points: the points that it keeps follow a time offset. needs_classes:
-    it wants the classes of every frame, not only of those that leave doubt.
-    """
+    """Another objective, which joins by the entry point ``calib_ros.objectives``. pinholes_only: it cannot project onto
+    cylinders. moves_points: the points that it keeps follow a time offset. needs_classes: not only where there is doubt."""
 
     pinholes_only: bool
     moves_points: bool
@@ -95,11 +96,9 @@ class ObjectiveKind(Protocol):
         extractor: FeatureExtractor,
     ) -> Any:
         """What it keeps of a frame, as `FrameFeatures.own`. image: rectified, (h, w[, 3]) of features.camera."""
-        ...
 
     def __call__(self, edges: FastObjective, T_prior: Transform, config: Config) -> Objective:
         """The objective of the frames of `edges`, around T_prior (4, 4). Raises TooFewFeaturesError."""
-        ...
 
 
 def penalised(objective: Objective, T: Transform) -> float:
@@ -118,9 +117,8 @@ def search_margin(camera: Camera, box: SearchBox | None) -> float:
 class FastObjective:
     """The method's own objective: oriented edges of sparse points (FastScore).
 
-    features: one or more frames of one camera. T_prior: (4, 4), decides which points are near the image. constraints: None =
-    none. atlas: of the features' edge maps, if there is one already. observer: watches all evaluations. Raises
-    TooFewFeaturesError when there are too few points near the image.
+    features: of one camera. T_prior: (4, 4), decides which points are near the image. constraints: None = none. atlas: of the
+    edge maps, if there is one already. observer: watches all evaluations. TooFewFeaturesError with too few points near the image.
     """
 
     systematic_error = SYSTEMATIC_ERROR
@@ -143,7 +141,6 @@ class FastObjective:
 
     @property
     def edges(self) -> FastObjective:
-        """Itself."""
         return self
 
     def value(self, T: Transform) -> float:
@@ -151,7 +148,6 @@ class FastObjective:
         return self.score.at(-1).value(T)
 
     def frame_scores(self, T: Transform) -> Matrix:
-        """See Objective."""
         return self.score.frame_scores(T)
 
     def search(self, T: Transform, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
@@ -166,16 +162,14 @@ class FastObjective:
             self.config.refine.max_p_value,
             self.constraints.prior,
             progress.of("search"),
-            self._guide(),
+            consistency_score(views_of(self.features)),
         )
         self._reached(result.T)
         return result
 
     def optimise(self, T: Transform, searched: bool = False, progress: Progress = SILENT) -> Transform:
-        """Level by level. From 1.5 deg / 15 cm per axis, starting at 8 px instead of the next level lifts the success of
-        Levenberg-Marquardt from 14 to 19 of 20 on KITTI. But a scene seen again and again may have its optimum on the coarse
-        level elsewhere: from 0.3 deg / 3 cm, 15 of 30 runs of consecutive frames left the truth. So both, unless after a search.
-        """
+        """Level by level, from each of NEAR unless after a search: the coarser one lifts successes from 14 to 19 of 20 on KITTI,
+        but a scene seen again and again may have its optimum elsewhere there."""
         few = self.score.subset(MIDDLE_POINTS, np.random.default_rng(self.config.search.seed))
         ends = [self._coarse_levels(few, first, T) for first in ((AFTER_SEARCH,) if searched else NEAR)]
         T = max(ends, key=lambda end: penalised(self, end))
@@ -192,7 +186,6 @@ class FastObjective:
         return self._level(self.score, self.score.n_levels - 1, T)
 
     def exclude(self, frames: NDArray[np.intp]) -> None:
-        """See Objective."""
         self._excluded += [int(j) for j in frames]
         self.constraints = self.constraints.with_frames(max(len(self.features) - len(self._excluded), 1))
         self.score = self.score.select(~np.isin(self.score.frame, frames))
@@ -204,11 +197,6 @@ class FastObjective:
     def _score_near(self, T: Transform, atlas: Atlas | None, margin: float | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T; see FastScore."""
         return FastScore(self.features, T, self.config.score, margin, atlas, self.observer)
-
-    def _guide(self) -> PointScore | None:
-        """The score of the frames' classes, which ranks starts of the search; None without classes."""
-        views = views_of(self.features)
-        return consistency_score(views)
 
     def _coarse_levels(self, few: PointScore, first: int, T: Transform) -> Transform:
         """From level `first` up to the last but one; the coarser of them with a few points."""
@@ -228,18 +216,6 @@ class FastObjective:
             self.observer.reached(T)
 
 
-@dataclass(frozen=True, eq=False)
-class WithPrior:
-    """A score less the cost of a prior, for optimisers that know of no prior; a Score."""
-
-    score: Score
-    constraints: PoseConstraints
-
-    def value(self, T: Transform) -> float:
-        """At T (4, 4)."""
-        return self.score.value(T) - self.constraints.cost(T)
-
-
 def optimise_smooth(
     score: SmoothScore,
     T: Transform,
@@ -249,9 +225,93 @@ def optimise_smooth(
     tolerance_deg: float = TOLERANCE_DEG,
 ) -> Transform:
     """The optimum from T (4, 4) by ``refine.optimizer``, which is Levenberg-Marquardt where nothing is asked for."""
-    evaluations, prior = 4 * SIMPLEX_EVALUATIONS, constraints.prior
-    if config.refine.optimizer == "nelder_mead":
-        return nelder_mead(score, T, step_deg, evaluations, None if prior is None else prior.value, constraints.limits)[0]
-    if config.refine.optimizer == "barzilai_borwein":
-        return barzilai_borwein(WithPrior(score, constraints), T, step_deg, evaluations=evaluations, limits=constraints.limits)[0]
-    return levenberg_marquardt(score, T, ITERATIONS, prior, constraints.limits, tolerance_deg, near=True)[0]
+    evaluations, limits, optimizer = 4 * SIMPLEX_EVALUATIONS, constraints.limits, config.refine.optimizer
+    if optimizer == "nelder_mead":
+        return nelder_mead(score, T, step_deg, evaluations, constraints.cost, limits)[0]
+    if optimizer == "barzilai_borwein":
+        return barzilai_borwein(score, T, step_deg, evaluations=evaluations, limits=limits, penalty=constraints.cost)[0]
+    return levenberg_marquardt(score, T, ITERATIONS, constraints.prior, limits, tolerance_deg, near=True)[0]
+
+
+def trust_region(box: SearchBox | None = None) -> tuple[float, float]:
+    """How far in deg and m, per axis, an optimisation may go from the start: a refinement as far as it is meant to, a search
+    somewhat out of its box."""
+    deg, m = box.reach if box is not None else (0.0, 0.0)
+    return max(BEYOND_BOX * deg, REFINEMENT_DEG), max(BEYOND_BOX * m, REFINEMENT_M)
+
+
+def seen_by_rows(features: FrameFeatures, T: Transform, camera: Camera, readout_s: float) -> FrameFeatures:
+    """Features whose points are where the rows of the image see them at T_camera_lidar (4, 4); the same where the shutter is
+    global, the LiDAR's velocity is not known, or another objective keeps points of its own. camera: of the recorded images.
+
+    The row t seconds after the middle one sees a static point at exp(-twist t) p in the LiDAR frame. Which row depends on
+    the extrinsic, but weakly: that of the start tells it well enough for a search, its result for the final optimum.
+    """
+    points = features.points
+    if not readout_s or features.twist is None or features.own is not None:
+        return features
+    row = camera.project(se3.transform(T, points.xyz))[0][:, 1]
+    share = (np.clip(row, 0, camera.height - 1) + 0.5) / camera.height - 0.5
+    time = np.nan_to_num(share) * readout_s  # beside the image as on its border, behind it as in its middle
+    return replace(features, points=replace(points, xyz=moved(points.xyz, features.twist, -time).astype(np.float32)))
+
+
+class ObjectiveMaker:
+    """Makes the configured objective of frames of one camera, as they were recorded; the maps of the last frames are kept.
+
+    observer: gets every evaluation.
+    """
+
+    def __init__(self, config: Config, camera: Camera, observer: Observer | None) -> None:
+        self.config, self._camera, self.observer = config, camera, observer
+        self._last: Atlas | None = None  # whose memory is lent to the next one; other threads meanwhile lay out their own
+
+    def __call__(
+        self,
+        features: Sequence[FrameFeatures],
+        T_prior: Transform,
+        anchor: Transform,
+        box: SearchBox | None = None,
+        T_rows: Transform | None = None,
+        atlas: Atlas | None = None,
+    ) -> Objective:
+        """The configured objective around T_prior (4, 4). anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts
+        from. box: to be searched. T_rows: (4, 4), where points fall in the image, for a rolling shutter; None = T_prior. atlas:
+        of these features, if there is one already that others may use as well. Raises TooFewFeaturesError."""
+        config, other = self.config, other_objective(self.config)
+        constraints = pose_constraints(anchor, config.constraints, max(len(features), 1))
+        constraints = constraints.within_trust_region(T_prior, *trust_region(box))
+        if atlas is None and features:
+            last, self._last = self._last, None
+            atlas = Atlas([f.levels for f in features], features[0].camera, last)
+        seen = self._seen_by_rows(features, T_prior if T_rows is None else T_rows)
+        if other is None:
+            return FastObjective(seen, T_prior, config, constraints, atlas, self.observer)
+        # How another objective is optimised must not change how the edges search and validate.
+        of_edges = replace(config, refine=replace(config.refine, optimizer="auto"))
+        return other(FastObjective(seen, T_prior, of_edges, constraints, atlas, self.observer), T_prior, config)
+
+    def of_edges(self, features: Sequence[FrameFeatures], T_prior: Transform, anchor: Transform | None = None) -> FastObjective:
+        """The edges' own objective around T_prior (4, 4), whatever the configured one. Raises TooFewFeaturesError.
+
+        anchor: None = constraints do not count. The maps that are kept are left to estimates: this is for another thread.
+        """
+        config = self.config
+        constraints = pose_constraints(T_prior if anchor is None else anchor, config.constraints, max(len(features), 1))
+        if anchor is None:
+            constraints = PoseConstraints(unlimited(T_prior))
+        constraints = constraints.within_trust_region(T_prior, *trust_region())
+        # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
+        plain = [(f.plain or f).edges_only for f in features]
+        return FastObjective(self._seen_by_rows(plain, T_prior), T_prior, config, constraints)
+
+    def _seen_by_rows(self, features: Sequence[FrameFeatures], T: Transform) -> list[FrameFeatures]:
+        return [seen_by_rows(f, T, self._camera, self.config.motion.readout_s) for f in features]
+
+    def keep_maps(self, objective: Objective) -> None:
+        """Keep the maps of an objective that is done with: the next one may be of mostly the same frames."""
+        self._last = objective.edges.score.atlas
+
+    def free_memory(self) -> None:
+        """Free them: as much as the maps of all frames take."""
+        self._last = None

@@ -15,10 +15,8 @@ Callback = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Progress:
-    """Share of a stage that is done, reported to a callback. A part of a stage reports its own 0..1 as its range of the whole.
-
-    callback: None = not reported. stage: name passed on to the callback. first, last: the range of the stage that is reported.
-    """
+    """Share of a stage that is done, reported to a callback, None = to nobody. first, last: the range of the stage that its own
+    0..1 stands for."""
 
     callback: Callback | None = None
     stage: str = ""
@@ -44,19 +42,13 @@ SILENT = Progress()
 
 
 class Observer(Protocol):
-    """Watches an optimisation and does not change it. A linearisation is a slope with its Gauss-Newton matrix.
-
-    All calls come from the thread of the estimate: a search that is watched does not use ``search.threads``.
-    """
+    """Watches an optimisation from the thread of the estimate, where ``search.threads`` is not used, and does not change it."""
 
     def evaluated(self, count: int) -> None:
         """The score of so many extrinsics has been computed."""
-        ...
 
     def linearised(self) -> None:
-        """The score has been linearised at one extrinsic."""
-        ...
+        """The slope of the score and its Gauss-Newton matrix have been computed at one extrinsic."""
 
     def reached(self, T: NDArray[np.float64]) -> None:
         """The search, or one level of the optimisation, has ended at T_camera_lidar (4, 4)."""
-        ...

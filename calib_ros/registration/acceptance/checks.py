@@ -6,35 +6,40 @@ second test, over time, is the gate of online/tracker.py.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config
 from calib_ros.config.sensors import MAX_OFFSET_S
-from calib_ros.registration.acceptance.refusal import ObjectivesDisagree, Refusal, WrongTimes
+from calib_ros.registration.acceptance.refusal import (
+    Refusal,
+    objectives_disagree,
+    too_far_from_start,
+    worse_than_start,
+    wrong_times,
+)
 from calib_ros.registration.acceptance.significance import (
+    RATIO_CONSISTENT,
+    RATIO_INCONSISTENT,
     UNDOUBTED_Z,
-    check_distance,
-    check_improvement,
     check_significance,
     check_uncertainty,
-    is_borderline,
     p_value,
     semantic_likelihood_ratio,
 )
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
-from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.classes import consistency_score
-from calib_ros.registration.features import FrameFeatures, views_of
+from calib_ros.registration.estimate import Alignment, Estimate
+from calib_ros.registration.features import views_of
 from calib_ros.registration.joint import Optimised, estimates_offset
 from calib_ros.registration.nuisance.lens import intrinsics
 from calib_ros.registration.nuisance.parameters import NuisanceEstimate, estimate_parameters, wrong_parameter
 from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
-from calib_ros.registration.objective import Objective, penalised
-from calib_ros.registration.objective_maker import trust_region
-from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.registration.objective import Objective, penalised, trust_region
+from calib_ros.registration.progress import Progress
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult, search_decoy
 from calib_ros.result import Evidence
@@ -64,41 +69,25 @@ class Acceptance:
         halves = disagreement(objective.smooth_score(alignment.T), alignment.T, limits)
         return Evidence(z_score, decoy_z, p_value(z_score, decoy_z, rounds), halves)
 
-    def refusal(
-        self,
-        objective: Objective,
-        initial: Transform,
-        start: Transform,
-        optimised: Optimised,
-        alignment: Alignment,
-        evidence: Evidence,
-        pose: ObservablePose,
-        intrinsics: Sequence[NuisanceEstimate],
-        progress: Progress = SILENT,
-    ) -> Refusal | None:
-        """Why the extrinsic of an estimate from `initial` (4, 4) is not to be used: the first check that fails. start: what the
-        constraints leave of initial."""
-        score, initial_score = objective.value(pose.T), objective.value(start)
-        is_worse = penalised(objective, pose.T) < penalised(objective, start)
+    def refusal(self, found: Estimate, progress: Progress) -> Refusal | None:
+        """Why the extrinsic of an estimate is not to be used: the first check that fails."""
         return (
-            check_improvement(is_worse, score, initial_score)
-            or self.check_sensors(objective, alignment, evidence, optimised, intrinsics)
-            or check_distance(initial, alignment.T, objective.constraints.limits)
-            or self.check_match(optimised.features, objective, alignment, evidence)
-            or self.check_uncertainty(objective, pose)
-            or check_agreement(objective, pose.T, progress)
+            _check_improvement(found)
+            or self._check_sensors(found)
+            or _check_distance(found)
+            or self._check_match(found)
+            or self._check_uncertainty(found)
+            or _check_agreement(found.objective, found.pose.T, progress)
         )
 
-    def check_match(
-        self, features: Sequence[FrameFeatures], objective: Objective, alignment: Alignment, evidence: Evidence
-    ) -> Refusal | None:
+    def _check_match(self, found: Estimate) -> Refusal | None:
         """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
-        kept = [f for k, f in enumerate(features) if k not in alignment.outliers]
-        views = views_of(kept)
+        T, evidence = found.alignment.T, found.evidence
         largest, ratio = self.config.refine.max_p_value, 1.0
-        if is_borderline(evidence.p_value, largest):
-            ratio = semantic_likelihood_ratio(consistency_score(views), alignment.T)
-        score = objective.edges.score.at(-1).value(alignment.T)
+        if largest * RATIO_INCONSISTENT < evidence.p_value <= largest * RATIO_CONSISTENT:  # they can change the verdict
+            kept = [f for k, f in enumerate(found.optimised.features) if k not in found.alignment.outliers]
+            ratio = semantic_likelihood_ratio(consistency_score(views_of(kept)), T)
+        score = found.objective.edges.score.at(-1).value(T)
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
 
     def intrinsics(self, objective: Objective, alignment: Alignment, evidence: Evidence) -> tuple[NuisanceEstimate, ...]:
@@ -113,29 +102,21 @@ class Acceptance:
         limited = refine.tolerance_deg < NO_LIMIT_DEG or refine.tolerance_m < NO_LIMIT_M
         return self.searched and limited and evidence.p_value <= refine.max_p_value
 
-    def check_sensors(
-        self,
-        objective: Objective,
-        alignment: Alignment,
-        evidence: Evidence,
-        optimised: Optimised,
-        intrinsics: Sequence[NuisanceEstimate],
-    ) -> Refusal | None:
+    def _check_sensors(self, found: Estimate) -> Refusal | None:
         """Are the intrinsics others than given, or the offset of the clocks?"""
-        features, wrong = optimised.features, self._check_offset(optimised)
+        optimised, objective, evidence = found.optimised, found.objective, found.evidence
+        wrong = self._check_offset(optimised)
         if wrong is not None or not self._asks_sensors(evidence):
             return wrong
-        refine, motion, inflated = self.config.refine, self.config.motion, inflation(evidence.disagreement)
-        found = list(intrinsics)
-        moving = with_known_motion(features, objective.edges.score)
+        refine, limits, unknowns = self.config.refine, objective.constraints.limits, list(found.intrinsics)
+        moving = with_known_motion(optimised.features, objective.edges.score)
         # An offset that was found may be the best of those that were looked at only.
-        unknown = optimised.seconds != 0 or not estimates_offset(features, self.config)
-        if moving is not None and unknown:
-            clocks = ClockOffset(motion.time_offset_sigma_s, moving[1])
-            found += estimate_parameters([clocks], moving[0], alignment.T, objective.constraints.limits, inflated, search=True)
-        return wrong_parameter(found, refine.tolerance_deg, refine.tolerance_m)
+        if moving is not None and (optimised.seconds != 0 or not estimates_offset(optimised.features, self.config)):
+            clocks, inflated = ClockOffset(self.config.motion.time_offset_sigma_s, moving[1]), inflation(evidence.disagreement)
+            unknowns += estimate_parameters([clocks], moving[0], found.alignment.T, limits, inflated, search=True)
+        return wrong_parameter(unknowns, refine.tolerance_deg, refine.tolerance_m)
 
-    def _check_offset(self, optimised: Optimised) -> WrongTimes | None:
+    def _check_offset(self, optimised: Optimised) -> Refusal | None:
         """Is the time offset one that can be used, or does nothing near match?"""
         offset, motion = optimised.offset, self.config.motion
         if offset is None:
@@ -144,21 +125,38 @@ class Acceptance:
         # Nobody is told of an offset that is not observable: the extrinsic would be that of other clocks.
         unobservable = optimised.seconds != 0 and not offset.observable(motion)
         if too_far or unobservable or offset.suspected(motion):
-            return WrongTimes(optimised.seconds if unobservable else offset.seconds, offset.gain)
+            return wrong_times(optimised.seconds if unobservable else offset.seconds, offset.gain)
         return None
 
-    def check_uncertainty(self, objective: Objective, pose: ObservablePose) -> Refusal | None:
+    def _check_uncertainty(self, found: Estimate) -> Refusal | None:
         """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with
         it. What intrinsics and clocks leave open is not asked: more scenes would not help."""
-        if not self.searched or objective.agreement is not None:
+        if not self.searched or found.objective.agreement is not None:
             return None
-        return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
+        return check_uncertainty(found.pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
 
 
-def check_agreement(objective: Objective, T: Transform, progress: Progress = SILENT) -> ObjectivesDisagree | None:
+def _check_improvement(found: Estimate) -> Refusal | None:
+    """Does the start score more, its prior counted?"""
+    objective, T, start = found.objective, found.pose.T, found.start
+    if penalised(objective, T) < penalised(objective, start):
+        return worse_than_start(objective.value(T), objective.value(start))
+    return None
+
+
+def _check_distance(found: Estimate) -> Refusal | None:
+    """Has the optimisation come to the end of its trust region?"""
+    T, limits = found.alignment.T, found.objective.constraints.limits
+    if limits.trust_region is None or not limits.at_trust_region(T):
+        return None
+    off = se3.rotation_error_deg(found.initial, T), se3.translation_error_m(found.initial, T)
+    return too_far_from_start(*off, float(np.rad2deg(limits.trust_region.half[0])), float(limits.trust_region.half[3]))
+
+
+def _check_agreement(objective: Objective, T: Transform, progress: Progress) -> Refusal | None:
     """If the edges, begun at the optimum T (4, 4) of another objective, end far away, one of the two is wrong."""
     if objective.agreement is None:
         return None
     other = objective.edges.optimise(T, False, progress)
     deg, m = se3.rotation_error_deg(T, other), se3.translation_error_m(T, other)
-    return None if deg <= objective.agreement[0] and m <= objective.agreement[1] else ObjectivesDisagree(deg, m)
+    return None if deg <= objective.agreement[0] and m <= objective.agreement[1] else objectives_disagree(deg, m)

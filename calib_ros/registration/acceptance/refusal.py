@@ -1,10 +1,9 @@
-"""Why an estimate is refused, as typed values, and the texts for people: reasons and notes of a Result."""
+"""Why an estimate is refused, and the texts for people: reasons and notes of a Result."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from calib_ros.registration.covariance import Direction
 from calib_ros.result import RefusalCode
@@ -16,175 +15,116 @@ ONE_FRAME = "one frame only: a direction that it does not show may be wrong; use
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why an optimum is not to be used. Kinds differ in their code and in the figures they carry; str() is the message."""
+    """Why an optimum is not to be used. figures: its numbers, by name. str() is the message."""
 
-    code: ClassVar[RefusalCode]
+    code: RefusalCode
+    text: str
+    figures: Mapping[str, float]
 
-    @property
-    def figures(self) -> dict[str, float]:
-        """Its numbers, by name."""
-        values = {own.name: getattr(self, own.name) for own in fields(self)}
-        return {name: float(value) for name, value in values.items() if isinstance(value, (int, float))}
+    def __str__(self) -> str:
+        return self.text
 
 
-@dataclass(frozen=True)
-class WorseThanStart(Refusal):
+def _refusal(code: RefusalCode, text: str, **figures: float) -> Refusal:
+    return Refusal(code, text, {name: float(value) for name, value in figures.items()})
+
+
+def worse_than_start(score: float, initial_score: float) -> Refusal:
     """The optimum scores less than the initial extrinsic."""
-
-    code = RefusalCode.WORSE_THAN_START
-    score: float
-    initial_score: float
-
-    def __str__(self) -> str:
-        return f"no better extrinsic found: score {self.score:.3f} against {self.initial_score:.3f} at the start"
+    text = f"no better extrinsic found: score {score:.3f} against {initial_score:.3f} at the start"
+    return _refusal(RefusalCode.WORSE_THAN_START, text, score=score, initial_score=initial_score)
 
 
-@dataclass(frozen=True)
-class TooFarFromStart(Refusal):
-    """The optimum lies farther from the initial extrinsic than the search was meant to reach; deg and m."""
-
-    code = RefusalCode.TOO_FAR_FROM_START
-    rotation_deg: float
-    translation_m: float
-    max_rotation_deg: float
-    max_translation_m: float
-
-    def __str__(self) -> str:
-        return (
-            f"the score still rises {self.rotation_deg:.1f} deg / {self.translation_m:.2f} m away from the start, at the limit "
-            f"of {self.max_rotation_deg:g} deg / {self.max_translation_m:g} m per axis; widen the search"
-        )
+def too_far_from_start(rotation_deg: float, translation_m: float, max_rotation_deg: float, max_translation_m: float) -> Refusal:
+    """The optimum lies farther from the initial extrinsic than the search was meant to reach."""
+    text = (
+        f"the score still rises {rotation_deg:.1f} deg / {translation_m:.2f} m away from the start, at the limit "
+        f"of {max_rotation_deg:g} deg / {max_translation_m:g} m per axis; widen the search"
+    )
+    figures = {"rotation_deg": rotation_deg, "translation_m": translation_m}
+    limits = {"max_rotation_deg": max_rotation_deg, "max_translation_m": max_translation_m}
+    return _refusal(RefusalCode.TOO_FAR_FROM_START, text, **figures, **limits)
 
 
-@dataclass(frozen=True)
-class LowScore(Refusal):
+def low_score(score: float) -> Refusal:
     """The score is no better than that of the mean of the edge maps."""
-
-    code = RefusalCode.LOW_SCORE
-    score: float
-
-    def __str__(self) -> str:
-        return (
-            f"the score is {self.score:.2f}: the image shows nothing where the LiDAR sees edges; "
-            "check exposure, lens, topics and time stamps"
-        )
+    text = (
+        f"the score is {score:.2f}: the image shows nothing where the LiDAR sees edges; check exposure, lens, topics and time "
+        "stamps"
+    )
+    return _refusal(RefusalCode.LOW_SCORE, text, score=score)
 
 
-@dataclass(frozen=True)
-class NotSignificant(Refusal):
+def not_significant(z_score: float, decoy_z: float, p_value: float, largest: float, inconsistent: bool) -> Refusal:
     """The optimum is no better than chance alignments are. inconsistent: the classes of points and pixels disagree there too."""
-
-    code = RefusalCode.NOT_SIGNIFICANT
-    z_score: float
-    decoy_z: float
-    p_value: float
-    largest: float
-    inconsistent: bool = False
-
-    def __str__(self) -> str:
-        classes = " and few labelled points meet pixels of their class there" if self.inconsistent else ""
-        return (
-            f"the optimum may be chance: its z-score is {self.z_score:.1f}, a mirrored image reaches {self.decoy_z:.1f} "
-            f"(p = {self.p_value:.2g}, at most {self.largest:.2g} is accepted){classes}; use more scenes, widen the search, or "
-            "check intrinsics, topics and time stamps"
-        )
+    classes = " and few labelled points meet pixels of their class there" if inconsistent else ""
+    text = (
+        f"the optimum may be chance: its z-score is {z_score:.1f}, a mirrored image reaches {decoy_z:.1f} "
+        f"(p = {p_value:.2g}, at most {largest:.2g} is accepted){classes}; use more scenes, widen the search, or "
+        "check intrinsics, topics and time stamps"
+    )
+    figures = {"z_score": z_score, "decoy_z": decoy_z, "p_value": p_value, "largest": largest, "inconsistent": inconsistent}
+    return _refusal(RefusalCode.NOT_SIGNIFICANT, text, **figures)
 
 
-@dataclass(frozen=True)
-class TooUncertain(Refusal):
+def too_uncertain(directions: Sequence[Direction], tolerance_deg: float, tolerance_m: float) -> Refusal:
     """The scenes do not determine the extrinsic to within the tolerance. directions: those they leave open."""
-
-    code = RefusalCode.TOO_UNCERTAIN
-    directions: tuple[Direction, ...]
-    tolerance_deg: float
-    tolerance_m: float
-
-    def __str__(self) -> str:
-        directions = ", ".join(map(str, self.directions[:2]))  # the least known ones
-        return (
-            f"not known to within {self.tolerance_deg:g} deg / {100 * self.tolerance_m:g} cm: {directions} (standard "
-            "deviations); add frames of other scenes, or start from a known extrinsic and refine it"
-        )
+    text = (
+        f"not known to within {tolerance_deg:g} deg / {100 * tolerance_m:g} cm: {', '.join(map(str, directions[:2]))} (standard "
+        "deviations); add frames of other scenes, or start from a known extrinsic and refine it"
+    )
+    return _refusal(RefusalCode.TOO_UNCERTAIN, text, tolerance_deg=tolerance_deg, tolerance_m=tolerance_m)
 
 
-@dataclass(frozen=True)
-class LeftOpen(Refusal):
+def left_open(what: str, value: float, sigma: float, probability: float, tolerance_deg: float, tolerance_m: float) -> Refusal:
     """The scenes leave open whether something that was given is so wrong that the extrinsic is off by more than the tolerance.
 
     what: its name with the unit. value: what the scenes show of it, with its standard deviation. probability: of being so wrong.
     """
-
-    code = RefusalCode.TOO_UNCERTAIN
-    what: str
-    value: float
-    sigma: float
-    probability: float
-    tolerance_deg: float
-    tolerance_m: float
-
-    def __str__(self) -> str:
-        return (
-            f"not known to within {self.tolerance_deg:g} deg / {100 * self.tolerance_m:g} cm: the scenes show a change of "
-            f"{self.what} of {self.value:.2g} +- {self.sigma:.2g}, and leave open whether it is that wrong (probability "
-            f"{self.probability:.0%}); add frames of other scenes, or check K and D in camera_info and the clocks"
-        )
+    text = (
+        f"not known to within {tolerance_deg:g} deg / {100 * tolerance_m:g} cm: the scenes show a change of "
+        f"{what} of {value:.2g} +- {sigma:.2g}, and leave open whether it is that wrong (probability "
+        f"{probability:.0%}); add frames of other scenes, or check K and D in camera_info and the clocks"
+    )
+    figures = {"value": value, "sigma": sigma, "probability": probability}
+    return _refusal(RefusalCode.TOO_UNCERTAIN, text, **figures, tolerance_deg=tolerance_deg, tolerance_m=tolerance_m)
 
 
-@dataclass(frozen=True)
-class ObjectivesDisagree(Refusal):
-    """The fast objective, started at the optimum of eq. 3.12, ends elsewhere; deg and m."""
-
-    code = RefusalCode.OBJECTIVES_DISAGREE
-    rotation_deg: float
-    translation_m: float
-
-    def __str__(self) -> str:
-        return (
-            f"the optimum of eq. 3.12 lies {self.rotation_deg:.1f} deg / {self.translation_m:.2f} m from that of the fast form, "
-            "which begins there: use more scenes, start nearer, or take refine.objective: fast"
-        )
+def objectives_disagree(rotation_deg: float, translation_m: float) -> Refusal:
+    """The fast objective, started at the optimum of eq. 3.12, ends elsewhere."""
+    text = (
+        f"the optimum of eq. 3.12 lies {rotation_deg:.1f} deg / {translation_m:.2f} m from that of the fast form, "
+        "which begins there: use more scenes, start nearer, or take refine.objective: fast"
+    )
+    return _refusal(RefusalCode.OBJECTIVES_DISAGREE, text, rotation_deg=rotation_deg, translation_m=translation_m)
 
 
-@dataclass(frozen=True)
-class WrongIntrinsics(Refusal):
+def wrong_intrinsics(focal: float, u: float, v: float, deviations: float) -> Refusal:
     """Another focal length or principal point matches better. focal: share of the focal length; u, v: px of the recorded image;
     deviations: how far it is off, in standard deviations of the scenes and of what is known in advance together."""
-
-    code = RefusalCode.WRONG_INTRINSICS
-    focal: float
-    u: float
-    v: float
-    deviations: float
-
-    def __str__(self) -> str:
-        if self.focal:
-            what = f"with a focal length about {abs(self.focal):.1%} {'longer' if self.focal > 0 else 'shorter'}"
-        elif self.u:
-            what = f"with the principal point about {abs(self.u):.0f} px further to the {'right' if self.u > 0 else 'left'}"
-        else:
-            what = f"with the principal point about {abs(self.v):.0f} px further {'down' if self.v > 0 else 'up'}"
-        return (
-            f"wrong intrinsics: the scenes match better {what} ({self.deviations:.1f} standard deviations); check K and D "
-            "in camera_info, the image size they are for, and image_is_rectified"
-        )
+    if focal:
+        what = f"with a focal length about {abs(focal):.1%} {'longer' if focal > 0 else 'shorter'}"
+    elif u:
+        what = f"with the principal point about {abs(u):.0f} px further to the {'right' if u > 0 else 'left'}"
+    else:
+        what = f"with the principal point about {abs(v):.0f} px further {'down' if v > 0 else 'up'}"
+    text = (
+        f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); check K and D "
+        "in camera_info, the image size they are for, and image_is_rectified"
+    )
+    return _refusal(RefusalCode.WRONG_INTRINSICS, text, focal=focal, u=u, v=v, deviations=deviations)
 
 
-@dataclass(frozen=True)
-class WrongTimes(Refusal):
+def wrong_times(seconds: float, deviations: float) -> Refusal:
     """The scenes match better with the points measured at other times. seconds: what motion.time_offset_s lacks; deviations:
     how far that is from what is configured, in standard deviations."""
-
-    code = RefusalCode.WRONG_TIMES
-    seconds: float
-    deviations: float
-
-    def __str__(self) -> str:
-        late = "images are stamped late" if self.seconds > 0 else "images are stamped early"
-        return (
-            f"wrong times: the scenes match clearly better with the clocks set {1000 * abs(self.seconds):.0f} ms apart "
-            f"({self.deviations:.1f} standard deviations): {late}, or the scans the other way; synchronise the clocks, or add "
-            f"{self.seconds:g} to motion.time_offset_s"
-        )
+    late = "images are stamped late" if seconds > 0 else "images are stamped early"
+    text = (
+        f"wrong times: the scenes match clearly better with the clocks set {1000 * abs(seconds):.0f} ms apart "
+        f"({deviations:.1f} standard deviations): {late}, or the scans the other way; synchronise the clocks, or add "
+        f"{seconds:g} to motion.time_offset_s"
+    )
+    return _refusal(RefusalCode.WRONG_TIMES, text, seconds=seconds, deviations=deviations)
 
 
 def outliers_note(names: Sequence[str]) -> str:

@@ -1,7 +1,7 @@
 """Is an optimum a calibration, or only the best of many chance alignments? And do all frames agree with it?
 
-The score at the optimum is compared with a null distribution, the scores of extrinsics so far off that edges match by chance
-only, and with the best optimum that the same search finds in a decoy. In doubt, the classes of points and pixels have a say.
+Its score is compared with a null distribution, the scores of extrinsics so far off that edges match by chance only, and with the
+best optimum of the same search in a decoy. In doubt, the classes of points and pixels have a say.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
-from calib_ros.registration.acceptance.refusal import LowScore, NotSignificant, TooFarFromStart, TooUncertain, WorseThanStart
+from calib_ros.registration.acceptance.refusal import Refusal, low_score, not_significant, too_uncertain
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.constraints import Limits
 from calib_ros.registration.search.optimizers import Sobol
 from calib_ros.result import RefusalCode, Result
 
@@ -27,25 +26,19 @@ HALF_WIDTH = np.array([np.deg2rad(6.0)] * 3 + [0.5] * 3)  # rad, m; edges move b
 POINTS = 15000  # edge points used, so that many frames do not cost more
 NO_SPREAD = 1e-6  # a picture without any edge scores 0 everywhere: its z-score is 0
 
-# Significance. A z-score that no decoy comes near: the best optimum of a decoy has 1 to 6.3 on five vehicles and on synthetic
-# streets of 16 to 64 rings, from one frame to ten.
+# z-scores. None of a decoy comes near the first: 1 to 6.3 on five vehicles and synthetic streets, from one frame to ten.
 UNDOUBTED_Z, HIGHEST_DECOY_Z, LOWEST_DECOY_Z = 10.0, 6.3, 1.0
-# The best of many optima of chance follows Gumbel's distribution, with the scale by which their z-scores exceed a high one:
-# 0.6 to 0.9 on average over the optima of single searches, 0.2 to 0.7 from search to search in the same decoy.
-GUMBEL_SCALE = 0.65
+GUMBEL_SCALE = 0.65  # of the distribution of the best of many optima of chance: 0.6 to 0.9 within searches, 0.2 to 0.7 across
 
 WITH_90_PERCENT = 1.645  # standard deviations that a normal error exceeds in one of ten cases
 
-# Outlier frames. z-score of a frame as a share of the median of all: frames of the right image 0.6 to 2.5 (one of 42, a poor
-# scene, 0.25), of another scene's image -0.12 to 0.2 on KITTI and synthetic drives.
+# z-score of a frame as a share of the median of all: 0.6 to 2.5 with the right image, -0.12 to 0.2 with another scene's.
 OUTLIER_SHARE = 0.35
 MIN_MEDIAN_Z = 2.5  # median z-score below which no frame matches, and none can judge the others
 MIN_JUDGING_FRAMES = 4  # frames needed to tell which of them is an outlier
 
-# Semantic consistency: share of the null distribution that meets the classes better, and standard deviations above its mean.
-# With the network of the package, on single KITTI frames of two drives: of 43 right optima 34 are consistent and 3 are not, whose
-# edges leave no doubt; of 74 wrong ones, in boxes beside the truth and in pictures of other places, 11 are consistent, 7 of them
-# within 3.5 deg, and 39 are not (searched with borders of classes blended in by 0.2).
+# Semantic consistency: share of the null distribution that meets the classes better, and standard deviations above its mean. Of
+# 43 right optima of single KITTI frames 34 are consistent and 3 inconsistent, of 74 wrong ones 11 and 39.
 CONSISTENT_RANK, CONSISTENT_Z = 0.02, 1.5
 INCONSISTENT_RANK = 0.15
 # How much more probable the classes make a right optimum than a wrong one, from these counts.
@@ -54,11 +47,11 @@ RATIO_CONSISTENT, RATIO_INCONSISTENT = 5.0, 1 / 7.0
 
 @dataclass(frozen=True, eq=False)
 class NullDistribution:
-    """The score at an extrinsic against the scores of extrinsics spread around it, in their standard deviations above their mean.
+    """The score at an extrinsic against the scores of extrinsics spread around it, in their standard deviations above their mean:
+    unlike scores, they compare across scenes and sensors.
 
-    z_score: of all frames together. z_scores: (n_frames,) of every frame alone; NaN for a frame without points. Unlike the
-    score itself they compare across scenes and sensors: a picture full of edges scores high anywhere. mean, spread: of the
-    distribution of all frames together.
+    z_score: of all frames together. z_scores: (n_frames,) of every frame alone; NaN for a frame without points. mean, spread: of
+    the distribution of all frames together.
     """
 
     z_score: float
@@ -102,26 +95,10 @@ def _twists() -> Matrix:
     return se3.exp_many(Sobol(6, seed=0).next(NEIGHBOURS) * HALF_WIDTH)
 
 
-def check_distance(initial: Transform, T: Transform, limits: Limits) -> TooFarFromStart | None:
-    """Has the optimisation from the initial extrinsic to T (4, 4) come to the end of its trust region?"""
-    if limits.trust_region is None or not limits.at_trust_region(T):
-        return None
-    max_deg, max_m = float(np.rad2deg(limits.trust_region.half[0])), float(limits.trust_region.half[3])
-    return TooFarFromStart(se3.rotation_error_deg(initial, T), se3.translation_error_m(initial, T), max_deg, max_m)
-
-
-def check_improvement(is_worse: bool, score: float, initial_score: float) -> WorseThanStart | None:
-    """Does the start score more, its prior counted?"""
-    return WorseThanStart(score, initial_score) if is_worse else None
-
-
 def p_value(z_score: float, decoy_z: float | None, rounds: int = 1) -> float:
-    """Probability that the best optimum of chance reaches this z-score, from that of one decoy.
-
-    decoy_z: of the best optimum that one round of the search finds in the decoy; None = not searched, and taken to be as high as
-    any. rounds: of the search itself, whose best optimum of chance rises with their logarithm. Of two independent maxima of
-    Gumbel's distribution the difference is logistic.
-    """
+    """Probability that the best optimum of chance reaches this z-score: the difference of two maxima of Gumbel's distribution is
+    logistic. decoy_z: of the best optimum of one round in the decoy; None = not searched, and taken to be as high as any. rounds:
+    of the search itself, with whose logarithm the best optimum of chance rises."""
     decoy = HIGHEST_DECOY_Z if decoy_z is None else decoy_z
     margin = (z_score - decoy) / GUMBEL_SCALE - np.log(rounds)
     return float(1 / (1 + np.exp(np.clip(margin, -50, 50))))
@@ -129,21 +106,14 @@ def p_value(z_score: float, decoy_z: float | None, rounds: int = 1) -> float:
 
 def check_significance(
     score: float, z_score: float, decoy_z: float | None, p: float, largest: float, ratio: float = 1.0
-) -> LowScore | NotSignificant | None:
+) -> Refusal | None:
     """Is the optimum no better than chance? p: its p value; largest: what is accepted; ratio: see semantic_likelihood_ratio.
-
-    score: of the optimum; 0 is that of the mean of the maps, and less than that, or NaN, of an image that shows nothing.
-    """
+    score: of the optimum; 0 is that of the mean of the maps, less, or NaN, of an image that shows nothing."""
     if p <= largest * ratio:
         return None
     if not score > 0:
-        return LowScore(score)
-    return NotSignificant(z_score, HIGHEST_DECOY_Z if decoy_z is None else decoy_z, p, largest * ratio, inconsistent=ratio < 1)
-
-
-def is_borderline(p: float, largest: float) -> bool:
-    """Can the classes change the verdict on a p value?"""
-    return largest * RATIO_INCONSISTENT < p <= largest * RATIO_CONSISTENT
+        return low_score(score)
+    return not_significant(z_score, HIGHEST_DECOY_Z if decoy_z is None else decoy_z, p, largest * ratio, ratio < 1)
 
 
 def leaves_doubt(result: Result) -> bool:
@@ -153,7 +123,7 @@ def leaves_doubt(result: Result) -> bool:
     return not result.converged or result.evidence is None or result.evidence.z_score < UNDOUBTED_Z
 
 
-def check_uncertainty(covariance: Covariance, tolerance_deg: float, tolerance_m: float) -> TooUncertain | None:
+def check_uncertainty(covariance: Covariance, tolerance_deg: float, tolerance_m: float) -> Refusal | None:
     """Is an extrinsic of this covariance (6, 6) known to within the tolerance? Its rotation and its shift, with 90 %."""
     sigma = np.sqrt(np.diag(covariance))
     limit_deg, limit_m = tolerance_deg / WITH_90_PERCENT, tolerance_m / WITH_90_PERCENT
@@ -161,12 +131,12 @@ def check_uncertainty(covariance: Covariance, tolerance_deg: float, tolerance_m:
         return None
     # A rotation or a shift within the limit has its axes within it divided by the root of 3, if they share it alike.
     directions = unobservable_directions(covariance, limit_deg / np.sqrt(3), limit_m / np.sqrt(3))
-    return TooUncertain(tuple(directions), tolerance_deg, tolerance_m)
+    return too_uncertain(directions, tolerance_deg, tolerance_m)
 
 
 def semantic_likelihood_ratio(consistency: PointScore | None, T: Transform) -> float:
-    """How much more probable the classes make it that T_camera_lidar (4, 4) is right, by how its semantic consistency compares
-    with the null distribution; 1.0 without classes."""
+    """How much more probable classes make it that T_camera_lidar (4, 4) is right, by its rank in the null distribution; 1.0
+    without classes."""
     if consistency is None:
         return 1.0
     level = consistency.n_levels - 1

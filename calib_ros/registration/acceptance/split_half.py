@@ -1,7 +1,7 @@
 """Split-half disagreement: do disjoint halves of the same data lead to the same extrinsic?
 
-A decoy tells an optimum of chance from a real one, but not a biased optimum from the right one, nor directions along which the
-score is flat. Halves do: each is refined by itself, and their distance is compared with what their own curvatures let expect.
+Unlike a decoy, this tells a biased optimum from the right one: the distance of halves, each refined by itself, is compared with
+what their own curvatures let expect.
 """
 
 from __future__ import annotations
@@ -21,18 +21,16 @@ from calib_ros.registration.search.optimizers import levenberg_marquardt
 POINTS = 6000  # edge points used for both halves, so that many frames do not cost more
 MIN_POINTS = 60  # of a half: ten per unknown
 LEVELS = (2, 3, 4)  # on which a half is refined: coarse enough to leave an optimum that only both halves together hold up
-# Of 111 single frames and 54 sets of 18 sensor sets with exact references these make the errors most likely. Without: normalised
-# errors squared of up to 152 for single frames, of which 6 were accepted more than 0.5 deg or 10 cm off; with them 2.
+# These make the errors of 111 single frames and 54 sets most likely; 2 of the single ones are accepted too far off, 6 without.
 AGREEING, MOST = 0.7, 5.0
 SECTOR = np.deg2rad(6.0)  # width of interleaved sectors of azimuth: wider than an object's edge, narrower than a scene
 
 
 def disagreement(score: PointScore, T: Transform, limits: Limits) -> float:
     """The distance of halves of the data, each refined from the optimum T (4, 4): squared, in units of what their covariances
-    let expect, on average over several ways to halve the data. About 1 for a right optimum; see `inflation`.
+    let expect, on average over several ways to halve the data, each at most MOST. About 1 for a right optimum; see `inflation`.
 
-    limits: axes that are fixed stay so. 1.0 where there are too few points. A way counts as MOST at most: halves that hold too
-    little to tell anything end anywhere.
+    limits: axes that are fixed stay so. 1.0 where there are too few points.
     """
     part = score.subset(POINTS, np.random.default_rng(0))
     axes = np.flatnonzero(limits.open_axes)
@@ -59,8 +57,7 @@ def inflation(disagreement: float) -> float:
 
 
 def _halvings(score: PointScore, T: Transform) -> Iterator[NDArray[np.bool_]]:
-    """Ways to halve the points, masks (n,): interleaved sectors of the scan, left and right half of the image, its middle and
-    its sides, near and far, and alternate frames. Only those that leave enough points on both sides."""
+    """Masks (n,) of halves with enough points: sectors of the scan, sides of the image, middle, near ones, alternate frames."""
     p = T[:3, :3] @ score.points + T[:3, 3:]
     quarter = share_of_weight(np.arctan2(p[0], p[2]), score.weights, 4)
     azimuth = np.arctan2(score.points[1], score.points[0])

@@ -14,56 +14,40 @@ from calib_ros import se3
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.initial_guess import rotation_distance_deg
-from calib_ros.registration.motion_guess.hand_eye import CLOCK_S, SAME_DEG, Fit, HandEye
-from calib_ros.registration.motion_guess.lidar_motion import Run, lidar_runs
-from calib_ros.registration.motion_guess.tracks import Tracks, tracked_points
+from calib_ros.registration.motion_guess.hand_eye import CLOCK_S, SAME_DEG, Fit, HandEye, distinct
+from calib_ros.registration.motion_guess.tracks import Run, Tracks, lidar_runs, tracked_points
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, SearchBox
 
 Matrix = NDArray[np.float64]
 
 LEAST_M, LEAST_RAD = 0.5, np.deg2rad(3.0)  # of travel or of turning; tracked points and aligned scans wander a tenth of it
 MIN_TRACKS, MIN_PAIRS = 100, 3
-# Of the way that points move in the images, the share that the LiDAR's motion does not explain: 0.01 to 0.07 of six windows, and
-# 0.05 to 0.37 where the pictures are those of another window, which also drives ahead.
+# Share of the points' way in the images that the LiDAR's motion does not explain: 0.01 to 0.07, of other pictures 0.05 to 0.37.
 MAX_UNEXPLAINED = 0.25
-# Standard deviation of the LiDAR's turns as the pictures see them: 0.02 to 0.12 deg of ten windows, and 0.20 to 1.5 deg where the
-# pictures are those of another window, or in reverse order; there it is half of the turns themselves, or more.
+# Standard deviation of the LiDAR's turns as the pictures see them: 0.02 to 0.12 deg, of other pictures 0.20 to 1.5 deg and half
+# of the turns themselves, or more.
 MAX_TURN_ERROR_DEG, MAX_TURN_SHARE = 0.2, 0.45
 HYPOTHESES = 3
-# Standard deviation of what the motion of one drive has in common, intrinsics and ways of aligning scans among it.
-FLOOR_DEG = 0.3
-# Cameras are mounted upright or on a side, by eye: with this standard deviation, half of the box around a nominal extrinsic.
-UPRIGHT_DEG = NOMINAL_BOX.reach[0] / 2
+FLOOR_DEG = 0.3  # standard deviation of what one drive has in common, intrinsics and ways of aligning scans among it
+UPRIGHT_DEG = NOMINAL_BOX.reach[0] / 2  # standard deviation of cameras that are mounted upright or on a side, by eye
 UPRIGHT = np.array([[0.0, -1, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])  # the LiDAR's z axis in the camera's frame
 # Standard deviation of an axis beyond which that is assumed; is said to be; leaves open which of them; and is too much to search.
 WEAK_DEG, HIDDEN_DEG, LOST_DEG = 2.0, 5.0, 15.0
 ALONG = np.cos(np.deg2rad(30))  # an axis is the direction of travel
 SIGMAS, LEAST_DEG = 3.0, 5.0  # half width of the box: so many standard deviations, but no less; a search needs room
 CLOCK_KNOWN_S = CLOCK_S / 2  # standard deviation of the clocks' offset at which the motion has told most of it
-# Of that standard deviation. Interpolating between scans averages their errors, most in the middle of two, which looks like a
-# better fit: offsets of 0 were found within 50 ms in the worst of 34 windows at 5 Hz, 2.5 standard deviations.
-CLOCK_INFLATION = 2.5
+CLOCK_INFLATION = 2.5  # of that: poses between two scans average their errors, which looks like a better fit
 
 
 @dataclass(frozen=True, eq=False)
 class MotionGuess:
     """What consecutive frames tell of the extrinsic by their motion.
 
-    Attributes
-    ----------
-    hypotheses : ndarray, shape (k, 4, 4)
-        T_camera_lidar, best first; the camera is at the LiDAR, since motion tells little of its place.
-    covariance : ndarray, shape (3, 3)
-        Of the first one's rotation, a turn about the camera's axes, rad^2, with what was assumed where an axis is hidden.
-    hidden : ndarray, shape (j, 3)
-        Unit vectors in the camera's frame, about which the motion does not tell the rotation.
-    time_offset_s : float or None
-        What ``motion.time_offset_s`` lacks; None where the motion does not tell.
-    time_sigma_s : float or None
-        Its standard deviation, s.
-    note : str
-        For people, one line.
+    hypotheses: (k, 4, 4) T_camera_lidar, best first; the camera is at the LiDAR, since motion tells little of its place.
+    covariance: (3, 3) of the first one's rotation, a turn about the camera's axes, rad^2, with what was assumed where an axis is
+    hidden. hidden: (j, 3) unit vectors in the camera's frame about which the motion does not tell the rotation. time_offset_s,
+    time_sigma_s: what ``motion.time_offset_s`` lacks, and its standard deviation; None where the motion does not tell. note: for
+    people, one line.
     """
 
     hypotheses: Matrix
@@ -125,7 +109,8 @@ def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> Mot
             "the motion does not tell the rotation, or only about one axis: give more frames in which the vehicle drives some "
             "metres, best round a bend"
         )
-    hypotheses = _apart(np.array([se3.from_parts(fit.R, np.zeros(3)) for fit in fits]))
+    hypotheses = np.array([se3.from_parts(fit.R, np.zeros(3)) for fit in fits])
+    hypotheses = hypotheses[distinct(hypotheses, np.arange(float(len(fits))), SAME_DEG)]
     sigma = CLOCK_INFLATION * float(np.sqrt(fits[0].covariance[6, 6]))
     known = sigma < CLOCK_KNOWN_S
     offset = -fits[0].clock_s if known else None
@@ -173,15 +158,6 @@ def _hidden_axes(covariance: Matrix, limit_deg: float) -> Matrix:
     """Unit vectors (j, 3) about which the rotation is less known than limit_deg, least known first."""
     variance, axes = np.linalg.eigh(covariance)
     return np.asarray(axes.T[variance > np.deg2rad(limit_deg) ** 2][::-1])
-
-
-def _apart(transforms: Matrix) -> Matrix:
-    """The transforms (k, 4, 4) without those whose rotation is that of an earlier one."""
-    kept: list[int] = []
-    for k, T in enumerate(transforms):
-        if not kept or rotation_distance_deg(transforms[kept], T).min() >= SAME_DEG:
-            kept.append(k)
-    return np.asarray(transforms[kept])
 
 
 def _with_upright(solver: HandEye, fit: Fit) -> Fit:

@@ -3,14 +3,12 @@
 Between two moments the LiDAR's points move by A (4, 4), so the camera's move by X A X^-1, X = T_camera_lidar (the hand-eye
 equation, Tsai and Lenz 1989), with R = R_X R_A R_X^T and t = R_X (t_A + (R_A - I) c), c the camera's centre in the LiDAR's frame.
 A point seen in direction x at first, at an unknown distance d, is later seen on an arc: R x + t / d, from d = infinity to the
-nearest distance at which anything can be. The angle from that arc is the residual. It holds the whole epipolar constraint, tells
-forward from backward, and becomes the angle between two directions where the camera only turns, so that no kind of motion is a
-special case, as it is for essential matrices.
+nearest distance at which anything can be. The angle from that arc is the residual, whatever the kind of motion.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.registration.initial_guess import rotation_distance_deg
-from calib_ros.registration.motion_guess.lidar_motion import Run
-from calib_ros.registration.motion_guess.tracks import Tracks
+from calib_ros.registration.motion_guess.tracks import Run, Tracks
 
 Matrix = NDArray[np.float64]
 
@@ -37,8 +34,7 @@ MAX_COST_RATIO = 1.3  # to the least of 16 local optima; where only one is right
 CENTRE_M = 1.0  # standard deviation of the camera's place along every axis, around the LiDAR
 CLOCK_S = 0.05  # standard deviation of the offset of the clocks, before anything is known of it
 CLOCKS_S = np.linspace(-0.5, 0.5, 11)  # offsets tried
-# The LiDAR's motion between two pictures is not exact: its error is estimated with everything else. Its standard deviations along
-# every axis, rad and m: at first, and at least.
+# Standard deviations, at first and at least, of the error of the LiDAR's motion between two pictures along every axis.
 MOTION_RAD, MOTION_M = np.deg2rad([0.1, 0.02]), np.array([0.03, 0.005])
 OVERLAP = 2.0  # pairs of pictures overlap by half, so that every moment counts twice
 
@@ -77,21 +73,7 @@ class _State:
         return _State(Rotation.from_rotvec(step[:3]).as_matrix() @ self.R, self.centre + step[3:6], clock, self.errors + errors)
 
 
-@dataclass(frozen=True, eq=False)
-class _Reduced:
-    """Normal equations of rotation, centre and clock, (7, 7) and (7,), and what leads from there to the errors of the m pairs:
-    inner (m, 6, 6) their covariance, cross (m, 6, 7), slope (m, 6)."""
-
-    information: Matrix
-    gradient: Matrix
-    inner: Matrix
-    cross: Matrix
-    slope: Matrix
-
-    def errors(self, step: Matrix) -> tuple[Matrix, Matrix]:
-        """Steps (m, 6) of the errors that belong to a step (7,), and their variances (m, 6)."""
-        steps = -np.einsum("mij,mj->mi", self.inner, self.slope + self.cross @ step)
-        return steps, np.diagonal(self.inner, axis1=1, axis2=2)
+Errors = Callable[[Matrix], tuple[Matrix, Matrix]]  # steps (m, 6) of the errors that belong to a step (7,), and their variances
 
 
 class HandEye:
@@ -123,16 +105,16 @@ class HandEye:
         coarse = self.tracks.subset(COARSE_TRACKS, rng)
         rotations = _all_rotations(COARSE)
         costs = np.array([_cost(_residuals(R, np.zeros(3), motions, coarse), scale) for R in rotations])
-        starts = [rotations[k] for k in _distinct(rotations, costs, 2 * SAME_DEG)]
+        starts = [rotations[k] for k in distinct(rotations, costs, 2 * SAME_DEG)]
         fine = self.tracks.subset(FINE_TRACKS, rng)
         refined = np.array([self._turned(R, motions, fine) for R in starts])
         scale = min(_scale(_residuals(R, np.zeros(3), motions, fine), self._floor) for R in refined)
         costs = np.array([_cost(_residuals(R, np.zeros(3), motions, fine), scale) for R in refined])
-        plausible = [k for k in _distinct(refined, costs, SAME_DEG) if costs[k] <= MAX_COST_RATIO * costs.min()]
+        plausible = [k for k in distinct(refined, costs, SAME_DEG) if costs[k] <= MAX_COST_RATIO * costs.min()]
         fits = [self.fit(refined[k]) for k in plausible[:limit]]
         smallest = min(fit.scale for fit in fits)
         fits = [replace(fit, cost=self.cost(fit, smallest)) for fit in fits]
-        order = _distinct(np.array([f.R for f in fits]), np.array([f.cost for f in fits]), SAME_DEG)
+        order = distinct(np.array([f.R for f in fits]), np.array([f.cost for f in fits]), SAME_DEG)
         return [fits[k] for k in order]
 
     def cost(self, fit: Fit, scale: float) -> float:
@@ -140,11 +122,8 @@ class HandEye:
         return _cost(_residuals(fit.R, fit.centre, self.motions(fit.clock_s), self.tracks), scale)
 
     def fit(self, R: Matrix, upright: tuple[Matrix, float] | None = None) -> Fit:
-        """The optimum next to a rotation (3, 3) with all that is unknown: rotation, centre, clocks, and the errors of the LiDAR's
-        motion, which are eliminated pair by pair (Schur complement).
-
-        upright: direction (3,) in the camera's frame of the LiDAR's z axis and its standard deviation, rad, a prior.
-        """
+        """The optimum next to a rotation (3, 3) in rotation, centre, clocks, and the errors of the LiDAR's motion, which are
+        eliminated pair by pair (Schur complement). upright: a prior, the LiDAR's z axis (3,) in the camera and its sigma, rad."""
         prior = np.r_[np.zeros(3), np.full(3, CENTRE_M**-2.0), CLOCK_S**-2.0]
         state = _State(R, np.zeros(3), self._clock(R), np.zeros((len(self.tracks.start), 6)))
         sigma = np.r_[MOTION_RAD[0], MOTION_M[0]]
@@ -152,8 +131,8 @@ class HandEye:
             r, J = self._linear(state)
             scale = _scale(r, self._floor)
             weight = 1 / (scale**2 + (r * r).sum(axis=1))
-            system = self._reduced(r, J, weight, state.errors, np.repeat(sigma**-2.0, 3))
-            information, gradient = system.information + np.diag(prior), system.gradient.copy()
+            reduced, gradient, errors_at = self._reduced(r, J, weight, state.errors, np.repeat(sigma**-2.0, 3))
+            information = reduced + np.diag(prior)
             gradient[3:] += prior[3:] * np.r_[state.centre, state.clock]
             if upright is not None:
                 d, G = _upright(state.R, *upright)
@@ -161,7 +140,7 @@ class HandEye:
                 gradient[:3] += G.T @ d
             step = -np.linalg.solve(information + 1e-6 * np.eye(7), gradient)
             step *= min(1.0, 0.3 / max(float(np.linalg.norm(step[:3])), 1e-9))
-            errors, spread = system.errors(step)
+            errors, spread = errors_at(step)
             state = state.moved(step, errors)
             # As expectation maximisation has it: the spread of the errors found, and what is left open of each.
             found = np.sqrt([np.mean(state.errors[:, s] ** 2 + spread[:, s]) for s in (slice(0, 3), slice(3, 6))])
@@ -173,9 +152,8 @@ class HandEye:
         unexplained = float(np.median(np.linalg.norm(measured, axis=1)) / np.median(self._flow(self.tracks)))
         return Fit(state.R, state.centre, state.clock, _cost(r, scale), scale, covariance, unexplained, float(sigma[0]))
 
-    def _reduced(self, r: Matrix, J: Matrix, weight: Matrix, errors: Matrix, precision: Matrix) -> _Reduced:
-        """The normal equations of residuals r (n, 2), J (n, 2, 13), without the errors (m, 6) of the pairs, whose precision (6,)
-        is given."""
+    def _reduced(self, r: Matrix, J: Matrix, weight: Matrix, errors: Matrix, precision: Matrix) -> tuple[Matrix, Matrix, Errors]:
+        """Normal equations of residuals r (n, 2), J (n, 2, 13), without the errors (m, 6) of the pairs, of precision (6,)."""
         m = len(errors)
         bounds = np.searchsorted(self.tracks.pair, np.arange(m + 1))
         information, gradient = np.zeros((7, 7)), np.zeros(7)
@@ -187,7 +165,11 @@ class HandEye:
             inner[k], cross[k], slope[k] = inverse, H[7:, :7], g[7:] + precision * errors[k]
             information += H[:7, :7] - H[:7, 7:] @ inverse @ H[7:, :7]
             gradient += g[:7] - H[:7, 7:] @ inverse @ slope[k]
-        return _Reduced(information, gradient, inner, cross, slope)
+
+        def errors_at(step: Matrix) -> tuple[Matrix, Matrix]:
+            return -np.einsum("mij,mj->mi", inner, slope + cross @ step), np.diagonal(inner, axis1=1, axis2=2)
+
+        return information, gradient, errors_at
 
     def _clock(self, R: Matrix) -> float:
         """The offset of the clocks (s) at which the tracks fit best at a rotation; 0 unless another one is clearly better."""
@@ -291,7 +273,7 @@ def _all_rotations(n: int) -> Matrix:
     )
 
 
-def _distinct(rotations: Matrix, costs: Matrix, least_deg: float) -> list[int]:
+def distinct(rotations: Matrix, costs: Matrix, least_deg: float) -> list[int]:
     """Positions of at most STARTS of the rotations (k, 3, 3), cheapest first, none nearer than least_deg to a cheaper one."""
     kept: list[int] = []
     for k in np.argsort(costs, kind="stable"):

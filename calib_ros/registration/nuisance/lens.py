@@ -1,21 +1,21 @@
 """Do the intrinsics fit the scenes?
 
-With a wrong focal length or principal point another extrinsic matches best, by decimetres and degrees elsewhere, and everything
-else about it looks right. But the match itself is worse than with the right ones: so focal length and principal point are
-estimated, with the extrinsic refined again for each of their values.
-
-Unrolled pictures of wide lenses show neither: a shift is a rotation there, and lenses of another focal length are unrolled
-otherwise.
+With a wrong focal length or principal point another extrinsic matches best, by decimetres and degrees elsewhere, but worse than
+with the right ones: so they are estimated, with the extrinsic refined again for each of their values. Unrolled pictures of wide
+lenses show neither: a shift is a rotation there, and lenses of another focal length are unrolled otherwise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.config import CameraConfig
-from calib_ros.registration.acceptance.refusal import WrongIntrinsics
+from calib_ros.intrinsics import CENTRE as CENTRE_NAMES
+from calib_ros.intrinsics import FOCAL as FOCAL_NAME
+from calib_ros.registration.acceptance.refusal import Refusal, wrong_intrinsics
 from calib_ros.registration.nuisance.parameters import Changed, NuisanceParameter
 from calib_ros.registration.score.point_score import PointScore
 
@@ -24,67 +24,42 @@ CENTRE = (-0.03, -0.015, 0.015, 0.03)  # shares of the image width, each way
 
 
 @dataclass(frozen=True, eq=False)
-class FocalLength(NuisanceParameter):
-    """The focal length, as a share of it."""
+class Intrinsic(NuisanceParameter):
+    """The focal length, as a share of it, or a coordinate of the principal point, as a share of the image width.
 
-    name = "focal_length_share"
+    name: of calib_ros.intrinsics. width: of the recorded image, px.
+    """
+
+    name: str = FOCAL_NAME
+    width: int = 1
     gross = 0.03
     step = 0.005  # 3 px at the border of an image of 1280
-    alternatives = FOCAL
-
-    def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
-        """See NuisanceParameter."""
-        return score.with_intrinsics(value, 0.0, 0.0), T
-
-    def observable_in(self, score: PointScore) -> bool:
-        """See NuisanceParameter."""
-        return not score.camera.is_cylinder
-
-    def refusal(self, value: float, deviations: float) -> WrongIntrinsics:
-        """See NuisanceParameter."""
-        return WrongIntrinsics(value, 0.0, 0.0, deviations)
-
-
-@dataclass(frozen=True, eq=False)
-class PrincipalPoint(NuisanceParameter):
-    """A coordinate of the principal point, as a share of the image width. axis: 0 across, 1 down. width: of the recorded image,
-    px."""
-
-    axis: int
-    width: int
-    gross = 0.03
-    step = 0.005
-    alternatives = CENTRE
-
-    @property
-    def name(self) -> str:
-        """See NuisanceParameter."""
-        return f"principal_point_{'xy'[self.axis]}_px"
 
     @property
     def unit(self) -> float:
-        """See NuisanceParameter."""
-        return float(self.width)
+        return 1.0 if self.name == FOCAL_NAME else float(self.width)
 
-    def _shift(self, value: float) -> tuple[float, float]:
-        return (value, 0.0) if self.axis == 0 else (0.0, value)
+    @property
+    def alternatives(self) -> Sequence[float]:
+        return FOCAL if self.name == FOCAL_NAME else CENTRE
 
     def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
-        """See NuisanceParameter."""
-        across, down = self._shift(value * score.camera.width / score.camera.K[0, 0])  # what it looks like: a rotation
-        return score.with_intrinsics(0.0, *self._shift(value)), se3.exp([down, -across, 0.0, 0.0, 0.0, 0.0]) @ T
+        _, across, down = self._of_all(value * score.camera.width / score.camera.K[0, 0])  # what it looks like: a rotation
+        return score.with_intrinsics(*self._of_all(value)), se3.exp([down, -across, 0.0, 0.0, 0.0, 0.0]) @ T
 
     def observable_in(self, score: PointScore) -> bool:
-        """See NuisanceParameter."""
         return not score.camera.is_cylinder
 
-    def refusal(self, value: float, deviations: float) -> WrongIntrinsics:
-        """See NuisanceParameter."""
-        u, v = self._shift(value * self.width)
-        return WrongIntrinsics(0.0, u, v, deviations)
+    def refusal(self, value: float, deviations: float) -> Refusal:
+        return wrong_intrinsics(*self._of_all(value * self.unit), deviations)
+
+    def _of_all(self, value: float) -> tuple[float, float, float]:
+        """The value among focal length and both coordinates, the others 0."""
+        focal, u, v = (value if name == self.name else 0.0 for name in (FOCAL_NAME, *CENTRE_NAMES))
+        return focal, u, v
 
 
 def intrinsics(config: CameraConfig, width: int) -> tuple[NuisanceParameter, ...]:
     """The intrinsics of a camera with images of this width, px, each a parameter of its own: those that are not exact."""
-    focal, centre = FocalLength(config.focal_sigma), [PrincipalPoint(config.centre_sigma, axis, width) for axis in (0, 1)]
-    return tuple(parameter for parameter in (focal, *centre) if parameter.sigma > 0)
+    centre = [Intrinsic(config.centre_sigma, name, width) for name in CENTRE_NAMES]
+    return tuple(parameter for parameter in (Intrinsic(config.focal_sigma), *centre) if parameter.sigma > 0)

@@ -1,8 +1,7 @@
-"""What an estimate takes for granted besides the extrinsic: the intrinsics and the clocks. Do they fit, and what if they are off?
+"""What an estimate takes for granted besides the extrinsic: the intrinsics (lens.py) and the clocks (time_offset.py).
 
-Another focal length, or an offset of the clocks, is one more unknown of the registration. The scenes tell some of it: the
-extrinsic is refined anew with another value, and the match gets worse, or clearly better. What they do not tell moves the
-extrinsic along one direction, and belongs to its covariance. The parameters are those of lens.py and time_offset.py.
+The extrinsic is refined anew with another value of an unknown, and the match gets worse, or clearly better. What the scenes do
+not tell of it moves the extrinsic along one direction, and belongs to its covariance.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from scipy.special import ndtr, stdtr
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
-from calib_ros.registration.acceptance.refusal import LeftOpen, WrongIntrinsics, WrongTimes
+from calib_ros.registration.acceptance.refusal import Refusal, left_open
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.covariance import NO_NOISE, REGIONS, effective_frames, noise_covariance, noise_level
 from calib_ros.registration.score.point_score import PointScore
@@ -43,11 +42,8 @@ SIGNIFICANT_Z, MIN_FRAMES = 2.5, 3
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """How an unknown moves the optimum.
-
-    direction: (6,) twist of the optimum, rad and m, per unit of the unknown. information: what the scenes tell of the unknown,
-    the inverse of its variance.
-    """
+    """How an unknown moves the optimum. direction: (6,) twist of it, rad and m, per unit of the unknown. information: what the
+    scenes tell of the unknown, the inverse of its variance."""
 
     direction: Matrix
     information: float
@@ -62,8 +58,7 @@ class Effect:
         return np.outer(shift, shift)
 
     def constrained(self, constraints: PoseConstraints, covariance: Covariance, prior: float) -> Effect:
-        """The same under constraints of the extrinsic: its prior holds the optimum back, and its limits end its way. covariance:
-        (6, 6) of the optimum, its prior counted."""
+        """The same under prior and limits of the extrinsic. covariance: (6, 6) of the optimum, its prior counted."""
         direction = self.direction
         if constraints.prior:
             direction = direction - covariance @ (constraints.information() * direction)
@@ -76,25 +71,25 @@ class Effect:
 class NuisanceParameter(ABC):
     """One more unknown of the registration beside the extrinsic, 0 where it is as configured.
 
-    sigma: its standard deviation in advance, 0 = known. gross: that of values that are plainly wrong. step: to either side for
-    its effect; so far that edges move by a pixel or more, and no further than their blurred maps reach. alternatives: other
-    values that are compared with 0.
+    sigma: its standard deviation in advance, 0 = known. name: for files, with the unit. gross: standard deviation of values that
+    are plainly wrong. step: to either side for its effect; so far that edges move by a pixel or more, and no further than their
+    blurred maps reach.
     """
 
     sigma: float
+    name: str
     gross: ClassVar[float]
     step: ClassVar[float]
-    alternatives: ClassVar[Sequence[float]]
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """For files, with the unit."""
 
     @property
     def unit(self) -> float:
         """By which values are multiplied for files."""
         return 1.0
+
+    @property
+    @abstractmethod
+    def alternatives(self) -> Sequence[float]:
+        """Other values that are compared with 0."""
 
     @abstractmethod
     def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
@@ -105,12 +100,11 @@ class NuisanceParameter(ABC):
         """Whether these frames can show it at all."""
 
     @abstractmethod
-    def refusal(self, value: float, deviations: float) -> WrongIntrinsics | WrongTimes:
+    def refusal(self, value: float, deviations: float) -> Refusal:
         """Why an extrinsic is refused if this value is right; deviations: how far it is off, in standard deviations."""
 
     def effect(self, score: PointScore, T: Transform, limits: Limits, points: int = NEAR_POINTS) -> Effect:
-        """How it moves the optimum T (4, 4), refined anew a step to either side, and by how much the score falls. points: edge
-        points used at most."""
+        """How it moves the optimum T (4, 4), refined anew a step to either side. points: edge points used at most."""
         if not self.observable_in(score):
             return Effect(np.zeros(6), 0.0)
         limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # at speed, a step is farther than the trust region
@@ -120,10 +114,6 @@ class NuisanceParameter(ABC):
         direction = np.where(limits.open_axes, se3.log(ends[2] @ se3.inverse(ends[0])), 0.0) / (2 * self.step)
         fallen = max(values[1] - 0.5 * (values[0] + values[2]), 0.0)
         return Effect(direction, 2 * fallen / self.step**2 / noise_of(part, T, limits))
-
-    def added_covariance(self, effect: Effect, constraints: PoseConstraints, covariance: Covariance) -> Covariance:
-        """Covariance (6, 6) that it adds to an optimum whose own is `covariance`."""
-        return effect.constrained(constraints, covariance, self.sigma).covariance(self.sigma)
 
     def scores_at(self, score: PointScore, T: Transform, values: Iterable[float]) -> list[float]:
         """Score with each value, the extrinsic held at T (4, 4)."""
@@ -135,9 +125,8 @@ class NuisanceEstimate:
     """What the scenes tell of an unknown, by its profile: the score with each value at an extrinsic of its own (as the profile
     likelihood of Murphy and van der Vaart 2000).
 
-    value: where the profile is highest, in the unit of the parameter; 0 = as given. effect: how it moves
-    the optimum, and how well the scenes tell it. freedom: degrees of freedom of the noise that this rests on, the regions of
-    frames that show different places less the unknowns: few tell their own noise badly, and errors have Student's tails.
+    value: where the profile is highest, in the unit of the parameter; 0 = as given. effect: how it moves the optimum, and how
+    well the scenes tell it. freedom: degrees of freedom of the noise, regions of frames less the unknowns.
     """
 
     parameter: NuisanceParameter
@@ -157,7 +146,7 @@ class NuisanceEstimate:
 
     @property
     def deviations(self) -> float:
-        """How far the value is off, in standard deviations: those of the scenes and of what is known in advance together."""
+        """How far the value is off, in standard deviations of the scenes and of what is known in advance together."""
         total = np.hypot(self.sigma, self.parameter.sigma)
         return float(abs(self.value) / total) if total > 0 else 0.0
 
@@ -195,8 +184,7 @@ class NuisanceEstimate:
         return float(-0.5 * (self.freedom + 1) * np.log1p(deviations**2 / self.freedom))
 
     def added_covariance(self, constraints: PoseConstraints, covariance: Covariance) -> Covariance:
-        """Second moment (6, 6) about the optimum for the given value, whose own covariance is `covariance`: by how much it would
-        be off if the value is another, of which the scenes and what is known in advance tell."""
+        """Second moment (6, 6) about the optimum for the given value, whose own covariance is `covariance`, if it is another."""
         direction = self.effect.constrained(constraints, covariance, self.parameter.sigma).direction
         mean, sigma = self.posterior
         return np.outer(direction, direction) * (mean**2 + sigma**2)
@@ -213,7 +201,7 @@ def estimate_parameters(
     """What the scenes tell of each parameter at the optimum T (4, 4), those that they cannot show left out.
 
     limits: axes that are fixed stay so. inflated: factor of the noise, by the disagreement of halves at T. search: values far off
-    are tried as well, as after a search, whose optimum may belong to one; else the profile is followed near the given value.
+    are tried as well, as after a search, whose optimum may belong to one.
     """
     free = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     if not limits.open_axes.any():
@@ -273,11 +261,9 @@ def _estimate(
     return NuisanceEstimate(parameter, value, Effect(direction, information / inflated))
 
 
-def wrong_parameter(
-    estimates: Sequence[NuisanceEstimate], tolerance_deg: float, tolerance_m: float
-) -> WrongIntrinsics | WrongTimes | LeftOpen | None:
-    """Which unknown is not as given, None if all may be: significantly so, as many as there are, and such that the extrinsic
-    would be off by more than the tolerance; or which is plainly wrong with a probability above OPEN_PROBABILITY."""
+def wrong_parameter(estimates: Sequence[NuisanceEstimate], tolerance_deg: float, tolerance_m: float) -> Refusal | None:
+    """Which unknown is significantly not as given, such that the extrinsic would be off by more than the tolerance, or plainly
+    wrong with a probability above OPEN_PROBABILITY; None if all may be as given."""
     judged = [(e, e.largest_within(tolerance_deg, tolerance_m)) for e in estimates]
     wrong = [e for e, largest in judged if e.p_value * len(judged) < SIGNIFICANCE and abs(e.value) > largest]
     if wrong:
@@ -286,7 +272,7 @@ def wrong_parameter(
     for e, largest in judged:
         probability, unit = e.probability_wrong(largest), e.parameter.unit
         if probability > OPEN_PROBABILITY:
-            return LeftOpen(e.parameter.name, unit * e.value, unit * e.sigma, probability, tolerance_deg, tolerance_m)
+            return left_open(e.parameter.name, unit * e.value, unit * e.sigma, probability, tolerance_deg, tolerance_m)
     return None
 
 

@@ -1,15 +1,13 @@
 """The intrinsics estimated together with the extrinsic: focal length, principal point, and the radial distortion where it shows.
 
-A wrong focal length moves the extrinsic that matches best along a ridge of the score, which its profile over one parameter after
-the other follows only as far as the others are right. Here all are free at once: damped Gauss-Newton steps in 6 + n unknowns,
-from several values of each, on the edge maps as they are. A change of the lens moves the rays of the points instead of the
-pictures; its effect on a ray is that of the recorded image's own camera model, to first order. So the pictures are rectified anew
-by the corrected camera, and the change that is left is estimated again, until there is none.
+All are free at once: damped Gauss-Newton steps in 6 + n unknowns, from several values of each, on the edge maps as they are. A
+change of the lens moves the rays of the points instead of the pictures, to first order: so the pictures are rectified anew by the
+corrected camera, and the change that is left is estimated again, until there is none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -26,35 +24,29 @@ from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.nuisance.lens import CENTRE as CENTRE_VALUES
 from calib_ros.registration.nuisance.lens import FOCAL as FOCAL_VALUES
-from calib_ros.registration.nuisance.lens import FocalLength, PrincipalPoint
+from calib_ros.registration.nuisance.lens import Intrinsic
 from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, noise_of
 from calib_ros.registration.nuisance.time_offset import FINE_POINTS
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior
-from calib_ros.registration.search.optimizers import learned_curvature
+from calib_ros.registration.search.optimizers import ascend_jointly
 
-# Of the radial distortion, as a displacement of the corner, a share of its radius: standard deviation of usual calibrations,
-# which state 1 to 3 px, and of values that are plainly wrong, as for the others.
+# Standard deviations of the radial distortion, as a displacement of the corner, a share of its radius: 1 to 3 px are usual.
 RADIAL_USUAL, RADIAL_GROSS = 0.004, 0.03
 DOUBT = 0.5  # probability in advance that a value is plainly wrong: who asks for another one has a reason
 RADIAL_VALUES = (-0.08, -0.04, 0.04, 0.08)  # shares of the corner's radius that are tried
 STEP = 0.005  # of every parameter for the profile: 3 px at the border of an image of 1280
 NODES = (65, 49)  # across and down, at which the effect on rays is computed; between, it is smooth
 DIFFERENCE = 1e-4  # of rays and parameters, for derivatives in float64
-ITERATIONS, GAIN = 15, 1e-7  # of the ascent on a level; less gain is rounding
-SMALLEST = 1e-5  # change of a parameter: a hundredth of a pixel at the border
 FOLLOWED = 3  # of the best starts, how many are followed to the finest level
 OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes then tell as much
 
 
 @dataclass(frozen=True, eq=False)
 class LensParameter:
-    """A change of a camera.
-
-    unit: by which values are multiplied for files. usual, gross: standard deviations in advance, of values that are as good as
-    usual, and of those that are plainly wrong. field: (h, w, 2) shift of the ray at every node of the working image, per unit of
-    the value. alternatives: values to begin from.
-    """
+    """A change of a camera. unit: by which values are multiplied for files. usual, gross: standard deviations in advance, of
+    usual values and of those that are plainly wrong. field: (h, w, 2) shift of the ray at every node of the working image, per
+    unit of the value. alternatives: values to begin from."""
 
     name: str
     unit: float
@@ -64,91 +56,56 @@ class LensParameter:
     alternatives: Sequence[float]
 
 
-@dataclass(frozen=True, eq=False)
-class JointOptimum:
-    """The optimum of extrinsic and intrinsics: T (4, 4), and the change of every parameter (n,).
-
-    covariance: (n, n) of the change, by scenes and what is known in advance. directions: (6, n) twist of the extrinsic per unit
-    of each. observable: (n,) whether the scenes tell more of it than is known in advance; what they do not tell stays as it is.
-    """
-
-    parameters: Sequence[LensParameter]
-    T: Transform
-    change: Matrix
-    covariance: Covariance
-    directions: Matrix
-    observable: NDArray[np.bool_]
-
-    @property
-    def sigma(self) -> Matrix:
-        """Standard deviations (n,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    def refined(self, camera: Camera, covariance: Covariance) -> RefinedCamera:
-        """The camera of the pictures with the change. covariance: (6, 6) of the extrinsic if the intrinsics are right."""
-        units = np.array([own.unit for own in self.parameters])
-        changes = {}
-        for own, value, sigma, seen in zip(self.parameters, self.change, self.sigma, self.observable, strict=True):
-            camera = changed(camera, own.name, own.unit * float(value))
-            changes[own.name] = IntrinsicEstimate(float(own.unit * value), float(own.unit * sigma), bool(seen))
-        lens, along = self.covariance * np.outer(units, units), self.directions / units
-        joint = np.block([[covariance + along @ lens @ along.T, along @ lens], [lens @ along.T, lens]])
-        return RefinedCamera(camera, self.T, changes, joint)
-
-
 def lens_parameters(config: CameraConfig, source: Camera, working: Camera) -> tuple[LensParameter, ...]:
     """What can be told of a camera by pictures that are rectified to the pinhole `working`, but for what is exact."""
     u, v = np.meshgrid(np.linspace(0, working.width - 1, NODES[0]), np.linspace(0, working.height - 1, NODES[1]))
     K = working.K
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
-    effect = _Effect(source, rays)
-    radial = effect.of(RADIAL, DIFFERENCE)
+    shift = _shifts(source, rays)
+    radial = shift(RADIAL, DIFFERENCE)
     radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
     corner = int(radius.argmax())
     share = float(np.linalg.norm(radial[corner])) / radius[corner]  # by which a k1 of 1 moves the corner
-    focal = effect.grid(effect.of(FOCAL, DIFFERENCE))
-    out = [LensParameter(FOCAL, 1.0, config.focal_sigma, FocalLength.gross, focal, FOCAL_VALUES)]
+    focal = _grid(shift(FOCAL, DIFFERENCE))
+    out = [LensParameter(FOCAL, 1.0, config.focal_sigma, Intrinsic.gross, focal, FOCAL_VALUES)]
     for name in CENTRE:
-        field, unit = effect.grid(effect.of(name, 1.0) * source.width), float(source.width)
-        out.append(LensParameter(name, unit, config.centre_sigma, PrincipalPoint.gross, field, CENTRE_VALUES))
-    out.append(LensParameter(RADIAL, 1 / share, RADIAL_USUAL, RADIAL_GROSS, effect.grid(radial / share), RADIAL_VALUES))
+        field, unit = _grid(shift(name, 1.0) * source.width), float(source.width)
+        out.append(LensParameter(name, unit, config.centre_sigma, Intrinsic.gross, field, CENTRE_VALUES))
+    out.append(LensParameter(RADIAL, 1 / share, RADIAL_USUAL, RADIAL_GROSS, _grid(radial / share), RADIAL_VALUES))
     return tuple(parameter for parameter in out if parameter.usual > 0)
 
 
-class _Effect:
-    """How a change of a lens moves rays (n, 2) in pictures that are rectified without it."""
+def _shifts(camera: Camera, rays: Matrix) -> Callable[[str, float], Matrix]:
+    """Shift (n, 2) of rays (n, 2) per unit of a change of the lens, by steps of it; 0 where the lens does not see."""
 
-    def __init__(self, camera: Camera, rays: Matrix) -> None:
-        self._camera, self._rays = camera, rays
-        slopes = []
-        for axis in np.eye(2):
-            ahead, behind = (self._pixels(camera, rays + sign * DIFFERENCE * axis) for sign in (1, -1))
-            slopes.append((ahead - behind) / (2 * DIFFERENCE))
-        self._slope = np.stack(slopes, axis=-1)  # (n, 2, 2) of the pixel by the ray
-
-    @staticmethod
-    def _pixels(camera: Camera, rays: Matrix) -> Matrix:
+    def pixels(camera: Camera, rays: Matrix) -> Matrix:
         return camera.project(np.c_[rays, np.ones(len(rays))])[0]
 
-    def of(self, name: str, step: float) -> Matrix:
-        """Shift of the rays (n, 2) per unit; 0 where the lens does not see."""
-        ahead, behind = (self._pixels(changed(self._camera, name, sign * step), self._rays) for sign in (1, -1))
-        shift = (ahead - behind) / (2 * step)
-        seen = np.isfinite(shift).all(axis=1) & np.isfinite(self._slope).all(axis=(1, 2))
-        out = np.zeros_like(shift)
-        out[seen] = np.linalg.solve(self._slope[seen], shift[seen][..., None])[..., 0]
+    off = DIFFERENCE * np.eye(2)
+    slope = np.stack([(pixels(camera, rays + d) - pixels(camera, rays - d)) / (2 * DIFFERENCE) for d in off], axis=-1)
+
+    def shift(name: str, step: float) -> Matrix:
+        ahead, behind = (pixels(changed(camera, name, sign * step), rays) for sign in (1, -1))
+        pixel = (ahead - behind) / (2 * step)
+        seen = np.isfinite(pixel).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
+        out = np.zeros_like(pixel)
+        out[seen] = np.linalg.solve(slope[seen], pixel[seen][..., None])[..., 0]
         return out
 
-    @staticmethod
-    def grid(shift: Matrix) -> NDArray[np.float32]:
-        """(n, 2) -> (h, w, 2) of the nodes."""
-        return np.ascontiguousarray(shift.reshape(NODES[1], NODES[0], 2), np.float32)
+    return shift
+
+
+def _grid(shift: Matrix) -> NDArray[np.float32]:
+    """(n, 2) -> (h, w, 2) of the nodes."""
+    return np.ascontiguousarray(shift.reshape(NODES[1], NODES[0], 2), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """The points as a changed lens shows them. part: of points in the camera's axes. shifts: (n, 2, points) m, by which each
-    parameter moves them in the plane of the image."""
+    """The points as a changed lens shows them; a JointView.
+
+    part: of points in the camera's axes. shifts: (n, 2, points) m, by which each parameter moves them in the plane of the image.
+    """
 
     part: PointScore
     shifts: Matrix
@@ -168,7 +125,7 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class _Doubted:
-    """What is known in advance of changes (n,) about `centre` (n,): each usual, or plainly wrong with the probability DOUBT."""
+    """What is known in advance of changes (n,) about `centre` (n,): each usual, or, with probability DOUBT, plainly wrong."""
 
     parameters: Sequence[LensParameter]
     centre: Matrix
@@ -192,11 +149,7 @@ class _Doubted:
 
 @dataclass(frozen=True, eq=False)
 class _Joint:
-    """The score in 6 + n unknowns.
-
-    limits, prior: of the extrinsic. advance: what is known of the intrinsics in advance. noise: of the score, by which that is
-    weighed.
-    """
+    """The score in 6 + n unknowns. limits, prior: of the extrinsic. advance: of the intrinsics, weighed by `noise`."""
 
     score: PointScore
     parameters: Sequence[LensParameter]
@@ -223,53 +176,17 @@ class _Joint:
         P[:2] += np.einsum("k,kin->in", change, shifts)
         return _Seen(self.score.with_points(P.astype(np.float32)), shifts)
 
-    def cost(self, T: Transform, change: Matrix) -> float:
-        """Of both priors, to subtract from the score."""
-        return self.noise * self.advance.cost(change) + (self.prior.value(T) if self.prior else 0.0)
-
     def ascend(
         self, T: Transform, change: Matrix, levels: Sequence[int], free: NDArray[np.bool_] | None = None
     ) -> tuple[Matrix, Matrix, float]:
-        """The optimum near T (4, 4) and a change (n,), level by level: as `time_offset.ascend`. free: (n,) what may change; None
-        = all. -> T, change, and the score less the priors."""
-        value = -np.inf
-        for level in levels:
-            T, change, value = self._ascend(T, change, level, np.ones(len(change), bool) if free is None else free)
-        return T, change, value
+        """The optimum near T (4, 4) and a change (n,), where `free` (n,). -> T, change, and the score less the priors."""
+        found = ascend_jointly(self.seen, T, change, levels, self.limits, self.prior, free, self.known)
+        return found[0], found[1], found[3]
 
-    def _ascend(self, T: Transform, change: Matrix, level: int, free: NDArray[np.bool_]) -> tuple[Matrix, Matrix, float]:
-        n = len(change)
-        here = self.seen(T, change)
-        objective = here.value(level) - self.cost(T, change)
-        damping, H, last, step = 1e-2, np.zeros((6 + n, 6 + n)), np.zeros(6 + n), np.zeros(6 + n)
-        for k in range(ITERATIONS):
-            ascent, scale = here.linearise(level)
-            H = learned_curvature(H, step, last - ascent) if k else scale
-            gradient, B = ascent.copy(), H.copy()
-            information = self.noise * self.advance.information(change)
-            gradient[6:] -= information * (change - self.advance.centre)
-            B[6:, 6:] += np.diag(information)
-            if self.prior:
-                gradient[:6] -= self.prior.cost(T)[1]
-                B[:6, :6] += np.diag(self.prior.information)
-            axes = np.flatnonzero(np.r_[self.limits.movable(T, gradient[:6]), free])
-            for _ in range(6):
-                step = np.zeros(6 + n)
-                damped = B[np.ix_(axes, axes)] + np.diag(damping * np.diag(B)[axes] + 1e-9)
-                step[axes] = np.linalg.solve(damped, gradient[axes])
-                candidate, later = self.limits.clip(se3.exp(step[:6]) @ T), change + step[6:]
-                moved = self.seen(candidate, later)
-                value = moved.value(level) - self.cost(candidate, later)
-                if value > objective + GAIN:
-                    break
-                damping = max(damping * 6, 1e-3)
-            else:
-                break
-            T, change, here, objective, last = candidate, later, moved, value, ascent
-            damping /= 4
-            if np.abs(step[6:]).max() < SMALLEST and np.abs(step[:3]).max() < 2e-6 and np.abs(step[3:6]).max() < 2e-5:
-                break
-        return T, change, objective
+    def known(self, change: Matrix) -> tuple[float, Matrix, Matrix]:
+        """Cost of a change (n,) by what is known in advance, to subtract from the score, its slope and its information (n,)."""
+        information = self.noise * self.advance.information(change)
+        return self.noise * self.advance.cost(change), information * (change - self.advance.centre), information
 
 
 def joint_optimum(
@@ -280,15 +197,16 @@ def joint_optimum(
     camera: Camera,
     config: CameraConfig,
     inflated: float,
+    extrinsic: Covariance,
     search: bool = False,
     given: Camera | None = None,
-) -> JointOptimum | None:
+) -> RefinedCamera | None:
     """The optimum of extrinsic and intrinsics near T (4, 4); None for unrolled pictures, which show no intrinsics, and where all
     is exact.
 
     score: of pictures of `camera`. limits, prior: of the extrinsic. inflated: factor of the variance, by the disagreement of
-    halves at T. search: values far off are tried as well. given: the camera that was stated, where `camera` corrects it already,
-    and more edge points are worth their time; None = it is `camera`.
+    halves at T. extrinsic: its covariance (6, 6) if the intrinsics are right. search: values far off are tried as well. given:
+    the camera that was stated, where `camera` corrects it already.
     """
     if score.camera.is_cylinder or not limits.open_axes.any():
         return None
@@ -307,11 +225,11 @@ def joint_optimum(
             ends = [joint.ascend(*start, LEVELS[:-1]) for start in _starts(T, part.camera, parameters)]
             ends = sorted(ends, key=lambda end: -end[2])[:FOLLOWED]
         begin = max((joint.ascend(*end[:2], NEAR_LEVELS) for end in ends), key=lambda end: end[2])[:2]
-    seen = joint.seen(*begin).part
+    part = joint.seen(*begin).part
     # The halves' disagreement at T may be that of the wrong intrinsics.
     if begin is not as_it_is:
-        inflated = min(inflated, inflation(disagreement(seen, np.eye(4), free)))
-    joint = replace(joint, noise=inflated * noise_of(seen, np.eye(4), free))
+        inflated = min(inflated, inflation(disagreement(part, np.eye(4), free)))
+    joint = replace(joint, noise=inflated * noise_of(part, np.eye(4), free))
     starts = [as_it_is] if begin is as_it_is else [begin, as_it_is, *_as_usual(*begin, part.camera, advance)]
     top, change, best = max((joint.ascend(*start, NEAR_LEVELS) for start in starts), key=lambda end: end[2])
     covariance, directions = _spread(joint, top, change, best)
@@ -321,7 +239,14 @@ def joint_optimum(
         kept = np.where(observable, change, 0.0)
         top, change, best = joint.ascend(_turned(top, kept - change, part.camera, parameters), kept, NEAR_LEVELS, observable)
         covariance, directions = _spread(joint, top, change, best)
-    return JointOptimum(parameters, top, change, covariance, directions, observable)
+    units, changes = np.array([own.unit for own in parameters]), {}
+    for own, value, sigma, seen in zip(parameters, change, np.sqrt(np.diag(covariance)), observable, strict=True):
+        camera = changed(camera, own.name, own.unit * float(value))
+        changes[own.name] = IntrinsicEstimate(float(own.unit * value), float(own.unit * sigma), bool(seen))
+    lens, along = covariance * np.outer(units, units), directions / units
+    return RefinedCamera(
+        camera, top, changes, np.block([[extrinsic + along @ lens @ along.T, along @ lens], [lens @ along.T, lens]])
+    )
 
 
 def _spread(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
@@ -345,8 +270,7 @@ def _starts(T: Transform, camera: Camera, parameters: Sequence[LensParameter]) -
 
 
 def _as_usual(T: Transform, change: Matrix, camera: Camera, advance: _Doubted) -> Iterator[tuple[Matrix, Matrix]]:
-    """The same with some of the values as they were given: beside a maximum of the scenes alone there may be a higher one with
-    what is known in advance."""
+    """The same with some of the values as they were given: with what is known in advance they may score higher."""
     groups = [[k for k, own in enumerate(advance.parameters) if own.name in names] for names in (CENTRE, (RADIAL,))]
     for some in (groups[0], groups[1], groups[0] + groups[1]):
         if some:
@@ -366,16 +290,23 @@ def _turned(T: Transform, change: Matrix, camera: Camera, parameters: Sequence[L
 
 
 def _profile(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
-    """How the score bends down (n, n) around a change, the extrinsic refined anew for each, without the prior of the change; and
-    the twist of the extrinsic (6, n) per unit of each, by differences of STEP."""
+    """How the score bends down (n, n) around a change, the extrinsic refined anew for each, by differences of STEP, without the
+    prior of the change; and the twist of the extrinsic (6, n) per unit of each."""
     n = len(change)
+
+    def costs(T: Transform, change: Matrix) -> tuple[float, float]:
+        """Of both priors together, and of that of the extrinsic."""
+        prior = joint.prior.value(T) if joint.prior else 0.0
+        return joint.known(change)[0] + prior, prior
 
     def at(off: Matrix, begin: Transform) -> tuple[Matrix, float]:
         end, _, value = joint.ascend(begin, change + off, NEAR_LEVELS, np.zeros(n, bool))
-        return end, value + joint.cost(end, change + off) - (joint.prior.value(end) if joint.prior else 0.0)
+        both, prior = costs(end, change + off)
+        return end, value + both - prior
 
     axes, H, directions = STEP * np.eye(n), np.zeros((n, n)), np.zeros((6, n))
-    top += joint.cost(T, change) - (joint.prior.value(T) if joint.prior else 0.0)
+    both, prior = costs(T, change)
+    top += both - prior
     for k in range(n):
         (ahead, high), (behind, low) = (at(sign * axes[k], T) for sign in (1, -1))
         directions[:, k] = np.where(joint.limits.open_axes, se3.log(ahead @ se3.inverse(behind)), 0.0) / (2 * STEP)
@@ -389,7 +320,6 @@ def _profile(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[M
 
 
 def _systematic(camera: Camera, parameters: Sequence[LensParameter]) -> Matrix:
-    """Standard deviations (n,) that no number of frames goes below: what shifts the border of the image as far as the systematic
-    error of a rotation does."""
+    """Standard deviations (n,) that shift the border of the image as far as the systematic error of a rotation does."""
     px = SYSTEMATIC_ERROR[0] * camera.K[0, 0]
     return np.array([px / camera.width * (1.0 if own.name in CENTRE else 2.0) for own in parameters])

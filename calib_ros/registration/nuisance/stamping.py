@@ -1,8 +1,7 @@
-"""How a driver stamps scans without point times, found out from the scenes: which way the scanner turns, where a scan begins, and
-which part of it the stamp refers to.
+"""How a driver stamps scans without point times, found out from the scenes: which way the scanner turns, and where a scan begins.
 
-Each convention gives every edge point another time, and the vehicle's motion then another place. The right one makes all frames
-agree; which part of the scan is stamped is a time offset of half a scan period at most.
+Each convention gives every edge point another time, and the vehicle's motion then another place: the right one makes all frames
+agree. Which part of the scan is stamped is a time offset of half a scan period at most.
 """
 
 from __future__ import annotations
@@ -35,8 +34,8 @@ def at_stamping(config: MotionConfig, stamping: Stamping) -> MotionConfig:
 
 
 def restamped(features: FrameFeatures, before: MotionConfig, after: MotionConfig) -> FrameFeatures:
-    """Features whose points are where another convention has them; the same if their times do not come from the azimuth, or the
-    LiDAR's velocity is not known. before: by which they were extracted."""
+    """Features extracted by `before` with points where `after` has them; the same if their times do not come from the azimuth, or
+    the LiDAR's velocity is not known."""
     points = features.points
     if not features.timed_by_azimuth or features.twist is None or points.time is None or features.own is not None:
         return features
@@ -61,11 +60,8 @@ class Convention:
 
 
 def convention(stamping: Stamping, seconds: float, scan_period_s: float) -> tuple[Convention, float]:
-    """The usual convention nearest to what was found, and the time offset that is left then, s.
-
-    seconds: time offset that belongs to `stamping`, whose scans are stamped half a turn after they begin. A scan that is stamped
-    where it begins is measured half a period later than that, one stamped at its end half a period earlier.
-    """
+    """The usual convention nearest to what was found, and the time offset that is left then, s. seconds: that of `stamping`,
+    whose scans are stamped half a turn after they begin."""
     if stamping.spin == "none":
         return Convention("none", "middle", 0.0), seconds
     halves = {"start": 0.5, "middle": 0.0, "end": -0.5}

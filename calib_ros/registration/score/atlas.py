@@ -23,11 +23,8 @@ MAX_SIDE = 32000  # px of an image of tiles: below 2^15, a float32 position is e
 
 @dataclass(frozen=True, eq=False)
 class AtlasLevel:
-    """All tiles at one resolution.
-
-    image: the tiles, in units of UNIT. corner: (tiles, 2) float32, left and top edge of each. K: intrinsics at the level's scale.
-    width, height: of a tile. sigma: blur in pixels of the level.
-    """
+    """All tiles at one resolution. image: in units of UNIT. corner: (tiles, 2) float32, left and top edge of each. K:
+    intrinsics at the level's scale. width, height: of a tile. sigma: blur in pixels of the level."""
 
     image: NDArray[np.int16]
     corner: Map
@@ -40,16 +37,15 @@ class AtlasLevel:
 class Atlas:
     """Maps of several frames of one camera.
 
-    levels: per frame, its maps coarse to fine. camera: pinhole at full size. last: an atlas that is no longer in use; if it
-    is of the same form, its memory is taken over with the frames that stand where they should: making the pages anew takes
-    longer than filling them.
+    levels: per frame, its maps coarse to fine. camera: pinhole at full size. last: an atlas that is no longer in use, whose
+    memory is taken over if it is of the same form, with the frames that stand where they should.
     """
 
     def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
         self.camera, self.n_frames = camera, len(levels)
         self._correlations: dict[int, NDArray[np.float64]] = {}
         self.channels = max(len(own[0].packed) for own in levels)
-        # Which frames these are is told without keeping them: the atlas lies in the cache when they have long left the buffer.
+        # Which frames these are is told without keeping them alive.
         self._frames = [weakref.ref(own[0]) for own in levels]
         self._form = [(level.packed.shape[1:], level.scale, level.sigma) for level in levels[0]]
         kept = last if last is not None and self._like(last) else None
@@ -61,20 +57,13 @@ class Atlas:
                 for k, level in enumerate(self.levels):
                     _fill(level, self.channels * j, own[k].packed)
 
-    def tiles(self, level: int, frames: NDArray[np.int32]) -> Map:
-        """The first two maps of some frames (k, n) at a level, every second row and column."""
-        own, out = self.levels[level], []
-        for frame in frames:
-            parts = []
-            for u, v in own.corner[self.channels * frame : self.channels * frame + min(self.channels, 2)].astype(int):
-                parts.append(own.image[v : v + own.height : 2, u : u + own.width : 2].ravel())
-            out.append(np.concatenate(parts))
-        return np.stack(out).astype(np.float32)
-
     def correlation(self, level: int) -> NDArray[np.float64]:
         """How alike the edge maps of all frames are at a level, (n_frames, n_frames), 0..1. Computed once."""
         if level not in self._correlations:
-            maps = self.tiles(level, np.arange(self.n_frames, dtype=np.int32))
+            own = self.levels[level]
+            corners = own.corner.reshape(self.n_frames, self.channels, 2)[:, :2].astype(int)
+            parts = [[own.image[v : v + own.height : 2, u : u + own.width : 2].ravel() for u, v in both] for both in corners]
+            maps = np.stack([np.concatenate(of_frame) for of_frame in parts]).astype(np.float32)
             maps -= maps.mean(axis=1, keepdims=True)
             maps /= np.maximum(np.linalg.norm(maps, axis=1, keepdims=True), 1e-6)
             found = np.clip(maps @ maps.T, 0, 1).astype(np.float64)
@@ -84,53 +73,29 @@ class Atlas:
 
     def mirrored(self) -> Atlas:
         """The same maps as a camera sees them that is mirrored left to right: its focal length fx is negative."""
-        out = copy.copy(self)
-        out.levels = [replace(level, K=level.K * np.array([[-1.0, 1, 1], [1, 1, 1], [1, 1, 1]])) for level in self.levels]
-        return out
+        return self._with([replace(level, K=level.K * [[-1.0, 1, 1], [1, 1, 1], [1, 1, 1]]) for level in self.levels])
 
     def with_intrinsics(self, focal: float, u: float, v: float) -> Atlas:
-        """The same maps seen by a camera with another focal length, by this share more, and another principal point, by these
-        shares of the image width."""
-        out = copy.copy(self)
-        change = np.array([[1 + focal, 1, 1], [1, 1 + focal, 1], [1, 1, 1]])
-        out.levels = [
-            replace(level, K=level.K * change + level.width * np.array([[0, 0, u], [0, 0, v], [0, 0, 0]]))
-            for level in self.levels
-        ]
-        return out
+        """The same maps of a camera with a focal length longer by a share, its principal point off by shares of the width."""
+        change, shift = np.array([[1 + focal, 1, 1], [1, 1 + focal, 1], [1, 1, 1]]), np.array([[0, 0, u], [0, 0, v], [0, 0, 0]])
+        return self._with([replace(level, K=level.K * change + level.width * shift) for level in self.levels])
 
     def with_distortion(self, barrel: float) -> Atlas:
-        """The same maps as an ideal lens would see them, if the pictures were taken by one with a radial distortion that moves
-        the corner towards the principal point by the share `barrel` of its radius, and other pixels less, by its square."""
-        out = copy.copy(self)
-        out.levels = [_undistorted(level, self.channels * self.n_frames, barrel) for level in self.levels]
+        """The same maps as an ideal lens would see them, if those of the pictures had a radial distortion that moves the corner
+        towards the principal point by the share `barrel` of its radius, and other pixels less, by its square."""
+        out = self._with([_undistorted(level, self.channels * self.n_frames, barrel) for level in self.levels])
         out._correlations = {}
+        return out
+
+    def _with(self, levels: list[AtlasLevel]) -> Atlas:
+        out = copy.copy(self)
+        out.levels = levels
         return out
 
     def _like(self, last: Atlas) -> bool:
         """Can the images of the other be filled with these frames?"""
         size, size_of_last = (self.n_frames, self.channels), (last.n_frames, last.channels)
         return self._form == last._form and size == size_of_last and np.array_equal(last.camera.K, self.camera.K)
-
-
-class AtlasCache:
-    """Lends the memory of the last atlas to the next one; one at a time, so that estimates in other threads lay out their own."""
-
-    def __init__(self) -> None:
-        self._last: Atlas | None = None
-
-    def atlas(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera) -> Atlas:
-        """An atlas of these frames, in the memory of the one that was given back last if there is one."""
-        last, self._last = self._last, None
-        return Atlas(levels, camera, last)
-
-    def give_back(self, atlas: Atlas) -> None:
-        """Nobody uses this atlas any more."""
-        self._last = atlas
-
-    def clear(self) -> None:
-        """Free the memory of the last atlas: the next one is far away."""
-        self._last = None
 
 
 def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:
@@ -167,7 +132,6 @@ def _undistorted(level: AtlasLevel, tiles: int, barrel: float) -> AtlasLevel:
 
 
 def _fill(level: AtlasLevel, tile: int, maps: NDArray[np.int16]) -> None:
-    """Write the maps (c, h, w) of a frame, from the given tile on. A frame with fewer of them leaves the others' room as it is:
-    no point of it looks there."""
+    """Write the maps (c, h, w) of a frame from the given tile on; no point of one with fewer looks at the others' room."""
     for own, (u0, v0) in zip(maps, level.corner[tile : tile + len(maps)].astype(int), strict=True):
         level.image[v0 : v0 + level.height, u0 : u0 + level.width] = own

@@ -1,13 +1,10 @@
-"""Scores of an extrinsic: points of all frames on maps of all images, which lie as tiles in one atlas per resolution.
-
-FastScore is the score of the method: sparse edge points on oriented edge maps.
-"""
+"""Scores of an extrinsic: points of all frames on maps of all images, which lie as tiles in one atlas per resolution."""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +39,6 @@ class Score(Protocol):
 
     def value(self, T: Transform) -> float:
         """Score at T_camera_lidar (4, 4)."""
-        ...
 
 
 class SmoothScore(Score, Protocol):
@@ -50,7 +46,6 @@ class SmoothScore(Score, Protocol):
 
     def linearise(self, T: Transform) -> tuple[Matrix, Matrix]:
         """Gradient (6,) of the score by a left twist at T and a positive matrix (6, 6) that scales the step."""
-        ...
 
 
 def project(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera) -> tuple[Pixels, Pixels, Pixels]:
@@ -89,11 +84,8 @@ def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera,
 
 @dataclass(frozen=True, eq=False)
 class ScoredPoints:
-    """Points of several frames, frame after frame.
-
-    xyz: (3, n) float32 m, LiDAR frame. weight: (n,) float32, sums up to 1. frame: (n,) number of the frame. channel: (n,)
-    which of the frame's maps is sampled.
-    """
+    """Points of several frames, frame after frame. xyz: (3, n) float32 m, LiDAR frame. weight: (n,) float32, sums up to 1. frame:
+    (n,) number of the frame. channel: (n,) which of its maps is sampled."""
 
     xyz: NDArray[np.float32]
     weight: NDArray[np.float32]
@@ -102,10 +94,8 @@ class ScoredPoints:
 
 
 class PointScore:
-    """Weighted mean of the map values under the points, at several resolutions.
-
-    points: of all frames of the atlas. observer: gets every evaluation of this score and of those selected from it.
-    """
+    """Weighted mean of the map values under the points, at several resolutions. observer: gets every evaluation of this score and
+    of those selected from it."""
 
     def __init__(self, points: ScoredPoints, atlas: Atlas, observer: Observer | None = None) -> None:
         self.observer = observer
@@ -116,6 +106,13 @@ class PointScore:
 
     def _make_sampler(self) -> Sampler:
         return Sampler(self.points, self.weights, self._tiles, self.atlas)
+
+    def _with(self, **changed: Any) -> PointScore:
+        """The same with some attributes changed."""
+        part = copy.copy(self)
+        vars(part).update(changed)
+        part._sampler = part._make_sampler()
+        return part
 
     @property
     def n_levels(self) -> int:
@@ -133,52 +130,34 @@ class PointScore:
 
     def select(self, keep: NDArray[np.intp] | NDArray[np.bool_]) -> PointScore:
         """The same on some of the points."""
-        part = copy.copy(self)
-        part.points, part.frame = np.ascontiguousarray(self.points[:, keep]), self.frame[keep]
-        part.weights = self.weights[keep] / self.weights[keep].sum()
-        part._tiles = self._tiles[keep]
-        part._sampler = part._make_sampler()
-        return part
+        points, weights = np.ascontiguousarray(self.points[:, keep]), self.weights[keep] / self.weights[keep].sum()
+        return self._with(points=points, frame=self.frame[keep], weights=weights, _tiles=self._tiles[keep])
 
     def mirrored(self) -> PointScore:
         """The same points on the maps mirrored left to right about the principal point: a decoy without any true alignment."""
-        part = copy.copy(self)
-        part.atlas = self.atlas.mirrored()
-        part._sampler = part._make_sampler()
-        return part
+        return self._with(atlas=self.atlas.mirrored())
 
     def with_intrinsics(self, focal: float, u: float, v: float) -> PointScore:
         """The same points seen by a camera with other intrinsics; see Atlas.with_intrinsics."""
-        part = copy.copy(self)
-        part.atlas = self.atlas.with_intrinsics(focal, u, v)
-        part._sampler = part._make_sampler()
-        return part
+        return self._with(atlas=self.atlas.with_intrinsics(focal, u, v))
 
     def with_distortion(self, barrel: float) -> PointScore:
         """The same points seen through a lens; see Atlas.with_distortion."""
-        part = copy.copy(self)
-        part.atlas = self.atlas.with_distortion(barrel)
-        part._sampler = part._make_sampler()
-        return part
+        return self._with(atlas=self.atlas.with_distortion(barrel))
 
     def with_points(self, xyz: NDArray[np.float32]) -> PointScore:
         """The same with its points elsewhere (3, n), m."""
-        part = copy.copy(self)
-        part.points = xyz
-        part._sampler = part._make_sampler()
-        return part
+        return self._with(points=xyz)
 
     def moved(self, twists: Matrix, seconds: float) -> PointScore:
         """The same points measured `seconds` later, from a LiDAR with these velocities (n_frames, 6), rad/s and m/s."""
-        part = copy.copy(self)
-        part.points = np.empty_like(self.points)
+        points = np.empty_like(self.points)
         ends = np.searchsorted(self.frame, np.arange(len(twists) + 1))  # frame after frame
         for j, motion in enumerate(se3.exp_many(twists * seconds).astype(np.float32)):
             own = slice(ends[j], ends[j + 1])
-            np.matmul(motion[:3, :3], self.points[:, own], out=part.points[:, own])
-            part.points[:, own] += motion[:3, 3:]
-        part._sampler = part._make_sampler()
-        return part
+            np.matmul(motion[:3, :3], self.points[:, own], out=points[:, own])
+            points[:, own] += motion[:3, 3:]
+        return self.with_points(points)
 
     def subset(self, n: int, rng: np.random.Generator) -> PointScore:
         """The same on n random points; itself if there are no more than n."""
@@ -186,7 +165,7 @@ class PointScore:
         return self if total <= n else self.select(np.sort(rng.choice(total, n, replace=False)))
 
     def sample(self, T: Transform, level: int) -> Map:
-        """Map value under every point (n,) at T; valid until the next call."""
+        """Map value under every point (n,) at T."""
         self._evaluated(1)
         return self._sampler.samples(T, level)
 
@@ -210,7 +189,7 @@ class PointScore:
         return out
 
     def jacobian(self, T: Transform, level: int) -> Map:
-        """Derivative of every sample by a left twist at T, (6, n); valid until the next call."""
+        """Derivative of every sample by a left twist at T, (6, n)."""
         self._linearised(1)
         return self._sampler.jacobian(T, level)
 
@@ -255,11 +234,11 @@ class LevelScore:
 
 
 class FastScore(PointScore):
-    """Score of an extrinsic over several frames at several resolutions.
+    """The score of the method: sparse edge points of several frames on oriented edge maps.
 
-    features: of one camera. T_prior: (4, 4); edge points that it projects far outside the image are left out. margin: how
-    far, as a share of the image width; None = MARGIN. atlas: of the same features, if there is one already. observer: gets every
-    evaluation. Raises TooFewFeaturesError when fewer than MIN_POINTS edge points remain.
+    features: of one camera. T_prior: (4, 4); edge points that it projects farther than `margin` (share of the image width; None =
+    MARGIN) outside the image are left out. atlas: of the same features, if there is one already. observer: gets every evaluation.
+    Raises TooFewFeaturesError when fewer than MIN_POINTS edge points remain.
     """
 
     def __init__(
@@ -292,19 +271,13 @@ class FastScore(PointScore):
 
 
 def _channels(points: EdgePoints, T_prior: Transform) -> NDArray[np.intp]:
-    """Which map each of a frame's points (n,) is to meet: by the direction of its edge as the camera sees it.
-
-    Side edges run along the spin axis of the scanner, upward ones across it: a camera mounted on its side sees them exchanged.
-    """
+    """Which map each of a frame's points (n,) is to meet: a camera mounted on its side sees side and upward edges exchanged."""
     axis = T_prior[:3, :3] @ points.pose.axis
     return np.asarray(_IS_UPWARD[points.kind] != (abs(axis[0]) > abs(axis[1])), np.intp)
 
 
 def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:
-    """Weights (n,) of one frame's points: every kind shares its weight out, unless it has hardly any points.
-
-    Upward edges are known to half a ring spacing only, so that they count less for scanners of few rings.
-    """
+    """Weights (n,) of one frame's points: every kind shares its weight out; upward edges of few rings, less exact, count less."""
     upward = float(np.sqrt(min(1.0, np.deg2rad(RING_SPACING_DEG) / max(points.ring_spacing, 1e-6))))
     of_kind = {
         EdgeKind.SIDE: WEIGHT_SIDE,

@@ -6,7 +6,6 @@ kernel.c does it in one pass per extrinsic without temporaries, in float32; setu
 from __future__ import annotations
 
 import ctypes
-import threading
 from contextlib import suppress
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
@@ -72,33 +71,8 @@ def load_kernel() -> ctypes.CDLL:
 KERNEL = load_kernel()
 
 
-class _Results(threading.local):
-    """Arrays that Sampler returns for n points, every thread its own; made when they are asked for."""
-
-    def __init__(self, n: int) -> None:
-        self._n = n
-        self._samples: Map | None = None
-        self._J: Map | None = None
-
-    def samples(self) -> Map:
-        """(n,)."""
-        if self._samples is None:
-            self._samples = np.empty(self._n, np.float32)
-        return self._samples
-
-    def jacobian(self) -> Map:
-        """(6, n)."""
-        if self._J is None:
-            self._J = np.empty((6, self._n), np.float32)
-        return self._J
-
-
 class Sampler:
-    """The maps of an atlas under its points, by kernel.c. T is T_camera_lidar (4, 4).
-
-    Returned arrays are valid until the same thread's next call. Calls release the interpreter lock, and threads do not disturb
-    each other.
-    """
+    """The maps of an atlas under its points, by kernel.c. T is T_camera_lidar (4, 4). Calls release the interpreter lock."""
 
     def __init__(self, points: Map, weights: Map, tiles: Tiles, atlas: Atlas) -> None:
         """points: (3, n). tiles: (n,) of the atlas, those that the points look at."""
@@ -107,7 +81,6 @@ class Sampler:
         self._points, self._weights = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(weights, np.float32)
         self._tiles = tiles
         self._made: dict[int, ctypes._Pointer[_View]] = {}
-        self._results = _Results(self._n)
 
     def _view(self, level: int) -> ctypes._Pointer[_View]:
         """The view of a level, made when it is asked for: few samplers are used on all of them."""
@@ -132,7 +105,7 @@ class Sampler:
 
     def samples(self, T: Transform, level: int) -> Map:
         """Map value (n,) under every point; 0 outside the frame."""
-        rows, out = _rows(T[None]), self._results.samples()
+        rows, out = _rows(T[None]), np.empty(self._n, np.float32)
         KERNEL.calib_samples(self._view(level), rows.ctypes.data, 1, out.ctypes.data)
         return out
 
@@ -147,11 +120,8 @@ class Sampler:
         return out
 
     def jacobian(self, T: Transform, level: int) -> Map:
-        """Derivative of every map value by a left twist at T, (6, n).
-
-        The map's gradient is taken over +- half the blur: the finest structure then does not make it noise.
-        """
-        rows, out = _rows(T[None]), self._results.jacobian()
+        """Derivative of every map value by a left twist at T, (6, n): over half the blur, or fine structure makes it noise."""
+        rows, out = _rows(T[None]), np.empty((6, self._n), np.float32)
         KERNEL.calib_jacobian(self._view(level), rows.ctypes.data, out.ctypes.data)
         return out
 

@@ -135,11 +135,8 @@ class PoseConstraints:
 
 
 def pose_constraints(T: Transform, config: ConstraintsConfig, n_frames: int) -> PoseConstraints:
-    """The stage ``constraints`` of the configuration around an extrinsic T (4, 4), for a score of n_frames.
-
-    A prior of standard deviation s weighs against a score as if both were measurements: the score's own covariance is
-    SCORE_NOISE / n_frames times its inverse Gauss-Newton matrix.
-    """
+    """The stage ``constraints`` of the configuration around an extrinsic T (4, 4), for a score of n_frames, whose own covariance
+    is SCORE_NOISE / n_frames times its inverse Gauss-Newton matrix: prior and score are weighed as two measurements."""
     half = np.concatenate([np.deg2rad(config.limit_deg), config.limit_m])
     half[:3][np.asarray(config.limit_deg) >= NO_LIMIT_DEG] = np.inf
     half[3:][np.asarray(config.limit_m) >= NO_LIMIT_M] = np.inf
@@ -156,8 +153,7 @@ Axes = float | tuple[float, float, float]
 class SearchBox:
     """Where the global search looks for the extrinsic: a box around the initial one, in the axes of the camera frame.
 
-    The defaults are those of the configuration stage ``search``, for an initial extrinsic that was calibrated once. Wider
-    boxes for other starts are `NOMINAL_BOX` and `SEMANTIC_BOX`.
+    The defaults are those of the configuration stage ``search``; `NOMINAL_BOX` and `SEMANTIC_BOX` are wider.
 
     Parameters
     ----------
@@ -181,10 +177,8 @@ class SearchBox:
     rounds: int | None = None
 
     def __post_init__(self) -> None:
-        for name, value, high in (
-            ("rotation_deg", self.rotation_deg, self.MAX_DEG),
-            ("translation_m", self.translation_m, self.MAX_M),
-        ):
+        for name, high in (("rotation_deg", self.MAX_DEG), ("translation_m", self.MAX_M)):
+            value = getattr(self, name)
             try:
                 axes = _per_axis(value)
             except (TypeError, ValueError):
@@ -218,6 +212,5 @@ def _per_axis(value: Axes) -> NDArray[np.float64]:
 
 
 NOMINAL_BOX = SearchBox(10.0, 0.5)  # around the nominal extrinsic: a camera mounted by eye is within this of it
-# Around a hypothesis from the classes of the scenes. From 3 to 10 KITTI frames the best hypothesis was up to 2.4 deg and 0.95 m
-# off; with 20 % of all labels wrong and 30 % missing, synthetic ones up to 8 deg.
+# Around a hypothesis from classes: up to 2.4 deg and 0.95 m off on KITTI, up to 8 deg with half of the labels wrong or missing.
 SEMANTIC_BOX = SearchBox(8.0, 1.0)

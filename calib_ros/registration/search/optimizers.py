@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.registration.score.point_score import Score, SmoothScore
 from calib_ros.registration.search.constraints import Limits, Prior, unlimited
 
+JOINT_ITERATIONS, GAIN = 15, 1e-7  # per level; a step that gains less of the score is rounding
 LEVEL = 1e-9  # score per radian; a slope below is rounding, and no way up
 METRES_PER_RADIAN = 10.0  # 1 deg moves an edge at 10 m as far as 17 cm: steps along all axes then weigh alike
 AXES = np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])  # what one radian is along each axis of a twist
@@ -30,11 +32,9 @@ def levenberg_marquardt(
     """Damped Gauss-Newton ascent on left twists; the score less the prior's cost never falls. Returns T (4, 4) and the score
     without the prior.
 
-    The Gauss-Newton scale is not the curvature of a score that is a mean of map values: it converges linearly, in 10 to 15
-    iterations on the finest level. near: T is a few degrees from the optimum, and the scale of the first iteration learns the
-    curvature from the change of the slope along every step (Broyden, Fletcher, Goldfarb, Shanno): 3 to 7 iterations, and from
-    1 to 1.5 deg on KITTI a sixth more successes; from afar its steps reach out of a search's box. Stops after `iterations`,
-    when no damped step improves, or when a step falls below tolerance_deg (0.3 mm at 0.001 deg).
+    near: T is a few degrees from the optimum, and the curvature is learned from the change of the slope along every step: 3 to 7
+    iterations instead of 10 to 15; from afar its steps reach out of a search's box. Stops after `iterations`, when no damped step
+    improves, or when a step falls below tolerance_deg (0.3 mm at 0.001 deg).
     """
     limits = limits or unlimited(T)
     damping, T = 1e-2, limits.clip(T)
@@ -55,7 +55,7 @@ def levenberg_marquardt(
             candidate = limits.clip(se3.exp(step) @ T)
             value = score.value(candidate)
             new_cost, new_slope = prior.cost(candidate) if prior else (0.0, slope)
-            if value - new_cost > objective + 1e-7:
+            if value - new_cost > objective + GAIN:
                 break
             damping = max(damping * 6, 1e-3)
         else:
@@ -69,13 +69,81 @@ def levenberg_marquardt(
 
 
 def learned_curvature(H: Matrix, moved: Matrix, fell: Matrix) -> Matrix:
-    """The BFGS update of a curvature (k, k): along the step `moved` (k,) the slope fell by `fell` (k,). Unchanged where that is
-    no descent, which would make it indefinite."""
+    """The update of a curvature (k, k) by Broyden, Fletcher, Goldfarb and Shanno: along the step `moved` (k,) the slope fell by
+    `fell` (k,). Unchanged where that is no descent, which would make it indefinite."""
     along, product = H @ moved, float(moved @ fell)
     expected = float(moved @ along)
     if not product > 1e-3 * expected > 0:
         return H
     return H - np.outer(along, along) / expected + np.outer(fell, fell) / product
+
+
+class JointView(Protocol):
+    """The points at an extrinsic and n values of further unknowns."""
+
+    def value(self, level: int) -> float:
+        """The score."""
+
+    def linearise(self, level: int) -> tuple[Matrix, Matrix]:
+        """Gradient (6 + n,) of the score by a left twist and by the values, and a positive matrix that scales the step."""
+
+
+def ascend_jointly(
+    see: Callable[[Transform, Matrix], JointView],
+    T: Transform,
+    x: Matrix,
+    levels: Sequence[int],
+    limits: Limits,
+    prior: Prior | None = None,
+    free: NDArray[np.bool_] | None = None,
+    known: Callable[[Matrix], tuple[float, Matrix, Matrix]] | None = None,
+) -> tuple[Matrix, Matrix, float, float]:
+    """The optimum of the extrinsic and n more unknowns near T (4, 4) and x (n,), level by level: damped Gauss-Newton steps as in
+    `levenberg_marquardt`, whose curvature is learnt on the way.
+
+    free: (n,) which of x may change; None = all. known: cost of x in advance, to subtract from the score, its slope and its
+    information (n,). Returns T, x, the score, and the score less both costs.
+    """
+    n, of_x = len(x), np.ones(len(x), bool) if free is None else free
+
+    def penalised(value: float, T: Transform, x: Matrix) -> float:
+        return value - ((known(x)[0] if known else 0.0) + (prior.value(T) if prior else 0.0))
+
+    for level in levels:
+        here = see(T, x)
+        best = here.value(level)
+        objective = penalised(best, T, x)
+        damping, H, last, step = 1e-2, np.zeros((6 + n, 6 + n)), np.zeros(6 + n), np.zeros(6 + n)
+        for k in range(JOINT_ITERATIONS):
+            ascent, scale = here.linearise(level)
+            H = learned_curvature(H, step, last - ascent) if k else scale
+            gradient, B = ascent.copy(), H.copy()
+            if known:
+                _, slope, information = known(x)
+                gradient[6:] -= slope
+                B[6:, 6:] += np.diag(information)
+            if prior:
+                gradient[:6] -= prior.cost(T)[1]
+                B[:6, :6] += np.diag(prior.information)
+            axes = np.flatnonzero(np.r_[limits.movable(T, gradient[:6]), of_x])
+            for _ in range(6):
+                step = np.zeros(6 + n)
+                damped = B[np.ix_(axes, axes)] + np.diag(damping * np.diag(B)[axes] + 1e-9)
+                step[axes] = np.linalg.solve(damped, gradient[axes])
+                candidate, later = limits.clip(se3.exp(step[:6]) @ T), x + step[6:]
+                moved = see(candidate, later)
+                value = moved.value(level)
+                higher = penalised(value, candidate, later)
+                if higher > objective + GAIN:
+                    break
+                damping = max(damping * 6, 1e-3)
+            else:
+                break
+            T, x, here, best, objective, last = candidate, later, moved, value, higher, ascent
+            damping /= 4
+            if np.abs(step[6:]).max() < 1e-5 and np.abs(step[:3]).max() < 2e-6 and np.abs(step[3:6]).max() < 2e-5:
+                break
+    return T, x, best, objective
 
 
 def nelder_mead(
@@ -122,22 +190,26 @@ def barzilai_borwein(
     epsilon_deg: float = 0.1,
     evaluations: int = 240,
     limits: Limits | None = None,
+    penalty: Callable[[Matrix], float] | None = None,
 ) -> tuple[Matrix, float]:
     """Gradient ascent with the step length of Barzilai and Borwein (1988), eq. 3.13 and 3.14 of the thesis.
 
-    epsilon_deg: half width of the central differences, deg (METRES_PER_RADIAN times that in translation); a score that
-    counts pixels is flat below half a pixel. step_deg: first step, and the longest one. Steps may lower the score, as the
-    method has it; the best extrinsic seen (4, 4) is returned, with its score. Ends after `evaluations`, or when a step falls
-    below a twentieth of epsilon.
+    epsilon_deg: half width of the central differences, deg (METRES_PER_RADIAN times that in translation). step_deg: first step,
+    and the longest one. Steps may lower the score: the best extrinsic seen (4, 4) is returned, with its score less the penalty.
+    Ends after `evaluations`, or when a step falls below a twentieth of epsilon.
     """
     epsilon, longest = np.deg2rad(epsilon_deg), np.deg2rad(step_deg)
     limits = limits or unlimited(T)
     T = limits.clip(T)
-    here, best, best_value = T, T, score.value(T)
+
+    def value_at(X: Matrix) -> float:
+        return score.value(X) - (penalty(X) if penalty else 0.0)
+
+    here, best, best_value = T, T, value_at(T)
     used, step, gradient = 1, np.zeros(6), np.zeros(6)
     while used + 13 <= evaluations:
-        ahead = [score.value(se3.exp(epsilon * AXES * axis) @ here) for axis in np.eye(6)]
-        behind = [score.value(se3.exp(-epsilon * AXES * axis) @ here) for axis in np.eye(6)]
+        ahead = [value_at(se3.exp(epsilon * AXES * axis) @ here) for axis in np.eye(6)]
+        behind = [value_at(se3.exp(-epsilon * AXES * axis) @ here) for axis in np.eye(6)]
         last, gradient = gradient, (np.array(ahead) - np.array(behind)) / (2 * epsilon)
         gradient = np.where(limits.movable(here, gradient), gradient, 0.0)
         used += 12
@@ -151,7 +223,7 @@ def barzilai_borwein(
             break
         step = alpha * gradient / steepness
         here = limits.clip(se3.exp(step * AXES) @ here)
-        value = score.value(here)
+        value = value_at(here)
         used += 1
         if value > best_value:
             best, best_value = here, value
@@ -159,13 +231,10 @@ def barzilai_borwein(
 
 
 class Sobol:
-    """A scrambled Sobol sequence over [-1, 1]^dimensions.
-
-    SciPy's statistics take half a second to import, which a process that searches nothing is spared.
-    """
+    """A scrambled Sobol sequence over [-1, 1]^dimensions."""
 
     def __init__(self, dimensions: int, seed: int) -> None:
-        from scipy.stats import qmc
+        from scipy.stats import qmc  # half a second, which a process that searches nothing is spared
 
         self._sequence = qmc.Sobol(dimensions, seed=seed)
 

@@ -1,8 +1,4 @@
-"""Independent parts of a computation on several threads.
-
-NumPy, OpenCV and kernel.c release the interpreter lock while they compute, so that threads share the arithmetic of a score; what
-remains in Python runs on one thread at a time.
-"""
+"""Independent parts of a computation on several threads: NumPy, OpenCV and kernel.c release the interpreter lock."""
 
 from __future__ import annotations
 
@@ -25,11 +21,8 @@ def cpu_time() -> float:
 
 
 class Workers:
-    """A pool of threads for calls that do not depend on each other, to be used as a context manager.
-
-    Results come in the order of the items, so that whatever is made of them does not depend on the number of threads. With one
-    thread there is no pool: calls are made by the caller's own thread, each when its result is asked for.
-    """
+    """A pool of threads for calls that do not depend on each other, to be used as a context manager. With one thread there is no
+    pool: calls are made by the caller's own thread, each when its result is asked for."""
 
     def __init__(self, threads: int = 1) -> None:
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="calib_search") if threads > 1 else None
@@ -39,7 +32,7 @@ class Workers:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        """Calls that have not begun are dropped, those that have are waited for: nothing goes on behind the caller's back."""
+        """Calls that have not begun are dropped, those that have are waited for."""
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
             _of_thread.workers_s = getattr(_of_thread, "workers_s", 0.0) + sum(self._seconds)

@@ -1,12 +1,8 @@
 """Global search in a box around the prior: Sobol starts in all six degrees of freedom, successive halving, in rounds.
 
-Rotation-only grids lose the truth under half a metre of translation; false optima above the truth are rare once edges
-are oriented and normalised, so that what decides is the number of starts. How many are enough depends on the box and on the
-scenes: the search begins small and goes on, round by round, until independent starts agree on the best optimum and this stands
-out from what the same search finds in a decoy, the mirrored edge maps of the same frames.
-
 A round: starts of every seeding strategy -> their optima on the coarse levels -> the best polished by simplex -> the best of
-these refined with all points -> the neighbourhood of the best one.
+these refined with all points -> the neighbourhood of the best one. Rounds go on until independent starts agree on the best
+optimum and this stands out from what the same search finds in a decoy, the mirrored edge maps of the same frames.
 """
 
 from __future__ import annotations
@@ -28,19 +24,13 @@ from calib_ros.registration.search.optimizers import Sobol, levenberg_marquardt,
 from calib_ros.registration.search.parallel import SERIAL, Workers
 
 # What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
-# Seeding. Levels where starts are ranked and optimised first: coarse ones have wide basins, but some scenes lead astray there;
-# from 5 deg / 0.3 m with one frame of two KITTI drives, 49 of 80 end at the truth with the two coarsest, 66 with all three. In
-# a wide box starts lie farther apart than the basins of level 2: from 20 deg / 1 m with 5 frames of 18 hard sets of all rigs,
-# 59 of 540 optimised starts end at the truth on level 0, 3 on level 1, none on level 2 (121, 39, 1 with four times the starts);
-# of 332 single frames from 10 deg / 0.5 m, level 2 alone finds one.
+# Seeding. Levels where starts are ranked and optimised first: the two coarsest find 49 of 80 KITTI frames, all three 66; in wide
+# boxes starts lie farther apart than the basins of level 2, where none of 540 ends at the truth.
 SEED_LEVELS, WIDE_SEED_LEVELS = (0, 1, 2), (0, 1)
-# The level, of classes and of edges, of starts that are ranked by classes: of 36 trials with 12 KITTI frames, most of them hard,
-# 26 searches end near the truth without such starts, 27 with level 1, 29 with 2, at about the same CPU time.
-GUIDE_LEVEL = 2
+GUIDE_LEVEL = 2  # of classes and of edges, for starts ranked by classes: 29 of 36 hard trials, 27 with level 1, 26 without them
 FIRST_POINTS, GUIDE_POINTS = 1500, 1500  # edge points and points of classes: enough to rank starts
-# Starts are scored on few points, the best of them again on more: next to optimising a start, scoring one costs nothing, and on
-# the 18 hard sets 25 of 54 searches from 20 deg / 1 m find the truth with 256 starts, 44 with 1024, 49 with 4096 or 16384. Half
-# the points find as many, a third of them fewer. Larger boxes than BASE_BOX get more starts, by the root of their volume.
+# Starts are scored on few points, the best of them again on more: of 54 hard searches 25 find the truth with 256 starts, 44 with
+# 1024, 49 with 4096. Larger boxes than BASE_BOX get more starts, by the root of their volume.
 RANKING_POINTS, BEST_RANKED = 300, 1024
 BASE_BOX, MOST_TIMES = np.array([np.deg2rad(5.0)] * 3 + [0.3] * 3), 16  # rad, m
 SAME_START = 0.12  # of the half width: starts nearer than this on all axes count as one
@@ -66,8 +56,7 @@ MIN_IMPROVEMENT = 0.02  # share of the score: by less, neighbours differ by chan
 # Ending.
 AGREEMENT = 3  # independent starts that must reach the best optimum: two may do so by chance
 # So many rounds, and starts agree on an optimum that is no better than chance: more rounds hardly find another. Or they do not
-# agree in a wide box: then half of it is searched around the best optimum so far. In a warehouse, from 20 deg / 1 m, ends of
-# single starts lay 1 to 2.5 deg and 7 to 60 cm from the truth, with z-scores of 9 to 17.
+# agree in a wide box: then half of it is searched around the best optimum so far, which may share some edges with the truth.
 FRUITLESS_ROUNDS = 3
 WIDE_DEG, WIDE_M = 5.0, 0.3
 
@@ -132,7 +121,7 @@ def search(
 
 
 def is_wide(box: SearchBox) -> bool:
-    """Whether a start in the box may end beside the best optimum, at one that shares some of its edges. Not one of few rounds."""
+    """Whether a start in the box may end at an optimum that shares some edges with the best one. Not one of few rounds."""
     deg, m = box.reach
     return box.rounds is None and (deg > WIDE_DEG or m > WIDE_M)
 
@@ -140,8 +129,7 @@ def is_wide(box: SearchBox) -> bool:
 def search_decoy(
     score: PointScore, T: Transform, box: SearchBox, config: SearchConfig, limits: Limits, user_prior: Prior | None = None
 ) -> float:
-    """z-score of the best extrinsic that one round of the same search finds in a decoy: the mirrored edge maps, which have the
-    statistics of the scene, but no true alignment."""
+    """z-score of the best extrinsic that a round of the same search finds in a decoy, the mirrored maps: no true alignment."""
     decoy = score.mirrored()
     with _workers(score, config) as workers:
         optima = Optima(SearchSpace(decoy, T, box, config, limits, user_prior, workers=workers))
@@ -156,8 +144,7 @@ def _workers(score: PointScore, config: SearchConfig) -> Workers:
 
 @dataclass(frozen=True, eq=False)
 class SeedingStrategy:
-    """Starts are ranked by a level of `ranking`, the best of them by that of `score`, and optimised from that level of the edges
-    on. ranking: the same score on fewer points."""
+    """Starts are ranked by a level of `ranking`, the best of them by that of `score`, and optimised from that level on."""
 
     ranking: PointScore
     score: PointScore
@@ -179,10 +166,7 @@ def seeding_strategies(first: PointScore, guide: PointScore | None, box: SearchB
 
 
 class SearchSpace:
-    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from.
-
-    workers: share the work; they only read what is in here.
-    """
+    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from."""
 
     def __init__(
         self,
@@ -207,7 +191,7 @@ class SearchSpace:
         self._sobol = Sobol(6, seed=config.seed)
 
     def draw(self) -> Matrix:
-        """The next starts (n, 6) in units of the box, -1..1; n is the power of two at which Sobol's sequence is balanced."""
+        """The next starts (n, 6) in units of the box, -1..1; n a power of two, at which Sobol's sequence is balanced."""
         searched = self.half > 0
         times = float(np.sqrt(np.prod(self.half[searched] / BASE_BOX[searched])))
         n = int(self.config.starts * np.clip(times, 1, MOST_TIMES))
@@ -222,12 +206,11 @@ class SearchSpace:
 @dataclass(eq=False)
 class Optimum:
     """An optimum of the coarse levels, polished once it is among the best. count: starts that ended here. coarse_T: where it was
-    before it was polished. final: with all points; None until it is a finalist."""
+    before it was polished; None until it is. final: with all points; None until it is a finalist."""
 
     value: float
     T: Transform
     count: int = 1
-    polished: bool = False
     coarse_T: Transform | None = None
     final: Finalist | None = None
 
@@ -242,8 +225,7 @@ class Finalist:
 
 
 class Optima:
-    """The optima of a search, round by round. optimised: starts that were followed to the end. nearby: optima (4, 4) around the
-    best one."""
+    """The optima of a search, round by round. optimised: starts followed to the end. nearby: optima (4, 4) around the best."""
 
     def __init__(self, space: SearchSpace) -> None:
         self.optimised = self._rounds = 0
@@ -309,7 +291,7 @@ def score_starts(space: SearchSpace, score: PointScore, level: int, unit: Matrix
 def optimise_starts(
     space: SearchSpace, starts: Sequence[Matrix], level: int, optima: list[Optimum], progress: Progress = SILENT
 ) -> int:
-    """Add the optima of the coarse levels that the starts lead to; the worse part of them is dropped after the first level.
+    """Add the optima of the coarse levels that the starts lead to, the worse part of them dropped after the first level.
     Returns how many starts were followed to the end."""
 
     def first(start: Transform) -> tuple[float, Matrix]:
@@ -338,7 +320,7 @@ def add_optimum(optima: list[Optimum], T: Transform, value: float) -> None:
     for other in optima:
         if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
             other.count += 1
-            if value > other.value and not other.polished:
+            if value > other.value and other.coarse_T is None:
                 other.value, other.T = value, T
             return
     optima.append(Optimum(value, T))
@@ -346,7 +328,7 @@ def add_optimum(optima: list[Optimum], T: Transform, value: float) -> None:
 
 def polish_best(space: SearchSpace, optima: Sequence[Optimum], progress: Progress = SILENT) -> list[Optimum]:
     """Polish the best of the optima that are not yet; these."""
-    waiting = sorted((o for o in optima if not o.polished), key=lambda o: -o.value)[:POLISHED]
+    waiting = sorted((o for o in optima if o.coarse_T is None), key=lambda o: -o.value)[:POLISHED]
     for k, _ in enumerate(space.workers.map(partial(polish, space), waiting)):
         progress((k + 1) / len(waiting))
     return waiting
@@ -359,7 +341,6 @@ def polish(space: SearchSpace, optimum: Optimum) -> None:
         optimum.T, optimum.value = nelder_mead(
             space.middle.at(level), optimum.T, step, SIMPLEX_EVALUATIONS, space.penalty, space.limits
         )
-    optimum.polished = True
 
 
 def finish_best(space: SearchSpace, polished: Sequence[Optimum]) -> list[Finalist]:
@@ -380,8 +361,7 @@ def finish(space: SearchSpace, T: Transform, count: int = 1) -> Finalist:
 
 
 def search_nearby(space: SearchSpace, top: Finalist) -> tuple[Matrix, list[Finalist]]:
-    """Something better near the best finalist, where a ridge may have parted a start from the top; else the finalist itself. And
-    all optima that were met."""
+    """Something better near the best finalist, beyond a ridge, else itself; and all optima that were met."""
     best, ends = top, [top]
     half = np.where(space.half > 0, NEARBY, 0.0)
     candidates = se3.exp_many(Sobol(6, seed=space.config.seed).next(NEARBY_STARTS) * half) @ top.T

@@ -14,7 +14,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import ConstraintsConfig, ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
-from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
+from calib_ros.lidar.edges import UPWARD, EdgePoints
 from calib_ros.registration.covariance import (
     FEW_POINTS,
     SYSTEMATIC_ERROR,
@@ -61,6 +61,12 @@ def points(seed: int, n: int = 900, spacing_deg: float = 0.4) -> EdgePoints:
     return EdgePoints(xyz.astype(np.float32), rng.uniform(0.2, 2, n).astype(np.float32), kind, float(np.deg2rad(spacing_deg)))
 
 
+def plain(xyz: np.ndarray, maps: list[EdgeLevel]) -> FrameFeatures:
+    """Points of the first kind, all as strong."""
+    p = EdgePoints(np.asarray(xyz, np.float32), np.ones(len(xyz), np.float32), np.zeros(len(xyz), np.uint8))
+    return FrameFeatures(p, maps, CAMERA, 0, "", True)
+
+
 def levels(seed: int, smoothness: float = 1.0) -> list[EdgeLevel]:
     rng = np.random.default_rng(1000 + seed)
     out = []
@@ -77,7 +83,7 @@ def frame(seed: int, smoothness: float = 1.0, **options) -> FrameFeatures:
 
 FRAMES = [frame(k) for k in range(3)]
 ONES = [EdgeLevel.of(np.ones((2, HEIGHT // k, WIDTH // k), np.float32), k, s) for k, s in zip(SCALES, SIGMAS, strict=True)]
-EMPTY = replace(FRAMES[1], points=EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)))
+EMPTY = plain(np.zeros((0, 3)), FRAMES[1].levels)
 POSES = [
     se3.exp(np.array(xi)) @ nominal() for xi in ([0] * 6, [0.02, -0.03, 0.01, 0.1, -0.05, 0.2], [0, 0.2, -0.1, 0.3, 0.4, 0.5])
 ]
@@ -86,40 +92,39 @@ POSES = [
 def slow(
     features: list[FrameFeatures], T: np.ndarray, level: int, config: ScoreConfig = CONFIG, share: float = MARGIN
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edge strength, weight and frame of every point that the prior keeps, one by one in double precision."""
+    """Edge strength, weight and frame of every point that the prior keeps, in double precision."""
+    weights_of = np.array([WEIGHT_SIDE, WEIGHT_TOP, config.weight_reflectivity, WEIGHT_SKY_SIDE, WEIGHT_SKY_TOP])
     sampled, weight, number = [], [], []
     for j, f in enumerate(features):
-        of_kinds = (WEIGHT_SIDE, WEIGHT_TOP, config.weight_reflectivity, WEIGHT_SKY_SIDE, WEIGHT_SKY_TOP)
-        weights_of = dict(zip(EdgeKind, of_kinds, strict=True))
-        margin = share * WIDTH
-        near = []
-        for k, p in enumerate(f.points.xyz.astype(float)):
-            x, y, z = nominal()[:3, :3] @ p + nominal()[:3, 3]
-            if z > MIN_DEPTH:
-                u, v = CAMERA.K[0, 0] * x / z + CAMERA.K[0, 2], CAMERA.K[1, 1] * y / z + CAMERA.K[1, 2]
-                if -margin < u < WIDTH + margin and -margin < v < HEIGHT + margin:
-                    near.append(k)
+        uv, z = pixels(f.points.xyz, nominal())
+        border = share * WIDTH
+        near = (z > MIN_DEPTH) & (uv > -border).all(axis=1) & (uv < np.array([WIDTH, HEIGHT]) + border).all(axis=1)
         kinds, strengths = f.points.kind[near], f.points.strength[near].astype(float)
-        blunt = np.sqrt(min(1, RING_SPACING_DEG / np.rad2deg(f.points.ring_spacing)))
-        for k, kind, strength in zip(near, kinds, strengths, strict=True):
-            same = strengths[kinds == kind]
-            total = same.sum() if len(same) > WEIGHT_FLOOR else WEIGHT_FLOOR * same.mean()
-            weight.append(weights_of[kind] * (blunt if kind in UPWARD else 1) * strength / total)
-            number.append(j)
-            x, y, z = T[:3, :3] @ f.points.xyz[k].astype(float) + T[:3, 3]
-            value = 0.0
-            if z >= MIN_DEPTH:
-                u, v = CAMERA.K[0, 0] * x / z + CAMERA.K[0, 2], CAMERA.K[1, 1] * y / z + CAMERA.K[1, 2]
-                scale = f.levels[level].scale
-                u, v = (u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5
-                image = f.levels[level].maps[1 if kind in UPWARD else 0]
-                u0, v0 = int(np.floor(u)), int(np.floor(v))
-                for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):  # the four neighbours; outside the picture all is 0
-                    if 0 <= v0 + a < image.shape[0] and 0 <= u0 + b < image.shape[1]:
-                        value += image[v0 + a, u0 + b] * (1 - abs(v - v0 - a)) * (1 - abs(u - u0 - b))
-            sampled.append(value)
-    weights = np.array(weight)
-    return np.array(sampled), weights / weights.sum(), np.array(number)
+        upward, blunt = np.isin(kinds, UPWARD), np.sqrt(min(1, RING_SPACING_DEG / np.rad2deg(f.points.ring_spacing)))
+        of_kind = np.array([max(own.sum(), WEIGHT_FLOOR * own.mean()) for own in (strengths[kinds == k] for k in range(5))])
+        weight.append(weights_of[kinds] * np.where(upward, blunt, 1) * strengths / of_kind[kinds])
+        number.append(np.full(len(kinds), j))
+        uv, z = pixels(f.points.xyz[near], T)
+        u, v = ((uv + 0.5) / f.levels[level].scale - 0.5).T
+        side, up = (bilinear(f.levels[level].maps[k], u, v) for k in (0, 1))
+        sampled.append(np.where(z >= MIN_DEPTH, np.where(upward, up, side), 0))
+    weights = np.concatenate(weight)
+    return np.concatenate(sampled), weights / weights.sum(), np.concatenate(number)
+
+
+def pixels(xyz: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    P = se3.transform(T, xyz.astype(float))
+    return P[:, :2] / P[:, 2:] * np.diag(CAMERA.K)[:2] + CAMERA.K[:2, 2], P[:, 2]
+
+
+def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Outside the picture all is 0."""
+    framed, rows, columns = np.pad(image, 1), np.floor(v), np.floor(u)
+    (height, width), out = image.shape, np.zeros(len(u))
+    for a, b in itertools.product((0, 1), repeat=2):
+        row, column = np.clip(rows + 1 + a, 0, height + 1), np.clip(columns + 1 + b, 0, width + 1)
+        out += framed[row.astype(int), column.astype(int)] * (1 - abs(v - rows - a)) * (1 - abs(u - columns - b))
+    return out
 
 
 @pytest.mark.parametrize(("config", "margin"), [(CONFIG, MARGIN), (replace(CONFIG, weight_reflectivity=0.3), 0.2)])
@@ -146,9 +151,8 @@ def test_points_at_the_border_fade_out():
     def at(u: float, v: float, level: int, slope: bool = False) -> float:
         z = 10.0
         p = np.array([(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * z, (v - CAMERA.K[1, 2]) / CAMERA.K[1, 1] * z, z])
-        xyz = np.repeat(se3.transform(se3.inverse(nominal()), p[None]), 300, axis=0).astype(np.float32)
-        one = EdgePoints(xyz, np.ones(300, np.float32), np.zeros(300, np.uint8))
-        score = FastScore([FrameFeatures(one, ONES, CAMERA, 0, "", True)], nominal(), CONFIG).at(level)
+        xyz = np.repeat(se3.transform(se3.inverse(nominal()), p[None]), 300, axis=0)
+        score = FastScore([plain(xyz, ONES)], nominal(), CONFIG).at(level)
         return float(np.abs(score.linearise(nominal())[0]).max()) if slope else score.value(nominal())
 
     for level, scale in enumerate(SCALES):
@@ -173,10 +177,9 @@ def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
     monkeypatch.setattr("calib_ros.registration.score.atlas.MAX_SIDE", 1300)
     several = FastScore(features, nominal(), CONFIG)
     assert several.atlas.levels[-1].image.shape[1] > 1.9 * one.atlas.levels[-1].image.shape[1]
-    for T in POSES:
-        for level in range(len(SCALES)):
-            assert several.at(level).value(T) == pytest.approx(one.at(level).value(T), abs=5e-4)
-            assert several.frame_scores(T, level) == pytest.approx(one.frame_scores(T, level), abs=4e-3)
+    for T, level in itertools.product(POSES, range(len(SCALES))):
+        assert several.at(level).value(T) == pytest.approx(one.at(level).value(T), abs=5e-4)
+        assert several.frame_scores(T, level) == pytest.approx(one.frame_scores(T, level), abs=4e-3)
     monkeypatch.setattr("calib_ros.registration.score.atlas.MAX_SIDE", 600)
     with pytest.raises(TooFewFeaturesError, match="7 frames of 322x121 do not fit one score"):
         FastScore(features, nominal(), CONFIG)
@@ -211,34 +214,6 @@ def test_the_gradient_is_the_slope(level):
     assert np.allclose(J @ weight, gradient, rtol=1e-3, atol=1e-4 * np.abs(gradient).max())
     assert np.allclose(H, (J * weight) @ J.T, rtol=1e-3, atol=1e-4 * H.max())
     assert np.linalg.eigvalsh(H).min() > 0
-
-
-def test_frames_add_up():
-    score = FastScore(FRAMES, nominal(), CONFIG)
-    share = np.bincount(score.frame, score.weights)
-    for T in POSES:
-        for level in (0, -1):
-            assert share @ score.frame_scores(T, level) == pytest.approx(score.at(level).value(T), abs=1e-6)
-
-
-def test_frame_without_edges_does_not_change_other_scores():
-    score = FastScore([FRAMES[0], EMPTY, FRAMES[2]], nominal(), CONFIG)
-    without = FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG)
-    T = POSES[1]
-    scores = score.frame_scores(T)
-    assert np.isnan(scores[1])
-    assert scores[[0, 2]] == pytest.approx(without.frame_scores(T), abs=1e-3)
-    assert score.at(-1).value(T) == pytest.approx(without.at(-1).value(T), abs=1e-3)
-
-
-def test_points_too_near_are_not_scored():
-    """A point at 20 cm would move by the whole picture at a tenth of a degree."""
-    xyz = np.repeat([[10.0, 0, 0], [0.6, 0, 0]], 300, axis=0).astype(np.float32)
-    both = EdgePoints(xyz, np.ones(600, np.float32), np.zeros(600, np.uint8))
-    score = FastScore([FrameFeatures(both, ONES, CAMERA, 0, "", True)], nominal(), CONFIG)
-    assert score.at(-1).value(nominal()) == pytest.approx(1)
-    nearer = se3.exp(np.array([0, 0, 0, 0, 0, -0.2])) @ nominal()
-    assert score.at(-1).value(nearer) == pytest.approx(0.5)
 
 
 def test_a_subset_is_the_score_of_its_points():
@@ -329,6 +304,7 @@ def test_other_optima_nearby_count_as_far_as_they_are_as_good():
     alike = 20 * less / noise  # of so much noise that the two are nearly as probable
     spread = covariance(score, nominal(), others=[aside], inflation=alike) - covariance(score, nominal(), inflation=alike)
     assert spread[1, 1] == pytest.approx(0.02**2 / 2, rel=0.1)
+    assert np.allclose(noise_of(score, inflation=4.0), 4 * noise_of(score), rtol=1e-6)  # a factor of the variance
 
 
 def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(monkeypatch):
@@ -342,11 +318,6 @@ def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(mo
     # Two pixels to the right are a turn about the camera's vertical axis.
     assert np.sqrt(apart[1, 1]) > 1.5 * np.sqrt(agreeing[1, 1])  # the noise is pooled over all directions
     assert np.sqrt(apart[1, 1]) > 0.4 * 2 / F / np.sqrt(4)
-
-
-def test_inflation_is_a_factor_of_the_variance():
-    score = FastScore([peaked(0, 0)], nominal(), CONFIG)
-    assert np.allclose(noise_of(score, inflation=4.0), 4 * noise_of(score), rtol=1e-6)
 
 
 def test_frames_of_few_points_are_less_certain():
@@ -404,14 +375,12 @@ def test_what_is_fixed_has_no_variance_and_a_prior_adds_its_information():
 
 def one_way(frames: int) -> list[FrameFeatures]:
     """All points in one direction, where the picture has its only bump; give or take half a pixel."""
-    xyz = np.repeat([[10.0, 0, 0]], 400, axis=0).astype(np.float32)
-    one = EdgePoints(xyz, np.ones(400, np.float32), np.zeros(400, np.uint8))
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     out = []
     for k in range(frames):
         u, v = CAMERA.K[:2, 2] + [0.5 * (-1) ** k, 0.5 * (-1) ** (k // 2)]
         bump = np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 4.0**2)).astype(np.float32)
-        out.append(FrameFeatures(one, [EdgeLevel.of(np.stack([bump, bump]), 1, 4.0)] * len(SCALES), CAMERA, 0, "", True))
+        out.append(plain(np.repeat([[10.0, 0, 0]], 400, axis=0), [EdgeLevel.of(np.stack([bump, bump]), 1, 4.0)] * len(SCALES)))
     return out
 
 

@@ -1,4 +1,4 @@
-"""Wrong intrinsics are named, with their size, and never become a mount."""
+"""Wrong intrinsics are named, with their size, and never become a mount; or they are corrected together with the extrinsic."""
 
 from __future__ import annotations
 
@@ -6,71 +6,83 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import QUICK, Scene, assert_not_used
+from scenes import QUICK, Scene, assert_not_used, same
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import update
-from calib_ros.registration.acceptance.refusal import LeftOpen, WrongIntrinsics
+from calib_ros.config import CameraConfig, update
+from calib_ros.errors import BadInputError
+from calib_ros.intrinsics import CENTRE, FOCAL, NAMES, RADIAL, IntrinsicEstimate, RefinedCamera, change_between, changed
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.nuisance.lens import FocalLength
+from calib_ros.registration.camera_rounds import refined_with_camera
+from calib_ros.registration.nuisance.lens import Intrinsic
 from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate, wrong_parameter
-from calib_ros.registration.search.constraints import Limits, PoseConstraints, SearchBox
-from calib_ros.result import RefusalCode, Result
+from calib_ros.registration.nuisance.refinement import joint_optimum, lens_parameters
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import Limits, PoseConstraints, SearchBox, unlimited
+from calib_ros.result import CONVERGED, RefusalCode, Result
 
 BOX = SearchBox(1.5, 0.15)
+REFINE = update(QUICK, {"camera": {"intrinsics": "refine"}})
+K = np.array([[700.0, 0, 630], [0, 690, 370], [0, 0, 1]])
+K_WIDE = np.array([[420.0, 0, 475], [0, 421, 390], [0, 0, 1]])
+LENSES = [
+    Camera(K, 1280, 720),
+    Camera(K, 1280, 720, D=np.array([-0.3, 0.1, 1e-3, 5e-4, 0.0])),
+    Camera(K_WIDE, 960, 768, "equidistant", np.array([0.02, -0.004, 8e-4, -1.5e-4])),
+]
 
 
-def changed(camera: Camera, focal: float = 0.0, u: float = 0.0, v: float = 0.0) -> Camera:
-    K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= 1 + focal
-    K[:2, 2] += np.array([u, v])
-    return replace(camera, K=K)
+def wrong(camera: Camera, focal: float = 0.0, u: float = 0.0, v: float = 0.0, corner: float = 0.0) -> Camera:
+    """A focal length that is off by a share, a principal point by pixels, and a k1 that moves the corner by a share of its
+    radius."""
+    unit = lens_parameters(CameraConfig(), camera, camera.rectified())[-1].unit
+    for name, value in ((FOCAL, focal), (CENTRE[0], u), (CENTRE[1], v), (RADIAL, corner * unit)):
+        camera = changed(camera, name, value) if value else camera
+    return camera
 
 
-def calibrated(scene: Scene, seen_by: Camera, box: SearchBox | None = BOX, **options: object) -> tuple[Result, np.ndarray]:
-    """The result with another camera, and its start."""
-    calibrator = Calibrator(seen_by, update(QUICK, options))
+def calibrated(scene: Scene, seen_by: Camera, box: SearchBox | None = BOX, config=QUICK, **options: object) -> Result:
+    """The result with another camera."""
+    calibrator = Calibrator(seen_by, update(config, options))
     start = scene.off(([0.4, -0.3, 0.2], [0.03, -0.02, 0.04]))
-    return calibrator.calibrate([replace(f, camera=seen_by) for f in scene.frames], start, box), start
+    return calibrator.calibrate([replace(f, camera=seen_by) for f in scene.frames], start, box)
+
+
+# --- given ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("focal", "u", "v", "says"),
-    [
-        (0.03, 0, 0, "shorter"),
-        (-0.04, 0, 0, "longer"),
-        (0, 16, 0, "further to the left"),
-        (0, 0, -16, "further down"),
-    ],
+    [(0.03, 0, 0, "shorter"), (-0.04, 0, 0, "longer"), (0, 16, 0, "further to the left"), (0, 0, -16, "further down")],
 )
 def test_wrong_intrinsics_are_refused_and_named(scene, focal, u, v, says):
-    result, start = calibrated(scene, changed(scene.camera, focal, u, v))
-    assert_not_used(result, start)
+    result = calibrated(scene, wrong(scene.camera, focal, u, v))
+    assert_not_used(result, result.initial)
     assert result.refusal is RefusalCode.WRONG_INTRINSICS
     assert says in result.reason
+    assert [result.refusal_figures[name] for name in "uv"] == pytest.approx([-u, -v], abs=6)
     assert result.refusal_figures["focal"] == pytest.approx(-focal, abs=0.01)
-    assert result.refusal_figures["u"] == pytest.approx(-u, abs=6)
-    assert result.refusal_figures["v"] == pytest.approx(-v, abs=6)
 
 
 def test_right_intrinsics_are_estimated_as_given(scene):
-    result, _ = calibrated(scene, scene.camera)
+    result = calibrated(scene, scene.camera)
     scene.assert_found(result)
-    assert set(result.intrinsics) == {"focal_length_share", "principal_point_x_px", "principal_point_y_px"}
-    focal = result.intrinsics["focal_length_share"]
+    assert result.refined_camera is None  # unless asked for
+    assert set(result.intrinsics) == {FOCAL, *CENTRE}
+    focal = result.intrinsics[FOCAL]
     assert focal.observable
     assert abs(focal.value) < 4 * focal.sigma < 0.02
-    told = result.to_dict()["intrinsics"]["focal_length_share"]
+    told = result.to_dict()["intrinsics"][FOCAL]
     assert told == {"value": focal.value, "sigma": focal.sigma, "observable": True}
 
 
 @pytest.mark.parametrize("focal", [-0.01, 0.01])
 def test_a_focal_length_one_per_cent_off_is_an_unknown_and_no_reason_to_refuse(scene, focal):
-    result, _ = calibrated(scene, changed(scene.camera, focal))
-    exact, _ = calibrated(scene, changed(scene.camera, focal), camera={"focal_sigma": 0.0, "centre_sigma": 0.0})
+    result = calibrated(scene, wrong(scene.camera, focal))
+    exact = calibrated(scene, wrong(scene.camera, focal), camera={"focal_sigma": 0.0, "centre_sigma": 0.0})
     assert result.converged
-    assert result.intrinsics["focal_length_share"].value == pytest.approx(-focal, abs=0.006)
+    assert result.intrinsics[FOCAL].value == pytest.approx(-focal, abs=0.006)
     assert exact.intrinsics == {}
     forward = scene.truth[:3, :3] @ [1.0, 0.0, 0.0]
     off = se3.log(result.T_camera_lidar @ se3.inverse(scene.truth))[3:] @ forward
@@ -79,41 +91,170 @@ def test_a_focal_length_one_per_cent_off_is_an_unknown_and_no_reason_to_refuse(s
     assert told > 1.5 * without  # by how much the camera looks nearer or farther away
 
 
+def test_another_focal_length_moves_the_camera_along_its_view(scene):
+    T = scene.quick.estimate(scene.features, scene.truth).T_camera_lidar
+    score = FastScore(list(scene.features), T, QUICK.score)
+    effect = Intrinsic(0.01).effect(score, T, unlimited(T))
+    assert effect.direction[5] > 2.0  # m for the whole of it: edges are 5 to 30 m away
+    assert abs(effect.direction[5]) > 3 * np.abs(effect.direction[3:5]).max()
+    assert 0.0 < effect.sigma(0.01) < 0.005
+    fixed = Limits(T, np.array([np.inf] * 5 + [0.0]))
+    assert Intrinsic(0.01).effect(score, T, fixed).direction[5] == pytest.approx(0.0, abs=1e-3)
+
+
 def unknown(value: float, sigma: float, prior: float, shift_m: float) -> NuisanceEstimate:
     """A focal length that shifts the optimum by so much."""
     direction = np.array([0, 0, 0, 0, 0, shift_m / value])
-    return NuisanceEstimate(FocalLength(prior), value, Effect(direction, 1 / sigma**2))
+    return NuisanceEstimate(Intrinsic(prior), value, Effect(direction, 1 / sigma**2))
 
 
 @pytest.mark.parametrize(
-    ("estimates", "refusal"),
+    ("count", "value", "sigma", "shift_m", "refusal"),
     [
-        ([unknown(0.03, 0.002, 0.005, 0.3)], WrongIntrinsics),
-        ([unknown(0.01, 0.002, 0.005, 0.3)], None),  # within what calibrations differ by
-        ([unknown(0.03, 0.02, 0.005, 0.3)], None),  # the scenes hardly tell
-        ([unknown(0.03, 0.002, 0.005, 0.05)], None),  # it does not matter
-        ([unknown(0.0182, 0.002, 0.005, 0.3)], WrongIntrinsics),  # p = 0.0007
-        ([unknown(0.0182, 0.002, 0.005, 0.3)] * 3, LeftOpen),  # of three, but it is as likely as not that one is plainly wrong
-        ([unknown(0.0182, 0.002, 0.005, 0.09)] * 3, None),  # it hardly matters
+        (1, 0.03, 0.002, 0.3, RefusalCode.WRONG_INTRINSICS),
+        (1, 0.01, 0.002, 0.3, None),  # within what calibrations differ by
+        (1, 0.03, 0.02, 0.3, None),  # the scenes hardly tell
+        (1, 0.03, 0.002, 0.05, None),  # it does not matter
+        (1, 0.0182, 0.002, 0.3, RefusalCode.WRONG_INTRINSICS),  # p = 0.0007
+        (3, 0.0182, 0.002, 0.3, RefusalCode.TOO_UNCERTAIN),  # it is as likely as not that one of them is plainly wrong
+        (3, 0.0182, 0.002, 0.09, None),  # it hardly matters
     ],
 )
-def test_what_is_refused_is_significant_and_matters(estimates, refusal):
-    found = wrong_parameter(estimates, 0.5, 0.1)
-    assert found is None if refusal is None else isinstance(found, refusal)
+def test_what_is_refused_is_significant_and_matters(count, value, sigma, shift_m, refusal):
+    found = wrong_parameter([unknown(value, sigma, 0.005, shift_m)] * count, 0.5, 0.1)
+    assert (found and found.code) == refusal
 
 
 def test_what_is_known_in_advance_and_what_the_scenes_tell_are_weighed():
     told = unknown(0.01, 0.005, 0.005, 0.1)
     assert told.posterior == pytest.approx((0.005, 0.005 / np.sqrt(2)))
-    moment = told.added_covariance(PoseConstraints(Limits(np.eye(4), np.full(6, np.inf))), np.eye(6))
+    moment = told.added_covariance(PoseConstraints(unlimited(np.eye(4))), np.eye(6))
     assert np.sqrt(moment[5, 5]) == pytest.approx(10 * np.hypot(0.005, 0.005 / np.sqrt(2)))
-    nothing = NuisanceEstimate(FocalLength(0.005), 0.01, Effect(np.ones(6), 0.0))
+    nothing = NuisanceEstimate(Intrinsic(0.005), 0.01, Effect(np.ones(6), 0.0))
     assert (nothing.sigma, nothing.deviations, nothing.is_observable) == (np.inf, 0.0, False)
     assert nothing.posterior == pytest.approx((0.0, 0.005))
 
 
 def test_they_are_checked_where_something_is_searched_and_it_is_wanted(scene):
-    wrong = changed(scene.camera, -0.04)
-    refined, _ = calibrated(scene, wrong, None)
-    unchecked, _ = calibrated(scene, wrong, refine={"tolerance_deg": 180.0, "tolerance_m": 100.0})
-    assert RefusalCode.WRONG_INTRINSICS not in (refined.refusal, unchecked.refusal)
+    camera = wrong(scene.camera, -0.04)
+    unchecked = calibrated(scene, camera, refine={"tolerance_deg": 180.0, "tolerance_m": 100.0})
+    assert RefusalCode.WRONG_INTRINSICS not in (calibrated(scene, camera, None).refusal, unchecked.refusal)
+
+
+# --- refined --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("focal", "corner", "box"), [(0.03, 0.0, BOX), (-0.03, 0.02, BOX), (0.03, 0.0, None)])
+def test_a_wrong_camera_is_corrected_with_the_extrinsic(scene, focal, corner, box):
+    """Also where the extrinsic is only refined."""
+    given = wrong(scene.camera, focal, corner=corner)
+    result = calibrated(scene, given, box, REFINE)
+    scene.assert_found(result, 0.3, 0.05)
+    assert (result.starts is None) == (box is None)
+    found = result.refined_camera
+    assert found is not None
+    for name, change in found.changes.items():
+        assert abs(change_between(scene.camera, found.camera, name)) < 2.5 * change.sigma
+        assert change.value == pytest.approx(change_between(given, found.camera, name), abs=1e-9)
+    assert found.changes[FOCAL].observable
+    assert found.changes[FOCAL].sigma < 0.003
+    assert np.allclose(found.T_camera_lidar, result.T_camera_lidar)
+    assert np.allclose(result.covariance, found.covariance[:6, :6])  # the vehicle stands: the clocks leave nothing open
+    assert np.linalg.eigvalsh(found.covariance / np.outer(*[np.sqrt(np.diag(found.covariance))] * 2)).min() > 0
+    assert dict(result.intrinsics) == dict(found.changes)
+
+
+def test_a_right_camera_stays_so_and_runs_are_the_same(scene):
+    first, second = (calibrated(scene, scene.camera, config=REFINE) for _ in range(2))
+    assert same(first, second)
+    assert first.refined_camera.to_dict() == second.refined_camera.to_dict()
+    scene.assert_found(first, 0.2, 0.04)
+    for name, change in first.refined_camera.changes.items():
+        assert abs(change.value) < 2.5 * change.sigma, name
+
+
+def test_exact_intrinsics_are_left_alone(scene):
+    names = [own.name for own in lens_parameters(CameraConfig(focal_sigma=0.0, centre_sigma=0.0), scene.camera, scene.camera)]
+    assert names == [RADIAL]
+
+
+def test_unrolled_pictures_show_no_intrinsics(scene):
+    calibrator = Calibrator(scene.camera, update(REFINE, {"image": {"projection": "cylinder"}}))
+    with pytest.raises(BadInputError, match="not observable"):
+        calibrator.calibrate(scene.frames, scene.truth)
+    score = calibrator.objectives([calibrator.extract(f) for f in scene.frames[:1]], scene.truth, scene.truth).edges.score
+    assert joint_optimum(score, scene.truth, unlimited(scene.truth), None, scene.camera, CameraConfig(), 1.0, np.eye(6)) is None
+
+
+@pytest.mark.parametrize("camera", LENSES)
+@pytest.mark.parametrize("name", NAMES)
+def test_the_effect_of_a_lens_on_rays_is_that_of_its_own_model(camera, name):
+    flat = camera.rectified()
+    own = next(own for own in lens_parameters(CameraConfig(), camera, flat) if own.name == name)
+    value = 1e-3
+    other = changed(camera, name, own.unit * value)
+    h, w = own.field.shape[:2]
+    for row, column in ((h // 2, w // 4), (h // 5, w // 2), (3 * h // 4, 7 * w // 8)):
+        u, v = column / (w - 1) * (flat.width - 1), row / (h - 1) * (flat.height - 1)
+        ray = np.array([(u - flat.K[0, 2]) / flat.K[0, 0], (v - flat.K[1, 2]) / flat.K[1, 1]])
+        # The picture of the changed lens, looked at as one of the given lens, shows the ray where the shift says.
+        seen = ray + value * own.field[row, column]
+        assert other.project([[*ray, 1.0]])[0] == pytest.approx(camera.project([[*seen, 1.0]])[0], abs=0.02)
+    assert np.linalg.norm(own.field, axis=2).max() > 0.1  # in the corner
+
+
+def test_changes_of_a_camera_and_their_sizes():
+    for camera in LENSES:
+        for name, value in zip(NAMES, (0.02, -3.0, 4.0, 0.01), strict=True):
+            other = changed(camera, name, value)
+            assert change_between(camera, other, name) == pytest.approx(value)
+            assert (other.model, other.width, other.height) == (camera.model, camera.width, camera.height)
+    assert len(changed(LENSES[0], RADIAL, 0.1).D) == 5
+
+
+# --- in rounds ------------------------------------------------------------------------------------------------------------
+
+
+def estimate(change: float, sigma: float, shift_m: float = 0.1, **options: object) -> Result:
+    """Of a focal length, a standard deviation of which shifts the extrinsic by so much."""
+    along = np.array([0, 0, 0, 0, 0, shift_m / sigma])
+    covariance = np.zeros((7, 7))
+    covariance[:6, :6] = 1e-6 * np.eye(6) + sigma**2 * np.outer(along, along)
+    covariance[:6, 6] = covariance[6, :6] = sigma**2 * along
+    covariance[6, 6] = sigma**2
+    camera = changed(LENSES[0], FOCAL, change)
+    left = RefinedCamera(camera, np.eye(4), {FOCAL: IntrinsicEstimate(change, sigma, True)}, covariance)
+    assert left.directions[:, 0] == pytest.approx(along)
+    values = {"covariance": 1e-6 * np.eye(6), "initial": np.eye(4), "refined_camera": left, **options}
+    return Result(np.eye(4), CONVERGED, **values)
+
+
+def test_rounds_end_where_nothing_is_left_and_the_covariance_is_about_the_camera_that_is_told():
+    asked = []
+
+    def near(camera: Camera, T: np.ndarray) -> Result:
+        asked.append(camera)
+        return estimate(0.02 if len(asked) == 1 else 0.0005, 0.001)
+
+    last = estimate(0.0005, 0.001, 0.01)
+    result = refined_with_camera(estimate(0.03, 0.001), LENSES[0], near, lambda camera: last, CameraConfig(), REFINE.refine)
+    assert len(asked) == 2
+    assert result.converged
+    assert result.refined_camera.changes[FOCAL].value == pytest.approx(0.0005)  # of the camera that the last round has told
+    sigma = np.sqrt(result.refined_camera.covariance[6, 6])
+    assert sigma == pytest.approx(np.hypot(0.001, 0.0005))
+    assert np.sqrt(result.covariance[5, 5]) == pytest.approx(np.hypot(0.001, 0.01 * np.hypot(1, 0.5)))
+
+
+def in_rounds(last: Result) -> Result:
+    return refined_with_camera(last, LENSES[0], lambda c, T: last, lambda c: last, CameraConfig(), REFINE.refine)
+
+
+def test_what_the_scenes_leave_too_open_is_refused():
+    assert in_rounds(estimate(0.0, 0.004, 0.2)).converged  # as well as a focal length is known that is given
+    refused = in_rounds(estimate(0.0, 0.02, 0.2))
+    assert_not_used(refused, np.eye(4))
+    assert refused.refusal is RefusalCode.TOO_UNCERTAIN
+    assert refused.refined_camera is None
+    assert in_rounds(estimate(0.0, 0.02, 0.02)).converged  # it hardly matters
+    assert in_rounds(replace(estimate(0.0, 0.001), status="refused", covariance=None)).refined_camera is None

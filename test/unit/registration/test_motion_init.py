@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import QUICK
+from scenes import QUICK, SIZE, RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
@@ -17,10 +17,9 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.motion_guess.guess import LEAST_DEG, guess_from_tracks, motion_guess
-from calib_ros.registration.motion_guess.lidar_motion import Run
-from calib_ros.registration.motion_guess.tracks import Tracks, picture_pairs
+from calib_ros.registration.motion_guess.tracks import Run, Tracks, picture_pairs
 from calib_ros.registration.search.constraints import SEMANTIC_BOX
-from calib_ros.result import INSUFFICIENT
+from calib_ros.result import CONVERGED, INSUFFICIENT, InitialSource
 
 CAMERA = Camera(np.array([[500.0, 0, 319.5], [0, 500, 119.5], [0, 0, 1]]), 640, 240)
 PIXEL = 1 / 500
@@ -73,16 +72,12 @@ def mounted(yaw_deg: float, tilt_deg: tuple[float, float, float] = (2.0, -1.5, 1
     return T
 
 
-def off_deg(T: np.ndarray, guess: np.ndarray) -> float:
-    return se3.rotation_error_deg(T, guess)
-
-
 @pytest.mark.parametrize(("yaw_deg", "roll_deg"), [(0.0, 1.0), (75.0, 1.0), (-170.0, 1.0), (0.0, 88.0)])
 def test_bends_tell_the_rotation_of_a_camera_of_any_yaw(yaw_deg: float, roll_deg: float) -> None:
     """Also of one on its side."""
     T, run = mounted(yaw_deg, (2.0, -1.5, roll_deg)), run_of(winding())
     guess = guess_from_tracks(tracks_of(run, T), [run])
-    assert off_deg(T, guess.hypotheses[0]) < 0.5
+    assert se3.rotation_error_deg(T, guess.hypotheses[0]) < 0.5
     assert len(guess.hypotheses) == 1
     assert len(guess.hidden) == 0
     assert guess.box.rotation_deg == (LEAST_DEG,) * 3
@@ -99,7 +94,7 @@ def test_driving_straight_hides_the_turn_about_the_direction_of_travel(yaw_deg: 
     assert len(guess.hidden) == 1
     assert abs(guess.hidden[0] @ travel) > 0.99
     assert np.rad2deg(np.arccos(np.clip(guess.hypotheses[0][:3, 0] @ travel, -1, 1))) < 0.3
-    assert off_deg(T, guess.hypotheses[0]) < 4
+    assert se3.rotation_error_deg(T, guess.hypotheses[0]) < 4
     assert "direction of travel" in guess.note
     assert 2 < np.rad2deg(np.sqrt(np.linalg.eigvalsh(guess.covariance)[-1])) < 10
 
@@ -131,7 +126,7 @@ def test_the_offset_of_the_clocks_where_turning_varies(late_s: float) -> None:
     assert guess.time_offset_s is not None
     assert guess.time_sigma_s is not None
     assert abs(guess.time_offset_s - late_s) < 0.02
-    assert off_deg(T, guess.hypotheses[0]) < 0.5
+    assert se3.rotation_error_deg(T, guess.hypotheses[0]) < 0.5
 
 
 def test_a_steady_speed_tells_nothing_of_the_clocks() -> None:
@@ -163,7 +158,7 @@ def test_a_third_of_wrong_tracks_does_not_matter() -> None:
     second, wrong = tracks.second.copy(), np.flatnonzero(rng.random(len(tracks)) < 0.33)
     second[wrong] += 0.05 * rng.normal(size=(len(wrong), 3))
     second /= np.linalg.norm(second, axis=1)[:, None]
-    assert off_deg(T, guess_from_tracks(replace(tracks, second=second), [run]).hypotheses[0]) < 0.5
+    assert se3.rotation_error_deg(T, guess_from_tracks(replace(tracks, second=second), [run]).hypotheses[0]) < 0.5
 
 
 def frame_at(seconds: float, twist: np.ndarray | None, delay_s: float = 0.0) -> Frame:
@@ -192,5 +187,27 @@ def test_the_calibrator_says_what_motion_lacks() -> None:
     result = Calibrator(CAMERA, QUICK).calibrate(frames, "motion")
     assert result.status == INSUFFICIENT
     np.testing.assert_array_equal(result.T_camera_lidar, nominal())
-    with pytest.raises(BadInputError, match="motion"):
-        Calibrator(CAMERA, QUICK).calibrate(frames, "movement")
+
+
+def test_auto_falls_back_on_the_nominal_extrinsic() -> None:
+    """Of a vehicle that stops for every frame, without classes."""
+    drive = RenderedDrive(seed=1, **SIZE)
+    frames = [drive[k] for k in range(2)]
+    result = Calibrator(frames[0].camera, QUICK).calibrate(frames, "auto")
+    assert result.status == CONVERGED
+    assert result.origin is InitialSource.NOMINAL
+    assert "not by motion" in result.reason
+
+
+def test_a_drive_is_calibrated_from_its_motion() -> None:
+    """A camera that looks backward, registered from every fourth frame."""
+    T = se3.perturb(nominal(180.0), np.array([2.0, -1.5, 1.0]), np.zeros(3))
+    T[:3, 3] = -T[:3, :3] @ [-0.3, 0.1, -0.1]
+    drive = RenderedDrive(seed=6, frames=11, rings=32, width=448, height=168, stride=3, T_camera_lidar=T)
+    frames = [drive[k] for k in range(len(drive))]
+    result = Calibrator(frames[0].camera, QUICK).calibrate(frames[::4], "motion", consecutive=frames)
+    assert result.initial is not None
+    assert se3.rotation_error_deg(T, result.initial) < 4
+    assert result.status == CONVERGED
+    assert result.origin is InitialSource.MOTION
+    assert se3.rotation_error_deg(T, result.T_camera_lidar) < 0.5

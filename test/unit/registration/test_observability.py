@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ConstraintsConfig
+from calib_ros.config import Config, ConstraintsConfig, RefineConfig
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.calibrator import Calibrator
@@ -30,39 +28,29 @@ def diagonal(deg: list[float], m: list[float]) -> np.ndarray:
 # --- names ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("axis", "words"),
-    [
-        (0, "pitch (0.40 deg)"),
-        (1, "yaw (0.40 deg)"),
-        (2, "roll (0.40 deg)"),
-        (3, "sideways shift (8 cm)"),
-        (4, "vertical shift (8 cm)"),
-        (5, "forward shift (8 cm)"),
-    ],
-)
-def test_every_axis_has_its_name(axis, words):
-    sigma = np.concatenate([np.full(3, 0.2 * DEG), np.full(3, 0.04)])
-    sigma[axis] *= 2
-    assert list(map(str, unobservable_directions(np.diag(sigma**2), 0.25, 0.05))) == [words]
-    # Just known well enough, and just not.
-    limit = 0.25 if axis < 3 else 0.05
-    sigma[axis] = (DEG if axis < 3 else 1.0) * limit * 0.99
-    assert list(map(str, unobservable_directions(np.diag(sigma**2), 0.25, 0.05))) == []
-    sigma[axis] *= 1.02
-    assert len(unobservable_directions(np.diag(sigma**2), 0.25, 0.05)) == 1
+def names(C: np.ndarray) -> list[str]:
+    return list(map(str, unobservable_directions(C, 0.25, 0.05)))
+
+
+def test_every_axis_has_its_name():
+    words = [f"{name} (0.40 deg)" for name in ("pitch", "yaw", "roll")]
+    words += [f"{name} shift (8 cm)" for name in ("sideways", "vertical", "forward")]
+    for axis, limit in enumerate([0.25 * DEG] * 3 + [0.05] * 3):
+        sigma = np.repeat([0.2 * DEG, 0.04], 3)
+        sigma[axis] *= 2
+        assert names(np.diag(sigma**2)) == [words[axis]]
+        # Just known well enough, and just not.
+        sigma[axis] = limit * 0.99
+        assert names(np.diag(sigma**2)) == []
+        sigma[axis] *= 1.02
+        assert len(names(np.diag(sigma**2))) == 1
 
 
 def test_weakest_direction_comes_first_and_unobservable_ones_have_no_sigma():
     C = diagonal([0.1, 40, 0.5], [0.15, 0.001, 5])
     # In units of the limits: 160, 100, 3 and 2 times.
-    assert list(map(str, unobservable_directions(C, 0.25, 0.05))) == [
-        "yaw (unknown)",
-        "forward shift (unknown)",
-        "sideways shift (15 cm)",
-        "roll (0.50 deg)",
-    ]
-    assert list(map(str, unobservable_directions(np.zeros((6, 6)), 0.25, 0.05))) == []
+    assert names(C) == ["yaw (unknown)", "forward shift (unknown)", "sideways shift (15 cm)", "roll (0.50 deg)"]
+    assert names(np.zeros((6, 6))) == []
 
 
 def test_correlated_axes_are_named_together():
@@ -70,12 +58,8 @@ def test_correlated_axes_are_named_together():
     together = np.zeros(6)
     together[[0, 4]] = DEG, -10 * DEG
     C = diagonal([0.02] * 3, [0.004] * 3) + np.outer(together, together)
-    assert list(map(str, unobservable_directions(C, 0.25, 0.05))) == ["pitch (1.00 deg) with vertical shift (17 cm)"]
-    # The same variances apart are two directions.
-    assert list(map(str, unobservable_directions(np.diag(np.diag(C)), 0.25, 0.05))) == [
-        "pitch (1.00 deg)",
-        "vertical shift (17 cm)",
-    ]
+    assert names(C) == ["pitch (1.00 deg) with vertical shift (17 cm)"]
+    assert names(np.diag(np.diag(C))) == ["pitch (1.00 deg)", "vertical shift (17 cm)"]  # the same variances apart
 
 
 # --- fusion ---------------------------------------------------------------------------------------------------------------
@@ -161,10 +145,8 @@ START = se3.exp(np.array([0.3 * DEG, 0.5 * DEG, 0.2 * DEG, 0.05, 0.03, 0.1])) @ 
 
 def calibrator(constraints: ConstraintsConfig | None = None) -> Calibrator:
     """Level lines stand out less than is asked of a whole scene; the directions are what counts here."""
-    config = Config(constraints=constraints or ConstraintsConfig())
-    return Calibrator(
-        CAMERA, replace(config, refine=replace(config.refine, max_p_value=1.0, tolerance_deg=180.0, tolerance_m=100.0))
-    )
+    accepting = RefineConfig(max_p_value=1.0, tolerance_deg=180.0, tolerance_m=100.0)
+    return Calibrator(CAMERA, Config(constraints=constraints or ConstraintsConfig(), refine=accepting))
 
 
 def twist(T: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

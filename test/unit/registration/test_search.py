@@ -1,8 +1,11 @@
-"""The global search: number of rounds, reported counts, limits of the box."""
+"""The global search: rounds, reported counts, limits of the box, threads; and what speaks for its optimum."""
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,14 +16,18 @@ from calib_ros import se3
 from calib_ros.config import Config, ScoreConfig, SearchConfig, update
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import ConfigError
-from calib_ros.registration.acceptance.significance import null_distribution
+from calib_ros.registration.acceptance.significance import check_uncertainty, null_distribution, p_value
+from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.progress import Progress
+from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import FastScore
-from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.search.optimizers import levenberg_marquardt
+from calib_ros.registration.search.parallel import Workers, cpu_time
 from calib_ros.registration.search.search import AGREEMENT, FRUITLESS_ROUNDS, SearchResult, search
 
 SMALL = SearchConfig(starts=32, rounds=8)
+RANKED, LARGE = SearchConfig(starts=1024, rounds=2), SearchBox(6, 0.4)  # so large that starts are ranked first
 ACCEPTED = 0.01  # largest p value
 
 
@@ -36,12 +43,13 @@ def found(
     by: tuple[list[float], list[float]],
     box: SearchBox,
     config: SearchConfig = SMALL,
-    frames: tuple[int, ...] = (0, 1),
     max_p_value: float = ACCEPTED,
+    progress: Progress = SILENT,
+    observer: Watcher | None = None,
 ) -> SearchResult:
     start = scene.off(by)
-    score = FastScore([scene.features[k] for k in frames], start, ScoreConfig(), 0.9)
-    return search(score, start, box, config, unlimited(start), max_p_value)
+    score = FastScore(scene.features[:2], start, ScoreConfig(), 0.9, observer=observer)
+    return search(score, start, box, config, unlimited(start), max_p_value, progress=progress)
 
 
 def test_starts_that_agree_end_the_search_and_are_counted(scene, monkeypatch, few_followed):
@@ -123,11 +131,6 @@ def test_search_without_a_match_ends_after_its_rounds(scene):
 # --- the box --------------------------------------------------------------------------------------------------------------
 
 
-def test_box_widths_may_differ_per_axis(scene):
-    start = scene.off(([0.5, -5, 0.5], [0.05, 0, -0.3]))
-    scene.assert_found(scene.calibrator.estimate(scene.features, start, SearchBox((1.0, 7.0, 1.0), (0.1, 0.1, 0.4))))
-
-
 @pytest.mark.parametrize(
     "values", [(-1, 0.1), (5, 3.1), ((1.0, 2.0), 0.1), ((1.0, 46.0, 1.0), 0.1), (1.0, (0.1, float("nan"), 0.1)), ("wide", 0.1)]
 )
@@ -161,3 +164,132 @@ def test_a_wide_box_among_near_shelves_is_searched_closer_by_where_starts_disagr
     assert se3.rotation_error_deg(result.T_camera_lidar, drive.reference) < 0.2
     assert se3.translation_error_m(result.T_camera_lidar, drive.reference) < 0.02
     assert result.starts[0] >= 3
+
+
+# --- threads --------------------------------------------------------------------------------------------------------------
+
+
+class Ended(Exception):
+    """What a callback raises."""
+
+
+class Watcher:
+    """An observer that notes its calls and where they come from."""
+
+    def __init__(self) -> None:
+        self.calls: list[int] = []
+        self.threads: set[str] = set()
+
+    def evaluated(self, count: int) -> None:
+        self.calls.append(count)
+        self.threads.add(threading.current_thread().name)
+
+    def linearised(self) -> None:
+        self.evaluated(0)
+
+
+def on_threads(scene: Scene, threads: int, **options: Any) -> tuple[object, ...]:
+    """The bits of a search on so many threads."""
+    result = found(scene, FAR, LARGE, replace(RANKED, threads=threads), **options)
+    nearby = tuple(T.tobytes() for T in result.nearby)
+    return result.T.tobytes(), result.agreed, result.optimised, result.rounds, result.decoy_z, nearby
+
+
+def pool_threads() -> list[str]:
+    return [t.name for t in threading.enumerate() if t.name.startswith("calib_search")]
+
+
+def test_any_number_of_threads_finds_the_same_to_the_last_bit(scene):
+    reports: dict[int, list[float]] = {}
+    results = {}
+    for threads in (1, 2, 5):
+        own = reports.setdefault(threads, [])
+        results[threads] = on_threads(
+            scene, threads, progress=Progress(lambda stage, share, own=own: own.append(share)), max_p_value=0.0
+        )
+    assert results[1][3] == 2
+    assert results[1] == results[2] == results[5]
+    assert reports[1] == reports[2] == reports[5]
+    assert np.diff(reports[1]).min() > -1e-9
+
+
+@pytest.mark.parametrize(("threads", "after"), [(1, 0.2), (2, 0.0), (2, 0.4)])
+def test_a_callback_that_raises_ends_the_search(scene, threads, after):
+    shares: list[float] = []
+
+    def callback(stage: str, share: float) -> None:
+        shares.append(share)
+        if share >= after:
+            raise Ended
+
+    with pytest.raises(Ended):
+        on_threads(scene, threads, progress=Progress(callback))
+    assert all(share < after for share in shares[:-1])
+    assert not pool_threads()
+    calls = len(shares)
+    assert on_threads(scene, threads) == on_threads(scene, 1)  # nothing of it is left
+    assert len(shares) == calls
+
+
+def test_an_observer_is_told_in_order_by_one_thread(scene):
+    one, two = Watcher(), Watcher()
+    assert on_threads(scene, 1, observer=one) == on_threads(scene, 2, observer=two)
+    assert one.calls == two.calls
+    assert len(one.calls) > 100
+    assert two.threads == {threading.current_thread().name}
+
+
+def test_the_cpu_time_of_the_pool_is_that_of_its_owner():
+    def busy(seconds: float) -> None:
+        began = time.thread_time()
+        while time.thread_time() - began < seconds:
+            pass
+
+    for threads in (1, 2):
+        before, own = cpu_time(), time.thread_time()
+        with Workers(threads) as workers:
+            list(workers.map(busy, [0.02, 0.03]))
+        counted, own = cpu_time() - before, time.thread_time() - own
+        assert counted >= 0.05
+        assert counted - own == pytest.approx(0.0 if threads == 1 else 0.05, abs=0.02)
+
+
+# --- evidence -------------------------------------------------------------------------------------------------------------
+
+
+def test_p_value_compares_two_maxima_of_chance():
+    assert p_value(5.0, 5.0) == pytest.approx(0.5)
+    assert p_value(8.0, 5.0) < 0.01 < p_value(7.0, 5.0)
+    # The best of ten rounds is as much higher as ten times the chance.
+    assert p_value(8.0, 5.0, 10) == pytest.approx(10 * p_value(8.0, 5.0), rel=0.1)
+    assert p_value(float("inf"), 5.0) > 0
+    # Without a decoy, the highest that was ever seen counts.
+    assert p_value(10.0, None) > p_value(10.0, 5.0)
+    assert p_value(10.0, None) < 0.01
+
+
+def test_halves_of_a_right_extrinsic_agree_and_halves_that_pull_apart_do_not(scene):
+    T = scene.calibrator.estimate(scene.features, scene.truth).T_camera_lidar
+    score = FastScore(scene.features, T, ScoreConfig())
+    right = disagreement(score, T, unlimited(T))
+    assert 0 < right < 2
+    # One side of the scan turned by half a degree: the optimum lies between the two.
+    bent = score.select(np.arange(score.points.shape[1]))
+    side = (T[:3, :3] @ bent.points + T[:3, 3:])[0] > 0
+    turn = se3.rotation_from_euler(np.deg2rad(0.5), 0, 0).astype(np.float32)
+    bent.points[:, side] = turn @ bent.points[:, side]
+    between = levenberg_marquardt(bent.at(-1), T)[0]
+    apart = disagreement(bent, between, unlimited(T))
+    assert apart > 1.5  # the covariance is inflated
+    assert apart > 5 * right
+    assert disagreement(score, T, Limits(T, np.zeros(6))) == 1.0
+
+
+@pytest.mark.parametrize(("sigma_deg", "sigma_m", "known"), [(0.1, 0.02, True), (0.2, 0.02, False), (0.1, 0.04, False)])
+def test_an_accuracy_is_asked_of_rotation_and_shift(sigma_deg, sigma_m, known):
+    """0.5 deg and 10 cm with 90 %, over three axes each."""
+    C = np.diag([np.deg2rad(sigma_deg)] * 3 + [sigma_m] * 3) ** 2
+    refusal = check_uncertainty(C, 0.5, 0.1)
+    assert (refusal is None) == known
+    if refusal is not None:
+        assert "add frames of other scenes" in str(refusal)

@@ -1,4 +1,4 @@
-"""Semantic consistency: where the search begins, and which p value is accepted."""
+"""Classes: where the search begins, which p value is accepted, and weights of edges and of frames."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig, update
 from calib_ros.frame import UNLABELLED
+from calib_ros.frame import SemanticClass as C
 from calib_ros.registration.acceptance.significance import RATIO_CONSISTENT, RATIO_INCONSISTENT, semantic_likelihood_ratio
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import consistency_score
+from calib_ros.registration.classes import FrameSemantics, consistency_score, edge_weights
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
 from calib_ros.result import CONVERGED, REFUSED, Evidence, RefusalCode, Result
 from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights, importance
 
 QUICK = Config(search=SearchConfig(rounds=2, starts=256, rotation_deg=2, translation_m=0.15))
 SOURCE = update(QUICK, {"semantics": {"image_classes": "source", "cloud_classes": "source"}})
-OFF = (np.array([0.02, 0.2, -0.03]), np.array([0.1, -0.2, 0.1]))  # rad, m: 11 deg to the side
+OFF = np.array([0.02, 0.2, -0.03, 0.1, -0.2, 0.1])  # rad, m: 11 deg to the side
 
 
 @pytest.fixture(scope="module")
@@ -38,17 +40,11 @@ def features(source):
     return [calibrator.extract(f, calibrator.segmentation(f)) for f in (source[0], source[1])]
 
 
-def wrong(T: np.ndarray) -> np.ndarray:
-    return se3.exp(np.concatenate(OFF)) @ T
-
-
 def test_semantic_consistency_is_highest_at_the_truth(source, features):
+    """Without common classes nothing is said about it."""
     consistency = consistency_score([f.view for f in features])
     assert semantic_likelihood_ratio(consistency, source.reference) == RATIO_CONSISTENT
-    assert semantic_likelihood_ratio(consistency, wrong(source.reference)) == RATIO_INCONSISTENT
-
-
-def test_without_common_classes_nothing_is_said_about_consistency(source, features):
+    assert semantic_likelihood_ratio(consistency, se3.exp(OFF) @ source.reference) == RATIO_INCONSISTENT
     assert consistency_score([]) is None
     blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
     assert consistency_score([blank]) is None
@@ -82,10 +78,6 @@ def test_the_classes_decide_where_the_edges_leave_a_doubt(source, features):
     assert verdict(mixed, at, 10)[0] == "converged"
 
 
-def se3_errors(source, transforms: np.ndarray) -> list[float]:
-    return [se3.rotation_error_deg(source.reference, T) for T in transforms]
-
-
 def test_the_search_is_seeded_by_classes_too(source, features):
     """Starts of a strategy of their own meet the classes better than those that meet the edges best."""
     T = se3.perturb(source.reference, [3, -3, 3], [0.2, -0.2, 0.2])
@@ -99,20 +91,16 @@ def test_the_search_is_seeded_by_classes_too(source, features):
     anywhere = se3.exp_many(np.random.default_rng(0).uniform(-1, 1, (500, 6)) * space.half) @ T
     seeded, by_chance = (consistency.values(some, GUIDE_LEVEL) for some in (starts, anywhere))
     assert seeded.min() > np.percentile(by_chance, 90)
-    assert np.median(se3_errors(source, starts)) < 0.7 * np.median(se3_errors(source, anywhere))
+    near, far = ([se3.rotation_error_deg(source.reference, T) for T in some] for some in (starts, anywhere))
+    assert np.median(near) < 0.7 * np.median(far)
 
     optimised = []
     for guide in (None, consistency):
-        found = search(score, T, SearchBox(8, 0.5, 1), SOURCE.search, unlimited(T), 1.8, guide=guide)
+        found, again = (search(score, T, SearchBox(8, 0.5, 1), SOURCE.search, unlimited(T), 1.8, guide=guide) for _ in range(2))
+        assert np.array_equal(found.T, again.T)
         assert se3.rotation_error_deg(source.reference, found.T) < 0.5
         optimised.append(found.optimised)
     assert optimised[1] == optimised[0] * (len(SEED_LEVELS) + 1) / len(SEED_LEVELS)
-
-
-def test_a_guided_search_is_repeatable(source, features):
-    T = se3.perturb(source.reference, [1, -1, 1], [0.1, 0.1, -0.1])
-    ends = [Calibrator(features[0].camera, SOURCE).estimate(features, T, SearchBox(2, 0.15, 1)) for _ in range(2)]
-    np.testing.assert_array_equal(ends[0].T_camera_lidar, ends[1].T_camera_lidar)
 
 
 @pytest.mark.parametrize(
@@ -140,3 +128,49 @@ def test_what_edges_alone_are_sure_of_is_not_refused_there_for_want_of_evidence(
     assert found.converged == (stays or refusal is None)
     assert (found.evidence is sure.evidence) == stays
     assert (found.reason == "with classes") == stays
+
+
+# --- weights --------------------------------------------------------------------------------------------------------------
+
+
+def test_edges_of_vegetation_and_the_ground_weigh_half() -> None:
+    label = np.array([*C, UNLABELLED], np.uint8)
+    weights = edge_weights(label)
+    assert weights.dtype == np.float32
+    np.testing.assert_allclose(weights, [0.5 if c in (C.VEGETATION, C.GROUND) else 1 for c in label.tolist()])
+    assert edge_weights(np.zeros(0, np.uint8)).shape == (0,)
+
+
+def test_frame_weights_grow_with_the_share_of_main_classes_and_have_mean_one() -> None:
+    classes = np.full((10, 10), C.GROUND, np.uint8)
+    assert importance(classes) == 0
+    classes[0, :5] = [C.VEHICLE, C.PERSON, C.CYCLIST, C.POLE, C.SIGN]
+    assert importance(classes) == pytest.approx(0.05)
+    classes[5:] = UNLABELLED
+    assert importance(classes) == pytest.approx(0.1)
+    assert importance(np.full((4, 4), UNLABELLED, np.uint8)) is None
+    weights = frame_weights([0.0, 0.1, 0.35])
+    assert weights.mean() == pytest.approx(1)
+    assert weights[1] / weights[0] == pytest.approx((0.1 + FEW_FRAMES_SHARE) / FEW_FRAMES_SHARE)
+    assert weights[2] / weights[1] == pytest.approx((0.35 + FEW_FRAMES_SHARE) / (0.1 + FEW_FRAMES_SHARE))
+
+
+def test_a_frame_of_unknown_classes_weighs_as_much_as_others_on_average() -> None:
+    weights = frame_weights([0.0, None, 0.2])
+    assert weights[1] == 1
+    assert weights[0] + weights[2] == pytest.approx(2)
+    assert frame_weights([None, None]).tolist() == [1, 1]
+    assert frame_weights([0.0, 0.0]).tolist() == [1, 1]
+    assert frame_weights([]).shape == (0,)
+
+
+def test_weights_of_edges_change_their_strength_alone() -> None:
+    frame = SyntheticDrive(seed=3, frames=1, rings=32, width=640, height=192, speed=0)[0]
+    made = Calibrator(frame.camera).extract(frame, FrameSemantics(None, None, frame.cloud.label))
+    assert made.plain is not None
+    before, after = made.plain.points, made.points
+    assert after.label is not None
+    assert np.array_equal(after.xyz, before.xyz)
+    np.testing.assert_allclose(after.strength, before.strength * edge_weights(after.label), rtol=1e-6)
+    assert len(np.unique(edge_weights(after.label))) == 2
+    assert made.levels is made.plain.levels

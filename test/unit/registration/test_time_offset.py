@@ -1,4 +1,5 @@
-"""The clocks' offset as the seventh unknown: found where motions differ, with the right extrinsic, and not made up elsewhere."""
+"""The clocks' offset as the seventh unknown: found where motions differ, with the right extrinsic, refused where it is fixed, and
+not made up elsewhere."""
 
 from __future__ import annotations
 
@@ -6,24 +7,34 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import QUICK, Scene, driven
+from scenes import QUICK, Scene, assert_not_used, driven
 
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.acceptance.checks import Acceptance
+from calib_ros.registration.acceptance.refusal import Refusal
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import FeatureExtractor, at_time_offset
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, at_time_offset
 from calib_ros.registration.joint import Optimised
-from calib_ros.registration.nuisance.parameters import Effect
-from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset, linearise
+from calib_ros.registration.nuisance.parameters import Effect, estimate_parameters, wrong_parameter
+from calib_ros.registration.nuisance.time_offset import ClockOffset, TimeOffset, estimate_time_offset, linearise
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
-from calib_ros.result import RefusalCode
+from calib_ros.result import RefusalCode, Result
 
 BOX = SearchBox(1.5, 0.15)
-DIFFERENT = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 8.0), (0.25, 4.0), (-0.25, 6.0), (0.0, 0.0))]
-ALIKE = [np.array([0, 0, 0, 8.0, 0, 0])] * 4
+STRAIGHT = np.array([0, 0, 0, 8.0, 0, 0])  # 8 m/s along the LiDAR's x axis
+ALIKE = [STRAIGHT] * 4
+FIXED = {"motion": {"time_offset": "fixed"}}
+
+
+def velocities(*turns_and_speeds: tuple[float, float]) -> list[np.ndarray]:
+    return [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in turns_and_speeds]
+
+
+DIFFERENT = velocities((0.0, 8.0), (0.25, 4.0), (-0.25, 6.0), (0.0, 0.0))
+FAST = velocities((0.0, 25.0), (0.6, 8.0), (-0.6, 12.0), (0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +42,17 @@ def scene() -> Scene:
     return Scene(seed=3, rings=32)
 
 
-FAST = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 25.0), (0.6, 8.0), (-0.6, 12.0), (0.0, 0.0))]
+@pytest.fixture(scope="module")
+def dense() -> Scene:
+    return Scene(seed=3)
+
+
+def estimated(scene: Scene, twists: list[np.ndarray], late_s: float = 0.0, box: SearchBox | None = BOX, **options) -> Result:
+    calibrator = Calibrator(scene.camera, update(QUICK, options))
+    return calibrator.estimate(driven(scene, twists, late_s), scene.truth, box)
+
+
+# --- estimated ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -45,7 +66,7 @@ FAST = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 25.0), (0.
     ],
 )
 def test_an_offset_is_found_with_the_extrinsic(scene, late_s, twists, box):
-    result = scene.quick.estimate(driven(scene, twists, late_s), scene.truth, box)
+    result = estimated(scene, twists, late_s, box)
     scene.assert_found(result)
     assert result.time_offset_s == pytest.approx(late_s, abs=0.003)
     assert abs(result.time_offset_s - late_s) < 2 * max(result.time_offset_sigma_s, 0.001)
@@ -53,32 +74,31 @@ def test_an_offset_is_found_with_the_extrinsic(scene, late_s, twists, box):
 
 
 def test_clocks_that_agree_stay_as_they_are(scene):
-    features = driven(scene, DIFFERENT)
-    result = scene.quick.estimate(features, scene.truth, BOX)
-    fixed = Calibrator(scene.camera, update(QUICK, {"motion": {"time_offset": "fixed"}})).estimate(features, scene.truth, BOX)
+    result, fixed = estimated(scene, DIFFERENT), estimated(scene, DIFFERENT, **FIXED)
     assert result.time_offset_s == 0.0
     assert 0 < result.time_offset_sigma_s < 0.005
     assert np.array_equal(result.T_camera_lidar, fixed.T_camera_lidar)
     assert fixed.time_offset_s is None
 
 
-def test_the_offset_counts_from_the_configured_one(scene):
-    known = Calibrator(scene.camera, update(QUICK, {"motion": {"time_offset_s": 0.2}}))
-    result = known.estimate(driven(scene, DIFFERENT, 0.06), scene.truth, BOX)
+def test_the_offset_counts_from_the_configured_one_and_must_be_one_that_an_option_can_hold(scene):
+    result = estimated(scene, DIFFERENT, 0.06, motion={"time_offset_s": 0.2})
     assert result.time_offset_s == pytest.approx(0.26, abs=0.003)
+    assert estimated(scene, DIFFERENT, 0.06, motion={"time_offset_s": 0.48}).refusal is RefusalCode.WRONG_TIMES
 
 
 @pytest.mark.parametrize("twists", [ALIKE, [np.zeros(6)] * 4], ids=["constant motion", "standing still"])
 def test_what_cannot_be_observed_is_not_told(scene, twists):
-    result = scene.quick.estimate(driven(scene, twists), scene.truth, BOX)
+    result = estimated(scene, twists)
     scene.assert_found(result)
     assert result.time_offset_s is None
     assert result.time_offset_sigma_s is None
 
 
-def test_two_frames_are_too_few(scene):
-    result = scene.quick.estimate(driven(scene, DIFFERENT, 0.06)[:2], scene.truth, BOX)
-    assert result.time_offset_s is None
+def test_two_frames_are_too_few_and_motion_is_needed(scene):
+    assert scene.quick.estimate(driven(scene, DIFFERENT, 0.06)[:2], scene.truth, BOX).time_offset_s is None
+    score, free = FastScore(list(scene.features), scene.truth, QUICK.score), unlimited(scene.truth)
+    assert estimate_time_offset(score, scene.truth, free, None, np.zeros((4, 6)), QUICK.motion, search=True) is None
 
 
 def test_the_derivative_is_that_of_the_score(scene):
@@ -95,12 +115,6 @@ def test_the_derivative_is_that_of_the_score(scene):
     assert alike[6] == pytest.approx(gradient[:6] @ se3.adjoint(T) @ ALIKE[0], rel=1e-4)
 
 
-def test_without_motion_nothing_is_estimated(scene):
-    score = FastScore(list(scene.features), scene.truth, QUICK.score)
-    twists = np.zeros((4, 6))
-    assert estimate_time_offset(score, scene.truth, unlimited(scene.truth), None, twists, QUICK.motion, search=True) is None
-
-
 def test_features_at_an_offset_are_those_of_that_configuration(scene):
     frame = replace(scene.frames[0], cloud_stamp=scene.frames[0].stamp, twist=np.array([0.01, -0.02, 0.3, 8.0, 0.5, 0.1]))
     shifted = FeatureExtractor(scene.camera, update(Config(), {"motion": {"time_offset_s": 0.05}}))(frame)
@@ -112,14 +126,8 @@ def test_features_at_an_offset_are_those_of_that_configuration(scene):
 
 
 def test_an_offset_that_cannot_be_reached_is_never_accepted_wrong(scene):
-    result = scene.quick.estimate(driven(scene, DIFFERENT, 0.6), scene.truth, BOX)
+    result = estimated(scene, DIFFERENT, 0.6)
     assert not result.converged or scene.is_near(result.T_camera_lidar, 0.3, 0.05)  # as the frame at rest has it
-
-
-def test_an_offset_that_no_option_can_hold_is_refused(scene):
-    far = Calibrator(scene.camera, update(QUICK, {"motion": {"time_offset_s": 0.48}}))
-    result = far.estimate(driven(scene, DIFFERENT, 0.06), scene.truth, BOX)
-    assert result.refusal is RefusalCode.WRONG_TIMES
 
 
 @pytest.mark.parametrize(
@@ -129,7 +137,89 @@ def test_an_extrinsic_at_clocks_that_nobody_is_told_of_is_refused(scene, applied
     """The features were moved by an offset that the frames do not show well enough to report it, or that no option can hold."""
     effect = Effect(np.zeros(6), 1 / sigma_s**2)
     offset = TimeOffset(applied_s, scene.truth, sigma_s, 1.0, effect, 0.3, 1.0, 0.1)
-    found = Optimised([], None, scene.truth, None, offset, applied_s)
-    wrong = Acceptance(Config(), 640, None)._check_offset(found)
+    wrong = Acceptance(Config(), 640, None)._check_offset(Optimised([], None, scene.truth, None, offset, applied_s))
     assert (wrong is not None) == refused
-    assert wrong is None or wrong.seconds == applied_s
+    assert wrong is None or wrong.figures["seconds"] == applied_s
+
+
+# --- taken for granted ----------------------------------------------------------------------------------------------------
+
+
+def optimum(scene: Scene, features: list[FrameFeatures]) -> tuple[FastScore, np.ndarray]:
+    T = scene.quick.estimate(features, scene.truth).T_camera_lidar
+    return FastScore(list(features), T, QUICK.score), T
+
+
+def wrong(twists: list[np.ndarray], score: FastScore, T: np.ndarray) -> Refusal | None:
+    clocks = ClockOffset(0.003, np.array(twists))
+    return wrong_parameter(estimate_parameters([clocks], score, T, unlimited(T), search=True), 0.5, 0.1)
+
+
+def along(scene: Scene, covariance: np.ndarray) -> float:
+    """Standard deviation along the direction of travel, m."""
+    forward = scene.truth[:3, :3] @ STRAIGHT[3:] / np.linalg.norm(STRAIGHT[3:])
+    return float(np.sqrt(forward @ covariance[3:, 3:] @ forward))
+
+
+def test_constant_motion_moves_the_optimum_and_tells_nothing_of_the_clocks(dense):
+    score, T = optimum(dense, driven(dense, ALIKE))
+    effect = ClockOffset(0.05, np.array(ALIKE)).effect(score, T, unlimited(T))
+    assert effect.sigma(0.05) > 0.04
+    forward = T[:3, :3] @ STRAIGHT[3:]  # points ahead come nearer by the vehicle's way
+    assert np.allclose(effect.direction[3:], -forward, atol=0.3)
+    assert np.abs(effect.direction[:3]).max() < np.deg2rad(1.0)
+    assert np.sqrt(effect.covariance(0.05).trace()) > 0.3
+
+
+def test_different_motions_tell_of_the_clocks(dense):
+    score, T = optimum(dense, driven(dense, DIFFERENT))
+    effect = ClockOffset(0.05, np.array(DIFFERENT)).effect(score, T, unlimited(T))
+    assert effect.sigma(0.05) < 0.01
+    assert effect.sigma(0.0) == 0.0
+    assert wrong(DIFFERENT, score, T) is None
+    assert not ClockOffset(0.05, np.zeros((4, 6))).effect(score, T, unlimited(T)).covariance(0.05).any()  # without motion
+
+
+@pytest.mark.parametrize(("late_s", "unknown"), [(0.05, False), (-0.05, False), (0.05, True)])
+def test_clocks_that_disagree_are_refused_and_named(dense, late_s, unknown):
+    """Also beside a frame of unknown motion."""
+    features = driven(dense, DIFFERENT, late_s)
+    features[3] = replace(features[3], twist=None if unknown else features[3].twist)
+    result = Calibrator(dense.camera, update(QUICK, FIXED)).estimate(features, dense.truth, BOX)
+    assert_not_used(result, dense.truth)
+    assert result.refusal is RefusalCode.WRONG_TIMES
+    assert f"stamped {'late' if late_s > 0 else 'early'}" in result.reason
+    assert "motion.time_offset_s" in result.reason
+
+
+@pytest.mark.parametrize("late_s", [0.05, 0.1])
+def test_the_offset_is_named_rightly_at_speed(dense, late_s):
+    twists = velocities((0.0, 20.0), (0.1, 18.0), (-0.1, 19.0), (0.0, 17.0))
+    T = dense.truth @ se3.exp(twists[0] * late_s)  # where its search would end
+    refusal = wrong(twists, FastScore(list(driven(dense, twists, late_s)), T, QUICK.score, margin=1.0), T)
+    assert refusal is not None
+    assert refusal.figures["seconds"] == pytest.approx(late_s, abs=0.01)
+
+
+def test_clocks_that_cannot_be_told_are_left_to_the_covariance(dense):
+    result = estimated(dense, ALIKE, box=None)
+    assert along(dense, result.clock_covariance) > 0.35  # 50 ms at 8 m/s
+    assert along(dense, result.shared_covariance) > 0.02  # 3 ms
+    exact = {"motion": {"time_offset_sigma_s": 0.0}, "camera": {"focal_sigma": 0.0, "centre_sigma": 0.0}}
+    sharp = estimated(dense, ALIKE, box=None, **exact)
+    assert np.allclose(sharp.covariance + result.shared_covariance, result.covariance)
+    assert not sharp.shared_covariance.any()
+
+
+@pytest.mark.parametrize("speed", [2.0, 25.0])
+def test_however_fast_it_is_the_clocks_are_not_known_from_constant_motion(dense, speed):
+    result = estimated(dense, [STRAIGHT * speed / 8.0] * 4, box=None)
+    assert along(dense, result.clock_covariance) == pytest.approx(0.05 * speed, rel=0.1)
+    assert result.clock_sigma_s > 0.04
+
+
+@pytest.mark.parametrize("known", [{"sigma_m": [0.005] * 3}, {"limit_m": [0.02] * 3}])
+def test_what_is_known_in_advance_is_not_left_open(dense, known):
+    result = estimated(dense, ALIKE, box=None, constraints=known)
+    assert np.sqrt(np.diag(result.clock_covariance)[3:].max()) < 0.3  # 0.4 without
+    assert np.sqrt(np.diag(result.shared_covariance)[3:].max()) < 0.025
