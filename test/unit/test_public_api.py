@@ -39,7 +39,8 @@ def test_public_classes_and_functions_have_numpy_docstrings(name: str) -> None:
     assert any(section in doc for section in sections), f"{name} has no section of parameters, attributes or errors"
 
 
-def test_one_version_for_package_metadata_and_results() -> None:
+def test_one_version_for_package_metadata_and_results_and_types_are_declared() -> None:
+    assert all((ROOT / package / "py.typed").exists() for package in ("calib_ros", "calib_ros_evaluation"))
     assert ET.parse(ROOT / "package.xml").findtext("version") == calib_ros.__version__
     assert ET.parse(ROOT / "calib_ros_msgs" / "package.xml").findtext("version") == calib_ros.__version__
     assert calib_ros.Result(calib_ros.se3.exp([0.0] * 6), "initial").to_dict()["version"] == calib_ros.__version__
@@ -49,11 +50,6 @@ def test_the_default_search_box_is_that_of_the_configuration() -> None:
     search, box = Config().search, calib_ros.SearchBox()
     assert (box.rotation_deg, box.translation_m) == (search.rotation_deg, search.translation_m)
     assert all(wide.reach > box.reach for wide in (NOMINAL_BOX, SEMANTIC_BOX))
-
-
-def test_both_packages_declare_their_types() -> None:
-    assert (ROOT / "calib_ros" / "py.typed").exists()
-    assert (ROOT / "calib_ros_evaluation" / "py.typed").exists()
 
 
 @pytest.mark.parametrize("room", ["calib_ros.cli", "calib_ros.ros"])
