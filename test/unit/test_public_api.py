@@ -1,4 +1,4 @@
-"""What `import calib_ros` gives: the names of the README, lazily, documented, and one version everywhere."""
+"""What `import calib_ros` gives: the names of the README, lazily, documented, one version everywhere; and extensions."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import os
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 from paths import ROOT
 
 import calib_ros
+from calib_ros import extensions
 from calib_ros.config import Config
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX
 
@@ -61,3 +64,16 @@ def test_programs_use_one_thread_for_linear_algebra_unless_told_otherwise(room: 
     script = f"import os, sys, {room}; print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", wanted or "1"]
+
+
+def test_a_service_whose_libraries_are_missing_is_told_and_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "needs_a_library.py").write_text("import a_library_that_nobody_has\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    group = extensions.NODE_SERVICES
+    entries = [EntryPoint("absent", "needs_a_library:Server", group), EntryPoint("there", "fractions:Fraction", group)]
+    monkeypatch.setattr(extensions, "_entries", lambda group: {entry.name: entry for entry in entries})
+    lines: list[str] = []
+    assert list(extensions.node_services(lines.append)) == ["there"]
+    (line,) = lines
+    assert "~/absent" in line
+    assert "a_library_that_nobody_has" in line
