@@ -59,15 +59,15 @@ _MODULES = {
     "SearchBox": "calib_ros.registration.search.constraints",
     "open_dataset": "calib_ros.datasets",
     "open_source": "calib_ros.datasets",
+    "se3": "calib_ros.se3",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use, so that `import calib_ros` and `calib-ros --help` do not load OpenCV and SciPy."""
-    if name == "se3":
-        return import_module("calib_ros.se3")
     if name in _MODULES:
-        return getattr(import_module(_MODULES[name]), name)
+        module = import_module(_MODULES[name])
+        return getattr(module, name, module)  # se3 is a module itself
     raise AttributeError(f"module 'calib_ros' has no attribute '{name}'")
 
 

@@ -38,19 +38,11 @@ class Camera:
 
     Parameters
     ----------
-    K : array, shape (3, 3)
-        Camera matrix, px.
-    width, height : int
-        Size of the image, px, at most 32766 each.
-    model : str
-        ``plumb_bob``, ``rational_polynomial`` or ``equidistant``; some other names of the same models are understood.
-    D : array, shape (n,)
-        Distortion coefficients in ROS order; empty or all zero = a pinhole camera.
+    K : (3, 3), px. width, height : of the image, px, at most 32766 each.
+    model : ``plumb_bob``, ``rational_polynomial`` or ``equidistant``; some other names of the same models are understood.
+    D : (n,) distortion coefficients in ROS order; empty or all zero = a pinhole camera.
 
-    Raises
-    ------
-    BadInputError
-        K is no camera matrix, the size is out of range, or D does not fit the model.
+    Raises BadInputError if K is no camera matrix, the size is out of range, or D does not fit the model.
     """
 
     K: NDArray[np.float64]
@@ -140,10 +132,7 @@ class Camera:
         return uv, inside
 
     def _lens_pixels(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels (n, 2) of rays (n, 3) of any direction through a lens with distortion; NaN outside its field.
-
-        A fisheye also sees what is behind the image plane, which `project` and OpenCV leave out.
-        """
+        """As `project`, pixels (n, 2) of rays (n, 3), also of those behind the image plane that a fisheye sees."""
         if self.model != "equidistant" or self.is_pinhole:
             return self.project(rays)[0]
         x, y, z = rays.T
@@ -173,10 +162,8 @@ class Camera:
     @cached_property
     def _field_radius(self) -> float:
         """Largest tan(angle from the axis) in the image, plus 10 %, at which the distortion does not fold back."""
-        w, h = self.width - 1, self.height - 1
-        t = np.linspace(0, 1, 33)
-        edge = np.concatenate([np.c_[t * w, 0 * t], np.c_[t * w, 0 * t + h], np.c_[0 * t, t * h], np.c_[0 * t + w, t * h]])
-        rays = self._undistort_points(edge)
+        undistort: Any = cv2.fisheye.undistortPoints if self.model == "equidistant" else cv2.undistortPoints
+        rays = np.asarray(undistort(self._border()[:, None], self.K, self.D)).reshape(-1, 2)
         radius = np.hypot(rays[:, 0], rays[:, 1])
         radius = radius[np.isfinite(radius) & (radius < 1e3)]
         return min(1.1 * float(radius.max()) if len(radius) else 20.0, self._fold_radius())
@@ -191,9 +178,11 @@ class Camera:
         grows = np.diff(lens._distort(np.c_[radius, 0 * radius, np.ones_like(radius)])[:, 0]) > 0
         return float("inf") if grows.all() else float(radius[np.argmin(grows)])
 
-    def _undistort_points(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        undistort: Any = cv2.fisheye.undistortPoints if self.model == "equidistant" else cv2.undistortPoints
-        return np.asarray(undistort(uv[:, None], self.K, self.D)).reshape(-1, 2)
+    def _border(self) -> NDArray[np.float64]:
+        """Pixels (132, 2) along the border of the image."""
+        w, h = self.width - 1, self.height - 1
+        t = np.linspace(0, 1, 33)
+        return np.concatenate([np.c_[t * w, 0 * t], np.c_[t * w, 0 * t + h], np.c_[0 * t, t * h], np.c_[0 * t + w, t * h]])
 
     def rectified(self) -> Camera:
         """The pinhole camera of the rectified image: same size, with K such that the image has no empty border."""
@@ -219,11 +208,8 @@ class Camera:
 
     def unrolled(self) -> Camera:
         """The camera of the image on a cylinder about the camera's y axis: of all that the lens sees up to 100 deg to either side
-        and 60 deg up and down.
-
-        A pinhole cannot show the whole field, and 60 deg from the axis it stretches the image four times, so that one blur is not
-        the same angle everywhere. Vertical lines stay vertical. The focal length is the lens's own.
-        """
+        and 60 deg up and down, at the lens's own focal length."""
+        # 60 deg from the axis a pinhole stretches the image four times: one blur is not the same angle everywhere.
         fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
         left, right = self._sides()
         slope = np.tan(np.linspace(-HIGHEST, HIGHEST, 241))
@@ -232,16 +218,9 @@ class Camera:
         return Camera(np.array([[fx, 0, -fx * left], [0, fy, -fy * top], [0, 0, 1]]), width, rows, CYLINDER)
 
     def _central_field(self) -> NDArray[np.float64]:
-        """K (3, 3) of the central field of a fisheye: the same principal point, and the shortest focal length, from 0.8 times
-        that of the lens, whose border is still in the image.
-
-        A pinhole cannot show the whole field. OpenCV's estimate tries to, and from about 80 deg off the axis on gives a tenth of
-        the focal length and principal points outside the image.
-        """
-        w, h = self.width - 1, self.height - 1
-        t = np.linspace(0, 1, 33)
-        edge = np.concatenate([np.c_[t * w, 0 * t], np.c_[t * w, 0 * t + h], np.c_[0 * t, t * h], np.c_[0 * t + w, t * h]])
-        focal = 0.8 * float(min(self.K[0, 0], self.K[1, 1]))
+        """K (3, 3) of a fisheye's central field: of the shortest focal length, from 0.8 times the lens's, without empty rim."""
+        # OpenCV's estimate tries the whole field: a tenth of the focal length, and principal points outside the image.
+        edge, focal = self._border(), 0.8 * float(min(self.K[0, 0], self.K[1, 1]))
         for _ in range(40):
             rays = np.c_[(edge - self.K[:2, 2]) / focal, np.ones(len(edge))]
             if self.project(rays)[1].all():
@@ -258,13 +237,8 @@ def _range_inside(values: NDArray[np.float64], pixel: NDArray[np.float64], size:
 
 
 class Rectifier:
-    """Removes lens distortion from images; look-up tables are made once, with the first image.
-
-    The registration works on rectified images, so that the projection in its inner loop is eq. 2.3 for every lens; on a cylinder
-    for the widest.
-
-    target: camera of the rectified image, a pinhole or a cylinder; None = ``camera.rectified()``.
-    """
+    """Removes lens distortion from images; look-up tables are made once, with the first image. target: camera of the rectified
+    image, a pinhole or a cylinder; None = ``camera.rectified()``."""
 
     def __init__(self, camera: Camera, target: Camera | None = None) -> None:
         self.source = camera
@@ -275,10 +249,9 @@ class Rectifier:
         lens, size = self.source, (self.source.width, self.source.height)
         if self.camera.is_cylinder:
             at = np.nan_to_num(self._pixels, nan=-1.0)
-            maps: tuple[Any, Any] = cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)
-            return maps
+            return cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)
         init: Any = cv2.fisheye.initUndistortRectifyMap if lens.model == "equidistant" else cv2.initUndistortRectifyMap
-        maps = init(lens.K, lens.D, np.eye(3), self.camera.K, size, cv2.CV_16SC2)
+        maps: tuple[Any, Any] = init(lens.K, lens.D, np.eye(3), self.camera.K, size, cv2.CV_16SC2)
         return maps
 
     @cached_property

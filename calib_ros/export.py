@@ -16,14 +16,12 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.result import Result
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +30,7 @@ class Pose:
 
     parent: str
     child: str
-    T: Matrix
+    T: Transform
 
     @staticmethod
     def of(result: Result, parent: str = "camera") -> Pose:
@@ -55,11 +53,8 @@ class Pose:
 
     @property
     def rpy(self) -> tuple[float, float, float]:
-        """Roll, pitch, yaw in rad; pitch within +-90 deg.
-
-        Yaw is taken off the matrix before roll is read from it. Read from the matrix as it is, both would be noise near gimbal
-        lock, where optical frames are: together they are exact, whatever the yaw.
-        """
+        """Roll, pitch, yaw in rad; pitch within +-90 deg."""
+        # Yaw is taken off before roll is read: near gimbal lock, where optical frames are, both would be noise otherwise.
         R = self.T[:3, :3]
         yaw = math.atan2(R[1, 0], R[0, 0])
         s, c = math.sin(yaw), math.cos(yaw)
@@ -96,24 +91,17 @@ def autoware_yaml(pose: Pose) -> str:
 
 
 def kitti_odometry(result: Result, camera: Camera | None = None) -> str:
-    """Lines of calib.txt as in KITTI odometry: `Tr`, LiDAR to rectified camera 0, and `P0` where the camera is known.
-
-    The camera is taken as camera 0 and as rectified already: P0 = K [I | 0], no rotation R0_rect. A camera with distortion has no
-    such P0, so that none is written: rectify the images and write P0 of that.
-    """
-    lines = []
-    if camera is not None and camera.is_pinhole:
-        lines.append(f"P0: {_numbers(np.c_[camera.K, np.zeros(3)].ravel())}\n")
-    lines.append(f"Tr: {_numbers(result.T_camera_lidar[:3].ravel())}\n")
-    return "".join(lines)
+    """Lines of calib.txt as in KITTI odometry: `Tr`, LiDAR to rectified camera 0, and P0 = K [I | 0] of a camera without
+    distortion, which is taken as camera 0."""
+    Tr = f"Tr: {_numbers(result.T_camera_lidar[:3].ravel())}\n"
+    if camera is None or not camera.is_pinhole:
+        return Tr
+    return f"P0: {_numbers(np.c_[camera.K, np.zeros(3)].ravel())}\n{Tr}"
 
 
 def kitti_raw(result: Result) -> str:
-    """calib_velo_to_cam.txt as in KITTI raw: `R` and `T`, LiDAR to camera 0 before rectification.
-
-    The camera is taken as camera 0 with R_rect_00 = I and P_rect_00 = K [I | 0]. Beside KITTI's own calib_cam_to_cam.txt, whose
-    R_rect_00 is none and whose other cameras stand elsewhere, these lines are wrong.
-    """
+    """calib_velo_to_cam.txt as in KITTI raw: `R` and `T`, LiDAR to a camera 0 with R_rect_00 = I and P_rect_00 = K [I | 0].
+    Beside KITTI's own calib_cam_to_cam.txt, of another R_rect_00, these lines are wrong."""
     T = result.T_camera_lidar
     return f"R: {_numbers(T[:3, :3].ravel())}\nT: {_numbers(T[:3, 3])}\n"
 
@@ -125,7 +113,7 @@ _OF_RESULT: dict[str, Callable[[Result, Camera | None], str]] = {
     "json": lambda result, _: result.dumps(),
     "yaml": lambda result, _: result.dumps(yaml_format=True),
 }
-FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
+FORMATS = (*_OF_POSE, *_OF_RESULT)
 
 
 def export(

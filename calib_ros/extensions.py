@@ -26,10 +26,8 @@ OBJECTIVES, CLASSES, STAGES = "calib_ros.objectives", "calib_ros.classes", "cali
 
 
 class Command(Protocol):
-    """A command of ``calib-ros``. Its module is imported whenever the command line starts: slow imports belong into run.
-
-    help: one line. add_arguments: its options. run: executes it and returns the exit code.
-    """
+    """A command of ``calib-ros``. Its module is imported whenever the command line starts: slow imports belong into run. help:
+    one line. add_arguments: its options. run: executes it and returns the exit code."""
 
     help: str
 

@@ -38,27 +38,15 @@ MAIN_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.CYCLI
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """A LiDAR scan in the LiDAR frame, in the order of the source.
+    """A LiDAR scan in the LiDAR frame, in the order of the source. BadInputError if the shapes do not match.
 
     Parameters
     ----------
-    xyz : array, shape (n, 3), float32
-        Points, m; NaN for no return.
-    intensity : array, shape (n,), float32, optional
-        Intensity in the source's own unit.
-    ring : array, shape (n,), int32, optional
-        Number of the laser.
-    time : array, shape (n,), float32, optional
-        Time of each point relative to the scan's stamp, s.
-    label : array, shape (n,), uint8, optional
-        `SemanticClass` of each point, ``UNLABELLED`` where unknown.
-    time_problem : str
-        For people: why the source's point times are not used; "" if they are, or if it has none.
-
-    Raises
-    ------
-    BadInputError
-        The shapes do not match.
+    xyz : (n, 3) float32, m; NaN for no return.
+    intensity : (n,) float32, in the source's own unit. ring : (n,) int32, number of the laser.
+    time : (n,) float32, s after the scan's stamp.
+    label : (n,) uint8, `SemanticClass` of each point, ``UNLABELLED`` where unknown.
+    time_problem : for people, why the source's point times are not used; "" if they are, or if it has none.
     """
 
     xyz: NDArray[np.float32]
@@ -107,31 +95,18 @@ class Frame:
 
     Parameters
     ----------
-    image : array, shape (H, W, 3) or (H, W), uint8
-        BGR or grey image as recorded (distorted if the camera is).
-    cloud : PointCloud
-        The scan.
-    camera : Camera
-        Intrinsics of this image.
-    stamp : int
-        Time of the image, ns.
-    cloud_stamp : int, optional
-        Time of the cloud, ns; by default that of the image.
-    reference : array, shape (4, 4), optional
-        T_camera_lidar, if the source knows it.
-    name : str
-        Name of the frame in its source.
-    twist : array, shape (6,), optional
-        Velocity of the LiDAR (rx, ry, rz, tx, ty, tz), rad/s and m/s, in its own frame at the cloud's stamp; None = unknown.
-    compensated : bool
-        The points are already motion-compensated to the cloud's stamp.
-    classes : array, shape (H, W), uint8, optional
-        `SemanticClass` of each pixel, ``UNLABELLED`` where unknown, if the source knows them.
+    image : (H, W, 3) BGR or (H, W) grey uint8, as recorded (distorted if the camera is).
+    camera : intrinsics of this image.
+    stamp : of the image, ns. cloud_stamp : of the cloud, ns; by default that of the image.
+    reference : T_camera_lidar (4, 4), if the source knows it.
+    name : of the frame in its source.
+    twist : (6,) velocity of the LiDAR (rx, ry, rz, tx, ty, tz), rad/s and m/s, in its own frame at the cloud's stamp; None =
+        unknown.
+    compensated : whether the points are already motion-compensated to the cloud's stamp.
+    classes : (H, W) uint8, `SemanticClass` of each pixel, ``UNLABELLED`` where unknown, if the source knows them.
 
-    Raises
-    ------
-    BadInputError
-        The image is not uint8 of one or three channels, or its size is not the camera's, or shapes do not match.
+    Raises BadInputError if the image is not uint8 of one or three channels, or its size is not the camera's, or shapes do not
+    match.
     """
 
     image: NDArray[np.uint8]

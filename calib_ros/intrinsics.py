@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
@@ -137,7 +136,7 @@ def camera_info_yaml(camera: Camera, name: str) -> str:
         raise BadInputError("an unrolled picture has no CameraInfo")
     D = camera.D if len(camera.D) else np.zeros(COEFFICIENTS[camera.model])
 
-    def matrix(values: NDArray[np.float64]) -> dict[str, Any]:
+    def matrix(values: Matrix) -> dict[str, Any]:
         rows, cols = np.atleast_2d(values).shape
         return {"rows": rows, "cols": cols, "data": [float(v) + 0.0 for v in values.ravel()]}
 

@@ -21,11 +21,11 @@ MAX_INTEGER = 10**1000
 
 
 def write_atomically(path: str | Path, data: bytes) -> None:
-    """Write to a temporary file in the same folder, flush to disk, rename to `path`.
+    """Write to a temporary file in the same folder, flush to disk, rename to `path`: a kill or power loss at any moment leaves
+    the old file or the new one.
 
-    The file has mode 0644, readable by all users. A kill or power loss at any moment leaves the old file or the new one;
-    temporary files of killed writers are removed by a later write. Links are followed; what is not a regular file (a pipe,
-    /dev/null) is written to directly, since a rename would replace it. Raises BadInputError if the folder cannot be written.
+    The file has mode 0644. Links are followed; what is not a regular file (a pipe, /dev/null) is written to directly. Raises
+    BadInputError if the folder cannot be written.
     """
     path = Path(os.path.realpath(path))
     temporary = None
@@ -52,10 +52,7 @@ def write_atomically(path: str | Path, data: bytes) -> None:
 
 
 def check_output(path: str | Path, option: str) -> None:
-    """Before the work whose outcome a file named by an option will hold: make its folder.
-
-    Raises BadInputError if that cannot be made or written to, or there is a folder of the file's name.
-    """
+    """Before the work whose outcome a file named by an option will hold: make its folder. BadInputError if none can be there."""
     if not str(path):
         raise BadInputError(f"{option} is given without a name; name a file, or leave {option} out")
     path = Path(os.path.realpath(path))

@@ -7,7 +7,6 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
@@ -21,11 +20,8 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import equalize, to_gray
 from calib_ros.io import write_atomically
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, TENTATIVE
-
-if TYPE_CHECKING:
-    from calib_ros.result import Extrinsic
-
+from calib_ros.lidar.edges import EdgePoints
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, TENTATIVE, Extrinsic
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
@@ -163,21 +159,12 @@ def draw_legend(canvas: Image, plan: OverlayLayout, max_range: float, edges: boo
         put(canvas, fitting("LiDAR edges", canvas.shape[1] - x - plan.line, font), (x + plan.line, top + thick), font)
 
 
-class HasXyz(Protocol):
-    """Anything with points."""
-
-    @property
-    def xyz(self) -> Points:
-        """(n, 3) float32 m, LiDAR frame."""
-        ...
-
-
 def render(
     frame: Frame,
     T: ArrayLike,
     *,
     T_before: ArrayLike | None = None,
-    edges: HasXyz | None = None,
+    edges: EdgePoints | None = None,
     lines: Sequence[str] = (),
     status: str = "",
     max_range: float = 60.0,
@@ -215,7 +202,7 @@ def _backdrop(image: Image) -> Image:
     return np.asarray(cv2.addWeighted(image if image.ndim == 3 else gray, 0.2, gray, 0.45, 0), np.uint8)
 
 
-def _draw_points(panel: Image, camera: Camera, T: Transform, xyz: Points, edges: HasXyz | None, max_range: float) -> bool:
+def _draw_points(panel: Image, camera: Camera, T: Transform, xyz: Points, edges: EdgePoints | None, max_range: float) -> bool:
     """Draw points and edges into a panel (H, W, 3); False if no point of xyz (n, 3) falls into it."""
     size = max(1, round(math.sqrt(camera.width * camera.height) / 350))  # px
     where, depth = _pixels(camera, T, xyz, max_range)
@@ -234,11 +221,8 @@ def _draw_points(panel: Image, camera: Camera, T: Transform, xyz: Points, edges:
 
 
 def _pixels(camera: Camera, T: Transform, xyz: Points, max_range: float) -> tuple[NDArray[np.intp], Points]:
-    """Points (n, 3) in the LiDAR frame -> flat pixel index and depth in m of those in the image.
-
-    A rough projection in float32 leaves few points to project exactly. Distortion maps points outside the pinhole's field into
-    the image, so that with it only points behind the camera are left out. NaN compares false and is left out too.
-    """
+    """Points (n, 3) in the LiDAR frame -> flat pixel index and depth in m of those in the image."""
+    # A rough projection leaves few to project exactly; a lens also shows points outside the pinhole's field. NaN compares false.
     with np.errstate(all="ignore"):
         P = np.vstack([camera.K[:2] @ T[:3], T[2]]).astype(np.float32)
         depth = xyz @ P[2, :3] + P[2, 3]
@@ -254,17 +238,15 @@ def _pixels(camera: Camera, T: Transform, xyz: Points, max_range: float) -> tupl
 
 
 def caption(extrinsic: Extrinsic, keyframes: int, initial: Transform | None = None) -> list[str]:
-    """Lines for `render`: frames used, score, motion from the start, standard deviation, and the reason of a refusal.
-
-    keyframes: in the buffer. initial: start (4, 4); None = that of the last estimate.
-    """
+    """Lines for `render`: frames used, score, motion from the start, standard deviation, and the reason of a refusal. keyframes:
+    in the buffer. initial: start (4, 4); None = that of the last estimate."""
     result = extrinsic.result
     start = result.initial if initial is None else initial
     lines = [f"frames {result.frames_used}/{keyframes}"]
     if math.isfinite(result.score):
         lines.append(f"score {result.score:.2f}")
     if start is not None:
-        deg, m = se3.rotation_error_deg(start, result.T_camera_lidar), se3.translation_error_m(start, result.T_camera_lidar)
+        deg, m = se3.error(start, result.T_camera_lidar)
         lines.append(f"moved {deg:.2f} deg / {100 * m:.1f} cm")
     if result.covariance is not None:
         sigma = np.sqrt(np.maximum(np.diag(result.covariance), 0))  # the largest of three axes

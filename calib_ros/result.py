@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from enum import Enum
@@ -13,9 +14,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from calib_ros import __version__, io, se3
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.io import write_atomically
@@ -61,11 +62,8 @@ def _now() -> str:
 
 @dataclass(frozen=True)
 class Stamping:
-    """How scans without point times are stamped.
-
-    spin: as motion.spin. azimuth_deg: azimuth of the scanner half a turn after the scan began, as motion.stamp_azimuth_deg with
-    motion.stamp_at: middle; the time offset counts from there.
-    """
+    """How scans without point times are stamped. spin: as motion.spin. azimuth_deg: azimuth of the scanner half a turn after the
+    scan began, as motion.stamp_azimuth_deg with motion.stamp_at: middle; the time offset counts from there."""
 
     spin: str
     azimuth_deg: float
@@ -90,93 +88,56 @@ class Evidence:
 class Result:
     """An estimate of the extrinsic, or an initial extrinsic in the same form.
 
+    What is None, NaN or empty is unknown or does not apply. * : not part of the file format.
+
     Attributes
     ----------
-    T_camera_lidar : ndarray, shape (4, 4)
-        Maps points from the LiDAR frame into the camera's optical frame. Where the estimate is not to be used, the start.
-    status : str
-        ``converged``, ``refused`` (the optimum is not to be used), ``insufficient`` (too little seen to estimate anything),
+    T_camera_lidar : (4, 4), from the LiDAR's into the camera's optical frame. Where the estimate is not to be used, the start.
+    status : ``converged``, ``refused`` (the optimum is not to be used), ``insufficient`` (too little seen to estimate anything),
         ``initial``, or one of the online recalibrator's: ``tentative``, ``suspect``, ``moved``, ``blinded``.
-    reason : str
-        For people: why it is refused, and what else there is to know. One line, may be empty.
-    score : float
-        Value of the objective at the optimum, also of a refused one; NaN if there is none.
-    covariance : ndarray, shape (6, 6), or None
-        Of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m; None if unknown.
-    frames_used : int
-        Frames of the estimate without the outlier frames.
-    camera_frame : str
-        Name of the camera's optical frame.
-    lidar_frame : str
-        Name of the LiDAR's frame.
-    elapsed_s : float
-        Wall-clock time of the estimate.
-    initial_score : float
-        Value of the objective at the start.
-    initial : ndarray, shape (4, 4), or None
-        The start.
-    frame_scores : tuple of float
-        Score of every frame, same scale as `score`; NaN for an outlier frame.
-    frame_names : tuple of str
-        Names of all frames.
-    frames_left_out : tuple of str
-        Names of the outlier frames.
-    starts : tuple of int, or None
-        Of a search, how many of how many independent starts ended at the result; None without a search.
-    reference_error : tuple of float, or None
-        Deg and m, if the source knows a reference.
-    motion : str
-        For people: how the vehicle's motion was dealt with.
-    stamp : str
-        ISO 8601, UTC.
-    refusal : RefusalCode or None
-        Why it is refused or insufficient; None if it is neither.
-    refusal_figures : mapping
-        Numbers that the refusal rests on, by name, as ``seconds`` of ``wrong_times``.
-    optimum : ndarray, shape (4, 4), or None
-        The optimum that was refused; None if there is none. Not to be used as a calibration.
-    evidence : Evidence or None
-        What speaks for the optimum; None if there is none.
-    intrinsics : mapping of str to IntrinsicEstimate
-        ``focal_length_share``, ``principal_point_x_px`` and ``principal_point_y_px``: which change of the given ones, to
-        which the extrinsic belongs, the scenes match best with. Empty where nothing was estimated. With camera.intrinsics:
-        refine, the changes that were made, ``k1`` among them.
-    refined_camera : RefinedCamera or None
-        The intrinsics corrected together with the extrinsic, where camera.intrinsics is refine. `Calibrator.calibrate` states
-        the extrinsic for it, `Calibrator.estimate` that for the camera that was given.
-    origin : InitialSource or None
-        Where an initial extrinsic comes from; None for an estimate, or if unknown. Not part of the file format.
-    shared_covariance : ndarray, shape (6, 6), or None
-        Part of `covariance` that estimates of the same sensors have in common: what the intrinsics and the clocks leave open. Not
-        part of the file format.
-    clock_covariance : ndarray, shape (6, 6), or None
-        What an offset of the clocks as large as motion.max_time_offset_s would leave open, beyond what the scenes tell of it;
-        None if unknown. Not part of the file format.
-    clock_sigma_s : float or None
-        Standard deviation of that offset, s, as far as the scenes tell; None if the motion is unknown. Not part of the file
-        format.
-    time_offset_s : float or None
-        Offset of the clocks that belongs to the extrinsic, as motion.time_offset_s: positive = points were measured later, or the
-        image was exposed earlier, than stamped. None where the frames do not show it, or it is not estimated.
-    time_offset_sigma_s : float or None
-        Its standard deviation, s.
-    stamping : Stamping or None
-        How scans without point times are stamped, where the frames show that it is another way than configured.
-    data_stamp : int
-        Stamp of the newest frame in it, ns, by the sensors' clock; 0 if unknown. Not part of the file format.
+    reason : for people, one line: why it is refused, and what else there is to know.
+    score : value of the objective at the optimum, also of a refused one. initial_score : at the start.
+    covariance : (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m.
+    frames_used : number of frames of the estimate without the outlier frames.
+    camera_frame, lidar_frame : names of the camera's optical frame and of the LiDAR's.
+    elapsed_s : wall-clock time of the estimate. stamp : ISO 8601, UTC.
+    initial : (4, 4), the start.
+    frame_scores : of every frame, same scale as `score`; NaN for an outlier frame. frame_names : of all frames.
+    frames_left_out : names of the outlier frames.
+    starts : of a search, how many of how many independent starts ended at the result.
+    reference_error : deg and m, if the source knows a reference.
+    motion : for people, how the vehicle's motion was dealt with.
+    refusal : why it is refused or insufficient. refusal_figures : numbers that this rests on, by name, as ``seconds`` of
+        ``wrong_times``.
+    optimum : (4, 4), the one that was refused. Not to be used as a calibration.
+    evidence : what speaks for the optimum.
+    intrinsics : ``focal_length_share``, ``principal_point_x_px`` and ``principal_point_y_px``: which change of the given ones, to
+        which the extrinsic belongs, the scenes match best with. With camera.intrinsics: refine, the changes that were made,
+        ``k1`` among them.
+    refined_camera : the intrinsics corrected together with the extrinsic, where camera.intrinsics is refine.
+        `Calibrator.calibrate` states the extrinsic for it, `Calibrator.estimate` that for the camera that was given.
+    origin* : where an initial extrinsic comes from.
+    shared_covariance* : (6, 6), part of `covariance` that estimates of the same sensors have in common: what the intrinsics and
+        the clocks leave open.
+    clock_covariance* : (6, 6), what an offset of the clocks as large as motion.max_time_offset_s would leave open, beyond what
+        the scenes tell of it. clock_sigma_s* : standard deviation of that offset, s, as far as they tell.
+    time_offset_s : of the clocks, which belongs to the extrinsic, as motion.time_offset_s: positive = points were measured later,
+        or the image was exposed earlier, than stamped. time_offset_sigma_s : its standard deviation, s.
+    stamping : how scans without point times are stamped, where the frames show that it is another way than configured.
+    data_stamp* : of the newest frame in it, ns, by the sensors' clock; 0 if unknown.
     """
 
-    T_camera_lidar: NDArray[np.float64]
+    T_camera_lidar: Transform
     status: str
     reason: str = ""
     score: float = math.nan
-    covariance: NDArray[np.float64] | None = None
+    covariance: Covariance | None = None
     frames_used: int = 0
     camera_frame: str = "camera"
     lidar_frame: str = "lidar"
     elapsed_s: float = 0.0
     initial_score: float = math.nan
-    initial: NDArray[np.float64] | None = None
+    initial: Transform | None = None
     frame_scores: tuple[float, ...] = ()
     frame_names: tuple[str, ...] = ()
     frames_left_out: tuple[str, ...] = ()
@@ -186,12 +147,12 @@ class Result:
     stamp: str = field(default_factory=_now)
     refusal: RefusalCode | None = None
     refusal_figures: Mapping[str, float] = field(default_factory=dict)
-    optimum: NDArray[np.float64] | None = None
+    optimum: Transform | None = None
     evidence: Evidence | None = None
     intrinsics: Mapping[str, IntrinsicEstimate] = field(default_factory=dict)
     origin: InitialSource | None = None
-    shared_covariance: NDArray[np.float64] | None = None
-    clock_covariance: NDArray[np.float64] | None = None
+    shared_covariance: Covariance | None = None
+    clock_covariance: Covariance | None = None
     clock_sigma_s: float | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
@@ -250,10 +211,8 @@ class Result:
 
 
 def parse(text: str, what: str) -> Result:
-    """A Result from JSON or YAML text. BadInputError names `what` and the first thing that is wrong.
-
-    Needs T_camera_lidar, or translation_m with quaternion_xyzw; everything else is optional.
-    """
+    """A Result from JSON or YAML text. BadInputError names `what` and the first thing that is wrong. Needs T_camera_lidar, or
+    translation_m with quaternion_xyzw; everything else is optional."""
     try:
         data = json.loads(text) if text.lstrip().startswith("{") else io.load(text)
     except (ValueError, yaml.YAMLError, RecursionError):
@@ -277,7 +236,7 @@ def parse(text: str, what: str) -> Result:
     try:
         covariance = None if data.get("covariance") is None else np.array(data["covariance"], float)
         score = math.nan if data.get("score") is None else float(data["score"])
-        offset = _number_or_none(data, "time_offset_s"), _number_or_none(data, "time_offset_sigma_s")
+        offset, offset_sigma = (_number_or_none(data, name) for name in ("time_offset_s", "time_offset_sigma_s"))
         frames, elapsed = int(data.get("frames_used") or 0), float(data.get("elapsed_s") or 0)
     except (TypeError, ValueError, OverflowError):
         raise BadInputError(f"{what}: covariance, score, frames_used, elapsed_s and time_offset_s must be numbers") from None
@@ -296,8 +255,8 @@ def parse(text: str, what: str) -> Result:
         _text(data, "lidar_frame", what) or "lidar",
         elapsed,
         stamp=_text(data, "stamp", what),
-        time_offset_s=offset[0],
-        time_offset_sigma_s=offset[1],
+        time_offset_s=offset,
+        time_offset_sigma_s=offset_sigma,
         stamping=_stamping(data, what),
         refined_camera=None if data.get("refined_camera") is None else RefinedCamera.from_dict(data["refined_camera"], what),
     )
@@ -307,15 +266,11 @@ def _stamping(data: dict[str, Any], what: str) -> Stamping | None:
     value = data.get("stamping")
     if value is None:
         return None
-    try:
+    with suppress(LookupError, TypeError, ValueError):
         stamping = Stamping(str(value["spin"]), float(value["azimuth_deg"]))
-    except (LookupError, TypeError, ValueError):
-        stamping = Stamping("", math.nan)
-    if stamping.spin not in ("clockwise", "counterclockwise", "none") or not abs(stamping.azimuth_deg) <= 180:
-        raise BadInputError(
-            f"{what}: stamping must have a spin (clockwise, counterclockwise or none) and an azimuth_deg, or be null"
-        )
-    return stamping
+        if stamping.spin in ("clockwise", "counterclockwise", "none") and abs(stamping.azimuth_deg) <= 180:
+            return stamping
+    raise BadInputError(f"{what}: stamping must have a spin (clockwise, counterclockwise or none) and an azimuth_deg, or be null")
 
 
 def _number_or_none(data: dict[str, Any], name: str) -> float | None:

@@ -13,11 +13,9 @@ ARENAS = 2
 
 
 def use_one_blas_thread() -> None:
-    """Keep OpenBLAS and MKL to one thread in this process, unless the environment says otherwise.
-
-    To be called before NumPy is imported. The matrices here are small: more threads wait for each other and take a third more CPU
-    time for the same result.
-    """
+    """Keep OpenBLAS and MKL to one thread in this process, unless the environment says otherwise. To be called before NumPy is
+    imported."""
+    # The matrices here are small: more threads wait for each other and take a third more CPU time.
     if "OMP_NUM_THREADS" in os.environ:  # which the variables of the libraries would take precedence over
         return
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -25,11 +23,8 @@ def use_one_blas_thread() -> None:
 
 
 def return_freed_memory() -> None:
-    """Let glibc map every large array on its own; does nothing with another C library. To be called before threads start.
-
-    By default it learns from the first arrays freed to keep their places for later ones, in an arena per thread. Features and
-    maps of many sizes then leave gaps: the resident memory grows by a sixth in ten minutes without anything being lost.
-    """
+    """Let glibc map every large array on its own; does nothing with another C library. To be called before threads start."""
+    # By default it keeps the places of freed arrays: of many sizes, their gaps let the memory grow by a sixth in ten minutes.
     with suppress(AttributeError, OSError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(M_MMAP_THRESHOLD, MMAP_THRESHOLD)

@@ -10,15 +10,15 @@ import math
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError
 
-Matrix = NDArray[np.float64]
 N = TypeVar("N", float, Matrix)
-# Optical axes (x right, y down, z forward) in terms of a body's (x forward, y left, z up), as in REP 103.
 MAX_TRANSLATION_M = 100.0  # per axis, between sensors of one vehicle: what is further is in millimetres, or of a map
+# Optical axes (x right, y down, z forward) in terms of a body's (x forward, y left, z up), as in REP 103.
 OPTICAL_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
@@ -38,11 +38,8 @@ def _series(angle: float) -> tuple[float, float, float]:
 
 
 def exp(xi: ArrayLike) -> Matrix:
-    """Twist (6,) in rad and m -> transform (4, 4) (Barfoot, State Estimation for Robotics, eq. 7.25 and 7.37).
-
-    Written out in numbers, as log and inverse are, instead of with scipy's Rotation: all three are in the inner loop of every
-    search, where a NumPy call on three numbers costs more than their arithmetic.
-    """
+    """Twist (6,) in rad and m -> transform (4, 4) (Barfoot, State Estimation for Robotics, eq. 7.25 and 7.37)."""
+    # Written out in numbers, as log and inverse: in the inner loop of every search a NumPy call on three numbers costs more.
     a, b, c, x, y, z = np.asarray(xi, float).tolist()
     rows = _rows(a, b, c, x, y, z, *_series(math.sqrt(a * a + b * b + c * c)))
     return np.array([*rows, [0.0, 0.0, 0.0, 1.0]])
@@ -114,10 +111,7 @@ def adjoint(T: ArrayLike) -> Matrix:
 
 
 def parts_jacobian(T: ArrayLike) -> Matrix:
-    """(6, 6) from a small left twist of T (4, 4), rad and m, to how its rotation vector and its translation change.
-
-    The translation moves by the shift, and by the rotation times its lever.
-    """
+    """(6, 6) from a small left twist of T (4, 4), rad and m, to how its rotation vector and its translation change."""
     out = np.eye(6)
     out[3:, :3] = -skew(np.asarray(T, float)[:3, 3])
     return out
@@ -142,20 +136,6 @@ def rotation_from_euler(yaw: float, pitch: float, roll: float) -> Matrix:
     return np.asarray(Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix())
 
 
-def euler_from_rotation(R: ArrayLike) -> tuple[float, float, float]:
-    """(3, 3) -> (yaw, pitch, roll) in rad, eq. 2.10-2.12.
-
-    Pitch is arctan2(-r31, hypot(r32, r33)): eq. 2.11 prints arcsin of two arguments and r31 under the root, which cannot be
-    intended. At pitch = +-90 deg only yaw -+ roll is defined (gimbal lock); roll is set to 0 there.
-    """
-    R = np.asarray(R, float)
-    horizontal = float(np.hypot(R[2, 1], R[2, 2]))
-    pitch = float(np.arctan2(-R[2, 0], horizontal))
-    if horizontal < 1e-9:
-        return float(np.arctan2(-R[0, 1], R[1, 1])), pitch, 0.0
-    return float(np.arctan2(R[1, 0], R[0, 0])), pitch, float(np.arctan2(R[2, 1], R[2, 2]))
-
-
 def quaternion_from_rotation(R: ArrayLike) -> Matrix:
     """(3, 3) -> unit quaternion (x, y, z, w) with w >= 0; ROS order (eq. 2.14 writes the real part first)."""
     return np.asarray(Rotation.from_matrix(np.asarray(R, float)).as_quat(canonical=True))
@@ -178,6 +158,11 @@ def rotation_error_deg(R_reference: ArrayLike, R: ArrayLike) -> float:
 def translation_error_m(T_reference: ArrayLike, T: ArrayLike) -> float:
     """Distance of the translations of two (4, 4) transforms in metres."""
     return float(np.linalg.norm(np.asarray(T, float)[:3, 3] - np.asarray(T_reference, float)[:3, 3]))
+
+
+def error(T_reference: ArrayLike, T: ArrayLike) -> tuple[float, float]:
+    """Both errors, deg and m."""
+    return rotation_error_deg(T_reference, T), translation_error_m(T_reference, T)
 
 
 def as_transform(value: ArrayLike, what: str = "transform") -> Matrix:

@@ -1,7 +1,4 @@
-"""Time stamps of two streams of messages: the period of each, what is missing in it, and which message belongs to which.
-
-The node and the reader of bags pair by the same rules. All stamps are in ns.
-"""
+"""Stamps, ns, of two streams of messages: the period of each, what is missing in it, and which message belongs to which."""
 
 from __future__ import annotations
 
@@ -15,8 +12,7 @@ from calib_ros.frame import NANOSECONDS
 
 Stamps = NDArray[np.int64]
 WINDOW = 64  # newest stamps that a period is found from: 6 s of a scanner at 10 Hz
-# The period is the median of the differences up to 1.5 times this quantile. The lowest ones may be doubled messages, and where
-# three of four messages are lost, only a quarter of the differences are one period.
+# The period is the median of differences up to 1.5 times this quantile: the lowest may be doubled, and most be several periods.
 LOW_QUANTILE = 0.1
 REGULAR_WITHIN, REGULAR_SHARE = 0.25, 0.9  # of a period, and of the differences: by chance, half of them lie that near
 LONGEST_GAP = 20  # periods; what lasts longer is an interruption, and no loss of single messages
@@ -42,14 +38,11 @@ class Rhythm:
         self.period = usual_period(self._steps())
 
     def missing_share(self) -> float:
-        """Share of the messages, 0 to 1, that are missing between those that came; 0 where that cannot be told.
-
-        A stream that keeps its period has stamps at multiples of it, and what gets lost leaves gaps. The lower of the shares of
-        an earlier and a later half counts: a camera that changes its rate for longer exposures, or pauses once, loses nothing.
-        """
+        """Share of the messages, 0 to 1, that are missing between those that came; 0 where that cannot be told."""
         if len(self._stamps) < WINDOW:
             return 0.0
         steps = self._steps()
+        # The lower of two halves: a camera that changes its rate for longer exposures, or pauses once, loses nothing.
         return min(_missing(half, self.period) for half in (steps[: WINDOW // 2], steps[WINDOW // 2 :]))
 
     def _steps(self) -> Stamps:
@@ -58,10 +51,7 @@ class Rhythm:
 
 
 def usual_period(steps: Stamps) -> int:
-    """The period, ns, of a stream with these differences (n,) >= 0 between neighbouring stamps, however many are missing.
-
-    0 without differences.
-    """
+    """Period, ns, of a stream by the differences (n,) >= 0 of neighbouring stamps, however many are missing; 0 without any."""
     steps = np.sort(steps[steps > 0])
     if not len(steps):
         return 0
@@ -70,10 +60,8 @@ def usual_period(steps: Stamps) -> int:
 
 
 def _missing(steps: Stamps, period: int) -> float:
-    """Share of the messages missing between stamps with these differences; 0 if they are no multiples of a period.
-
-    Their own, or, where so few remain that hardly any two are neighbours, that of a longer time.
-    """
+    """Share of the messages missing between stamps with these differences; 0 if they are no multiples of a period."""
+    # Their own, or, where so few remain that hardly any two are neighbours, that of a longer time.
     for candidate in (usual_period(steps), period):
         near = steps[steps <= LONGEST_GAP * candidate]
         multiples = near / max(candidate, 1)
@@ -84,12 +72,8 @@ def _missing(steps: Stamps, period: int) -> float:
 
 
 def pair_tolerance(periods: tuple[int, int], limit_s: float) -> int:
-    """Largest difference, ns, between a message and its partner, from the periods (0 = unknown) of both streams.
-
-    Half the longer period, with its jitter, reaches the nearest message whatever the phase of the two streams, and hardly one
-    beyond it. limit_s: upper limit from the user; 0 = none, then sensors slower than 5 Hz have that of 5 Hz: what lies farther
-    apart shows another scene.
-    """
+    """Largest difference, ns, between a message and its partner, from the periods (0 = unknown) of both streams. limit_s: upper
+    limit from the user; 0 = none, then sensors slower than 5 Hz have that of 5 Hz."""
     limit = round(limit_s * NANOSECONDS) or WIDEST_TOLERANCE
     if not all(periods):
         return limit if limit_s else FIRST_TOLERANCE
@@ -106,11 +90,8 @@ def nearest_index(stamps: Stamps, wanted: Stamps) -> NDArray[np.intp]:
 
 def nearest_pairs(a: Stamps, b: Stamps, tolerance: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Pairs of two sorted arrays of stamps at most `tolerance` apart, nearest first, each stamp used once, in the same order in
-    both: no earlier one of a with a later one of b than another pair's.
-
-    Returns the indices (k,) into a and into b. Mutually nearest stamps are paired, then again among the rest between two pairs,
-    which equals a greedy choice by distance, without its loop over pairs.
-    """
+    both: indices (k,) into a and into b."""
+    # Mutually nearest ones, then again among the rest between two pairs: a greedy choice by distance, without its loop.
     pairs: list[tuple[int, int]] = []
     rest_a, rest_b = np.arange(len(a)), np.arange(len(b))
     apart_a, apart_b = a, b  # what lies on different sides of a pair is moved apart, beyond the tolerance

@@ -86,7 +86,7 @@ def _finite(part: str, text: str) -> float:
 BAD_INPUT = 2
 # As in calib_ros.export, which would have --help wait for OpenCV.
 SOURCE = "KITTI, nuScenes[#SCENE] or plain folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
-FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
+FORMATS = ("tf", "urdf", "autoware", "kitti", "kitti-raw", "json", "yaml")
 
 
 class _Parser(argparse.ArgumentParser):

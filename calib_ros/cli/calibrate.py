@@ -8,20 +8,16 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.cli.inputs import initial_extrinsic, require_classes, search_box
 from calib_ros.cli.output import motion, note, progress_bar
 from calib_ros.config import Config, update
-from calib_ros.datasets.neighbours import neighbours
 from calib_ros.datasets.positions import frame_positions
-from calib_ros.datasets.source import Source, WithMotion
+from calib_ros.datasets.source import Source, WithMotion, neighbours
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.io import check_output
-from calib_ros.lidar.ego_motion import MAX_GAP_S
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.initial_guess import AUTO, GUESSES, MOTION, SEMANTIC, nominal_start
@@ -59,14 +55,14 @@ def calibrate(
             note(line)
     with progress_bar("estimating") as step:
         start = initial if initial in GUESSES else T0
-        consecutive = neighbours(source, positions, MAX_GAP_S) if moving else ()
+        consecutive = neighbours(source, positions) if moving else ()
         result = calibrator.calibrate(chosen, start, box, lambda stage, share: step(share), consecutive)
     reference = chosen[0].reference if chosen[0].reference is not None else source.reference
     result = replace(
         result,
         camera_frame=source.camera_frame,
         lidar_frame=source.lidar_frame,
-        reference_error=None if reference is None else error_against(reference, result.T_camera_lidar),
+        reference_error=None if reference is None else se3.error(reference, result.T_camera_lidar),
         motion=motion(chosen, config.motion),
     )
     if overlay is not None:
@@ -85,11 +81,6 @@ def _read(source: Source, positions: list[int], config: Config) -> list[Frame]:
             chosen.append(moving[i])
             step(k + 1, len(positions))
     return chosen
-
-
-def error_against(reference: NDArray[np.float64], T: NDArray[np.float64]) -> tuple[float, float]:
-    """Error of T (4, 4) against a reference, deg and m (eq. 2.19)."""
-    return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
 
 
 def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:
@@ -116,7 +107,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
     if initial == "nominal":
         wide = replace(config.search, rotation_deg=NOMINAL_BOX.reach[0], translation_m=NOMINAL_BOX.reach[1])
         config = replace(config, search=wide)
-    start: Result | NDArray[np.float64] = T0
+    start: Result | Transform = T0
     if initial in (MOTION, AUTO):
         raise BadInputError(
             f"--initial {initial} is of calibrate, not of replay: run calib-ros calibrate --initial {initial} --json FILE, and "
@@ -149,7 +140,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
                 continue
             result, status = extrinsic.result, extrinsic.result.status
             if source.reference is not None:
-                result = replace(result, reference_error=error_against(source.reference, result.T_camera_lidar))
+                result = replace(result, reference_error=se3.error(source.reference, result.T_camera_lidar))
             yield {
                 "frame": frame.name,
                 "frame_stamp": frame.stamp,

@@ -26,18 +26,14 @@ _FREE = {axis: NO_LIMIT_DEG if axis[0] == "r" else NO_LIMIT_M for axis in AXES}
 
 @dataclass(frozen=True)
 class ConstraintOptions:
-    """What the options of `calib-ros calibrate` and `replay` say about the extrinsic and the clocks; None or empty = nothing.
+    """What the options of `calib-ros calibrate` and `replay` say about the extrinsic and the clocks; None or empty = nothing."""
 
-    rotation_only: the camera's position in the LiDAR frame is fixed. fixed: names of AXES. bounds: axis and half width, deg or
-    m. prior_deg, prior_m: standard deviations of the initial extrinsic. time_offset: see ``motion.time_offset``; s if known.
-    """
-
-    rotation_only: bool = False
-    fixed: Sequence[str] = ()
-    bounds: Sequence[tuple[str, float]] = ()
-    prior_deg: Three | None = None
+    rotation_only: bool = False  # the camera's position in the LiDAR frame is fixed
+    fixed: Sequence[str] = ()  # names of AXES
+    bounds: Sequence[tuple[str, float]] = ()  # axis and half width, deg or m
+    prior_deg: Three | None = None  # standard deviations of the initial extrinsic
     prior_m: Three | None = None
-    time_offset: str | float | None = None
+    time_offset: str | float | None = None  # see motion.time_offset; s if known
 
     def limits(self) -> dict[str, float]:
         """Half width, deg or m, of every named axis. BadInputError for contradictory values, or one out of range."""
@@ -177,10 +173,7 @@ def constraint_options(args: argparse.Namespace) -> ConstraintOptions:
 
 
 def initial_extrinsic(text: str, source: Source, yaw_deg: float = 0.0) -> NDArray[np.float64]:
-    """'nominal', 'reference', one of GUESSES or a result file -> T_camera_lidar (4, 4). BadInputError if it is not available.
-
-    A guess starts from nominal; what the scenes tell replaces it.
-    """
+    """'nominal', 'reference', one of GUESSES or a result file -> T_camera_lidar (4, 4). BadInputError if it is not available."""
     if text in ("nominal", *GUESSES):
         return nominal(yaw_deg)
     if text == "reference":

@@ -97,10 +97,16 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 
 def _convert(args: argparse.Namespace) -> int:
-    from calib_ros.cli.bags import convert
     from calib_ros.cli.inputs import open_named_source
+    from calib_ros.cli.output import progress_bar
+    from calib_ros.datasets.bag_writer import write_bag
+    from calib_ros.datasets.positions import frame_positions
 
-    print(convert(open_named_source(args), args.bag, args.frames, args.storage))
+    source = open_named_source(args)
+    positions = frame_positions(args.frames, len(source))
+    with progress_bar("writing") as step:
+        path = write_bag(source, args.bag, args.storage, positions, step)
+    print(f"{len(positions)} frames written to {path}; play them with: calib-ros play {path}")
     return OK
 
 
@@ -120,9 +126,25 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from calib_ros.cli.bags import export_result
+    """What is not an accepted estimate is exported with a note, since initial extrinsics are exported as well."""
+    from calib_ros.cli.output import note
+    from calib_ros.export import export
+    from calib_ros.io import write_atomically
+    from calib_ros.online.state import read_state
 
-    print(export_result(args.file, args.format, args.parent, args.camera_frame, args.lidar_frame, args.out), end="")
+    state = read_state(args.file)
+    result = state.result
+    text = export(result, args.format, args.parent, state.camera, args.camera_frame, args.lidar_frame)
+    if not result.converged:
+        why = f" ({' '.join(result.reason.split())})" if result.reason else ""
+        note(f"calib-ros: {args.file} is not an accepted estimate, its status is {result.status}{why}; exported all the same")
+    if args.format == "kitti" and state.camera is not None and not state.camera.is_pinhole:
+        note("calib-ros: no P0 written, the camera has distortion; Tr holds for its rectified image, too")
+    if args.out is None or args.out == "-":
+        print(text, end="")
+    else:
+        write_atomically(args.out, text.encode())
+        print(f"wrote {args.out}")
     return OK
 
 
@@ -143,14 +165,7 @@ def _play(args: argparse.Namespace) -> int:
     return OK
 
 
-_RUN = {
-    "info": _info,
-    "calibrate": _calibrate,
-    "convert": _convert,
-    "replay": _replay,
-    "export": _export,
-    "play": _play,
-}
+_RUN = {"info": _info, "calibrate": _calibrate, "convert": _convert, "replay": _replay, "export": _export, "play": _play}
 
 
 if __name__ == "__main__":

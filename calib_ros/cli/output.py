@@ -64,32 +64,23 @@ def summary(result: Result, scan_period_s: float = MotionConfig.scan_period_s) -
     lines.append(f"T_{result.camera_frame}_{result.lidar_frame}  {pose(result.T_camera_lidar)}")
     if result.covariance is not None:
         sigma = np.sqrt(np.diag(result.covariance))
-        deg, cm = np.rad2deg(sigma[:3]), 100 * sigma[3:]
-        lines.append(
-            f"1 sigma: rx {deg[0]:.2f} ry {deg[1]:.2f} rz {deg[2]:.2f} deg, x {cm[0]:.1f} y {cm[1]:.1f} z {cm[2]:.1f} cm"
-        )
+        (rx, ry, rz), (x, y, z) = np.rad2deg(sigma[:3]), 100 * sigma[3:]
+        lines.append(f"1 sigma: rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg, x {x:.1f} y {y:.1f} z {z:.1f} cm")
     if result.refined_camera is not None:
         lines.append(refined_words(result.refined_camera))
     if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
         lines.append(_clocks(result, scan_period_s))
     if result.initial is not None and result.converged:
-        moved = (
-            se3.rotation_error_deg(result.initial, result.T_camera_lidar),
-            se3.translation_error_m(result.initial, result.T_camera_lidar),
-        )
-        lines.append(f"moved {moved[0]:.2f} deg, {100 * moved[1]:.1f} cm from the initial extrinsic")
+        deg, m = se3.error(result.initial, result.T_camera_lidar)
+        lines.append(f"moved {deg:.2f} deg, {100 * m:.1f} cm from the initial extrinsic")
     if result.reference_error is not None:
-        lines.append(
-            f"against the source's reference: {result.reference_error[0]:.3f} deg, {100 * result.reference_error[1]:.1f} cm"
-        )
+        deg, m = result.reference_error
+        lines.append(f"against the source's reference: {deg:.3f} deg, {100 * m:.1f} cm")
     lines += _details(result)
-    T = result.T_camera_lidar
-    t, q = " ".join(f"{v:.6f}" for v in T[:3, 3]), " ".join(f"{v:.8f}" for v in se3.quaternion_from_rotation(T[:3, :3]))
-    tx, ty, tz = t.split()
-    qx, qy, qz, qw = q.split()
+    (x, y, z), (qx, qy, qz, qw) = result.T_camera_lidar[:3, 3], se3.quaternion_from_rotation(result.T_camera_lidar[:3, :3])
     lines.append(
-        f"ros2 run tf2_ros static_transform_publisher --x {tx} --y {ty} --z {tz} --qx {qx} --qy {qy} --qz {qz} --qw {qw} "
-        f"--frame-id {result.camera_frame} --child-frame-id {result.lidar_frame}"
+        f"ros2 run tf2_ros static_transform_publisher --x {x:.6f} --y {y:.6f} --z {z:.6f} --qx {qx:.8f} --qy {qy:.8f} "
+        f"--qz {qz:.8f} --qw {qw:.8f} --frame-id {result.camera_frame} --child-frame-id {result.lidar_frame}"
     )
     return "\n".join(lines)
 
@@ -193,7 +184,7 @@ def save_camera_info(result: Result, path: str) -> None:
 
 def print_or_save(result: Savable, text: str, path: str | None) -> None:
     """What a command has found: in words on standard output, and as JSON in a file, if one is named; "-": JSON on standard
-    output, and the words on the standard error. The words come first: no full disk may take them."""
+    output, and the words on the standard error. The words come first: a full disk takes none of them."""
     if path == "-":
         print(result.dumps(), end="")
     print(text, file=sys.stderr if path == "-" else sys.stdout)

@@ -1,8 +1,5 @@
-"""Configuration: one frozen dataclass per stage of the method.
-
-All defaults are defined here; the YAML file and the ROS parameters use the same names (``stage.field``). The description of a
-field states its meaning and unit.
-"""
+"""Configuration: one frozen dataclass per stage of the method, whose fields the YAML file and the ROS parameters name as
+``stage.field``."""
 
 from __future__ import annotations
 
@@ -10,66 +7,41 @@ import dataclasses
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
-from calib_ros import extensions
-from calib_ros.config.files import load_stages
-from calib_ros.config.online import MonitorConfig, OnlineConfig, TrackerConfig
+import yaml
+
+from calib_ros import extensions, io
+from calib_ros.config.online import MonitorConfig as MonitorConfig
+from calib_ros.config.online import OnlineConfig as OnlineConfig
+from calib_ros.config.online import TrackerConfig as TrackerConfig
 from calib_ros.config.options import Stage, current_names
-from calib_ros.config.registration import (
-    NO_LIMIT_DEG,
-    NO_LIMIT_M,
-    ConstraintsConfig,
-    GuessConfig,
-    InitialConfig,
-    RefineConfig,
-    ScoreConfig,
-    SearchConfig,
-)
-from calib_ros.config.semantics import SemanticsConfig
-from calib_ros.config.sensors import CameraConfig, ImageConfig, LidarConfig, MotionConfig
-from calib_ros.errors import ConfigError
-
-__all__ = [
-    "NO_LIMIT_DEG",
-    "NO_LIMIT_M",
-    "CameraConfig",
-    "Config",
-    "ConstraintsConfig",
-    "GuessConfig",
-    "ImageConfig",
-    "InitialConfig",
-    "LidarConfig",
-    "MonitorConfig",
-    "MotionConfig",
-    "OnlineConfig",
-    "RefineConfig",
-    "ScoreConfig",
-    "SearchConfig",
-    "SemanticsConfig",
-    "TrackerConfig",
-    "former_names",
-    "load_stages",
-    "stages",
-    "update",
-]
-
+from calib_ros.config.registration import NO_LIMIT_DEG as NO_LIMIT_DEG
+from calib_ros.config.registration import NO_LIMIT_M as NO_LIMIT_M
+from calib_ros.config.registration import ConstraintsConfig as ConstraintsConfig
+from calib_ros.config.registration import GuessConfig as GuessConfig
+from calib_ros.config.registration import InitialConfig as InitialConfig
+from calib_ros.config.registration import RefineConfig as RefineConfig
+from calib_ros.config.registration import ScoreConfig as ScoreConfig
+from calib_ros.config.registration import SearchConfig as SearchConfig
+from calib_ros.config.semantics import SemanticsConfig as SemanticsConfig
+from calib_ros.config.sensors import CameraConfig as CameraConfig
+from calib_ros.config.sensors import ImageConfig as ImageConfig
+from calib_ros.config.sensors import LidarConfig as LidarConfig
+from calib_ros.config.sensors import MotionConfig as MotionConfig
+from calib_ros.errors import BadInputError, ConfigError
 
 AnyStage = TypeVar("AnyStage", bound=Stage)
 
 
 @dataclass(frozen=True)
 class Config:
-    """All parameters, one immutable stage each. Change them with `from_dict`, `from_yaml` or `dataclasses.replace`.
+    """All parameters, one immutable stage each. Change them with `from_dict`, `from_yaml` or `dataclasses.replace`. Listed with
+    units, defaults and ranges in docs/figures/parameters.csv.
 
     Raises
     ------
-    ConfigError
-        Values that are in range but contradict each other, such as ``online.min_keyframes`` above ``online.buffer_size``.
-
-    Notes
-    -----
-    Every parameter with its unit, default and range is listed in docs/figures/parameters.csv.
+    ConfigError : values that are in range but contradict each other, as ``online.min_keyframes`` above ``online.buffer_size``.
     """
 
     camera: CameraConfig = field(default_factory=CameraConfig)
@@ -97,7 +69,6 @@ class Config:
                 f"online.min_keyframes = {online.min_keyframes} is more than online.buffer_size = {online.buffer_size}: "
                 "no estimate would ever be made"
             )
-
         if self.semantics.segment_anything_decoder and not self.semantics.segment_anything:
             raise ConfigError(
                 "semantics.segment_anything_decoder is set without semantics.segment_anything, its encoder; set both, or neither"
@@ -114,33 +85,14 @@ class Config:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
-        """The defaults with some values replaced.
-
-        Parameters
-        ----------
-        values : dict
-            Nested ``{stage: {field: value}}``.
-
-        Raises
-        ------
-        ConfigError
-            An unknown name, or a value of the wrong type or out of range.
-        """
+        """The defaults with the values of a nested ``{stage: {field: value}}`` replaced. ConfigError for an unknown name, or a
+        value of the wrong type or out of range."""
         return update(Config(), values)
 
     @staticmethod
     def from_yaml(path: str | Path) -> Config:
-        """The defaults with the values of a YAML file, nested or as a ROS parameter file (``/**: ros__parameters:``).
-
-        Settings of the node in a ROS parameter file are ignored.
-
-        Raises
-        ------
-        BadInputError
-            The file cannot be read or holds no configuration.
-        ConfigError
-            An unknown name, or a value of the wrong type or out of range.
-        """
+        """The defaults with the values of a YAML file, nested or as a ROS parameter file (``/**: ros__parameters:``), of which
+        settings of the node are ignored. Raises as `load_stages` and `from_dict`."""
         return Config.from_dict(load_stages(path))
 
     def to_dict(self) -> dict[str, Any]:
@@ -148,22 +100,7 @@ class Config:
         return {name: dataclasses.asdict(_get(self, name)) for name in stages()}
 
 
-OWN_STAGES: dict[str, type[Stage]] = {
-    "camera": CameraConfig,
-    "image": ImageConfig,
-    "lidar": LidarConfig,
-    "motion": MotionConfig,
-    "score": ScoreConfig,
-    "semantics": SemanticsConfig,
-    "constraints": ConstraintsConfig,
-    "initial": InitialConfig,
-    "guess": GuessConfig,
-    "search": SearchConfig,
-    "refine": RefineConfig,
-    "online": OnlineConfig,
-    "tracker": TrackerConfig,
-    "monitor": MonitorConfig,
-}
+OWN_STAGES: dict[str, type[Stage]] = {name: kind for name, kind in get_type_hints(Config).items() if name != "others"}
 
 
 @cache
@@ -195,10 +132,8 @@ def former_names() -> dict[str, str]:
 
 
 def update(config: Config, values: dict[str, Any]) -> Config:
-    """`config` with the named values replaced. Former names are understood, with a FutureWarning.
-
-    ConfigError names what is unknown, out of range, or given under a former and the current name.
-    """
+    """`config` with the named values replaced. Former names are understood, with a FutureWarning. ConfigError names what is
+    unknown, out of range, or given under a former and the current name."""
     known, changed = stages(), {}
     for name, stage_values in values.items():
         if name not in known:
@@ -217,3 +152,32 @@ def update(config: Config, values: dict[str, Any]) -> Config:
     new = {type(stage): stage for name, stage in changed.items() if name not in OWN_STAGES}
     others = tuple({**{type(stage): stage for stage in config.others}, **new}.values())
     return dataclasses.replace(config, **own, others=others)
+
+
+def load_stages(path: str | Path) -> dict[str, Any]:
+    """The stages of a YAML file as nested {stage: {field: value}}; in it, flat ROS names (``search.seed``) or nested ones.
+    BadInputError if it cannot be read or holds something else."""
+    text = io.read_text(path, "configuration", "a file like config/calib_ros.yaml")
+    try:
+        data = io.load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date that is none
+        wrong = io.what_is_wrong(error)
+        raise BadInputError(f"{path} is not valid YAML{wrong}; correct it or start from config/calib_ros.yaml") from None
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise BadInputError(f"{path} must hold stages with names and values, as config/calib_ros.yaml does")
+    ros = next((v for v in data.values() if isinstance(v, dict) and "ros__parameters" in v), None)
+    if ros is None:
+        return data
+    parameters = ros["ros__parameters"] or {}  # nothing: everything in the file is commented out
+    if not isinstance(parameters, dict):
+        raise BadInputError(f"{path}: ros__parameters must hold names and values, as in config/calib_ros.yaml")
+    stages: dict[str, Any] = {}
+    for key, value in parameters.items():
+        stage, dot, name = str(key).partition(".")
+        if dot:  # the node's own settings have no dot; an unknown stage is refused by update()
+            stages.setdefault(stage, {})[name] = value
+        elif isinstance(value, dict):
+            stages.setdefault(stage, {}).update(value)
+    return stages

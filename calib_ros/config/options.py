@@ -22,10 +22,8 @@ def option(
     length: int | None = None,
     formerly: str | None = None,
 ) -> Any:
-    """A field with its description and its allowed range (inclusive; for tuples, of every element).
-
-    formerly: the name of the field in earlier versions; files and parameters that use it are still read.
-    """
+    """A field with its description and its allowed range (inclusive; for tuples, of every element). formerly: the name of the
+    field in earlier versions; files and parameters that use it are still read."""
     meta = {"doc": doc, "low": low, "high": high, "choices": choices, "length": length, "formerly": formerly}
     return field(default=default, metadata=meta)
 
@@ -47,11 +45,8 @@ def stage_name(stage: type) -> str:
 
 
 def current_names(stage: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """`values` of a stage with former field names replaced by the current ones.
-
-    Removed options are left out. Warns of them and of each former name (FutureWarning). ConfigError if a field is given under
-    both names.
-    """
+    """`values` of a stage with former field names replaced by the current ones. Removed options are left out. Warns of them and
+    of each former name (FutureWarning). ConfigError if a field is given under both names."""
     prefix = stage_name(stage)
     out = {name: value for name, value in values.items() if f"{prefix}.{name}" not in REMOVED}
     for notice in notices({f"{prefix}.{name}": value for name, value in values.items() if name not in out}):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,26 @@ from calib_ros.datasets.bag_file import (
     is_rectified,
     peek_header,
 )  # fmt: skip
-from calib_ros.datasets.bag_index import MAX_KEPT, BagIndex, TopicIndex, located
-from calib_ros.datasets.bag_windows import HALF_WIDTHS, Slots
+from calib_ros.datasets.bag_index import MAX_KEPT, BagIndex, Span, TopicIndex, located
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.sweep import BLIND_CLOUDS, SweepOffset
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image
-from calib_ros.stamps import nearest_index, nearest_pairs, pair_tolerance, usual_period
+from calib_ros.stamps import Stamps, nearest_index, nearest_pairs, pair_tolerance, usual_period
+
+# Half widths of windows, in periods of the slower sensor: four hold a frame and its neighbours; of late ones, it takes more.
+HALF_WIDTHS = (2.0, 6.0)
+# Where in its slot a window is looked for: in the middle, and elsewhere if no frame is there, as in an interruption.
+PLACES = (0.5, 0.2, 0.8)
+ENOUGH = 0.5  # share of the slots that must have a frame
+WORTHWHILE = 0.6  # share of the recording above which the whole of it is read instead
 
 
 class BagSource:
     """Frames of one camera and one LiDAR in a bag: each image with the cloud that swept its view at the nearest time, by the
-    node's rules.
-
-    Opening reads the headers of the whole bag once (at the disk's speed), or short windows of it; `source[i]` fetches its two
-    messages by their recording time. Topics are found by type if there is one of each. Not thread-safe.
+    node's rules. Topics are found by type if there is one of each. Not thread-safe.
 
     Parameters
     ----------
@@ -49,8 +53,7 @@ class BagSource:
         of the windows, and `middles` has the position of one in each, between two others. For a bag that has an index.
 
     `camera` and `reference` are those of the first frame; `vehicle_frames` are T_camera_F (4, 4) of further frames F, by name.
-    Each frame has the CameraInfo nearest in time and T_camera_lidar of the static transforms recorded up to then, None if they do
-    not connect the two frames. Raises BadInputError for no or several candidates for a topic, no pairs, a damaged bag or message.
+    Raises BadInputError for no or several candidates for a topic, no pairs, a damaged bag or message.
     """
 
     def __init__(
@@ -82,7 +85,9 @@ class BagSource:
             self._index = self._new_index()
             # Of a short bag nearly every message is asked for, some several times.
             self._index.read(keep=bool(windows) and self._bag.size <= MAX_KEPT)
-            self._index.check_complete()
+            if self._index.missing:
+                missing = ", ".join(self._index.missing)
+                raise BadInputError(f"bag {self.path}: no message on {missing} is readable; copy it again or record it again")
             self._pair()
         self.windows = 0 if found is None else len(found)
         self.camera_frame, self.lidar_frame = self._index.camera_frame, self._index.lidar_frame
@@ -111,7 +116,7 @@ class BagSource:
             self._index = self._new_index()
             while spans := slots.next_spans():
                 self._index.read_spans(spans)
-                if self._index.is_complete:
+                if not self._index.missing:
                     self._pair()
                     image, cloud = self._index.image, self._index.cloud
                     slots.look(image.recorded[self._pairs[0]], cloud.recorded[self._pairs[1]])
@@ -210,3 +215,50 @@ class BagSource:
             "lidar_frame": self.lidar_frame,
             "reference": "none" if self.reference is None else "from /tf_static",
         }
+
+
+class Slots:
+    """Equal parts of a recording, in each of which one frame with a neighbour on either side is looked for. start, stop: of the
+    recording, ns. count: of slots. half: half the width of a window, ns."""
+
+    def __init__(self, start: int, stop: int, count: int, half: int) -> None:
+        self._half, self._count = half, count
+        edges = np.linspace(start, stop, count + 1).astype(np.int64).tolist()
+        worthwhile = 2 * half * count < WORTHWHILE * (stop - start)
+        self._slots = list(pairwise(edges)) if worthwhile else []
+        self._places = list(PLACES)
+        self._read: list[Span] = []
+        self._windows: dict[int, Span] = {}  # the newest of each slot
+        self._frames: dict[int, int] = {}  # slot -> position of its frame
+
+    def next_spans(self) -> list[Span]:
+        """Windows to read next, apart from each other and from all before; none when every slot has its frame, or there is
+        nowhere left to look. Where no slot has one in its middle, windows are too short, and no others are tried."""
+        spans: list[Span] = []
+        while self._places and not spans and (self._frames or not self._windows):
+            place = self._places.pop(0)
+            for slot, (start, stop) in enumerate(self._slots):
+                middle = start + round(place * (stop - start))
+                span = (middle - self._half, middle + self._half)
+                if slot not in self._frames and not self._overlaps(span):
+                    spans.append(span)
+                    self._read.append(span)
+                    self._windows[slot] = span
+        return spans
+
+    def _overlaps(self, span: Span) -> bool:
+        return any(span[0] < stop and start < span[1] for start, stop in self._read)
+
+    def look(self, images: Stamps, clouds: Stamps) -> None:
+        """Look for the frames of the windows. images, clouds: (n,) recording times of all pairs, in their order."""
+        self._frames = {}
+        for slot, (start, stop) in self._windows.items():
+            inside = (start <= images) & (images < stop) & (start <= clouds) & (clouds < stop)
+            between = np.flatnonzero(inside)[1:-1]
+            if len(between):
+                self._frames[slot] = int(between[np.argmin(np.abs(images[between] - (start + stop) // 2))])
+
+    @property
+    def frames(self) -> list[int] | None:
+        """Positions of the frames in the middle of the windows; None if too few have one."""
+        return sorted(self._frames.values()) if len(self._frames) >= max(ENOUGH * self._count, 1) else None

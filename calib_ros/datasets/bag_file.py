@@ -13,17 +13,16 @@ from typing import Any, NamedTuple
 from weakref import finalize
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS
 
-Matrix = NDArray[np.float64]
 STORAGE = {".mcap": "mcap", ".db3": "sqlite3"}
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -42,13 +41,10 @@ class Topic(NamedTuple):
 
 
 class BagFile:
-    """An open bag: topics, raw messages, decoding.
+    """An open bag: topics, raw messages, decoding. Not thread-safe. Closes its files on `close` or garbage collection.
 
-    indexed: whether messages of a topic and time are found without reading the others. An mcap file without chunks, or without a
-    summary, has to be read from its beginning.
-
-    Raises BadInputError for whatever is wrong with its files, when opening or when reading. Not thread-safe. Closes its files on
-    `close` or garbage collection.
+    indexed: whether messages of a topic and time are found without reading the others, as in an mcap file with chunks and a
+    summary. Raises BadInputError for whatever is wrong with its files, when opening or when reading.
     """
 
     def __init__(self, path: Path) -> None:
@@ -112,19 +108,12 @@ class BagFile:
 
 @cache
 def typestore() -> Typestore:
-    """The message types of ROS 2.
-
-    Those used here are the same in every release, so that the definitions embedded in a bag, which may hold broken user types,
-    are not needed.
-    """
+    """The message types of ROS 2, the same in every release: a bag's own definitions, maybe broken, are not needed."""
     return get_typestore(Stores.ROS2_KILTED)
 
 
 def storage_file(path: Path) -> Path:
-    """The first storage file of a bag, whose suffix is its format.
-
-    A folder without metadata.yaml (interrupted recording) may hold only one.
-    """
+    """The first storage file of a bag, whose suffix is its format; the only one of an interrupted recording."""
     if not path.exists():
         raise BadInputError(f"{path} does not exist; give a bag folder, a .mcap or a .db3 file")
     if path.is_file():
@@ -176,10 +165,8 @@ class StaticTransforms:
         return None if edge is None else edge[0]
 
     def lookup(self, target: str, source: str, without: str | None = None) -> Matrix | None:
-        """T_target_source (4, 4) through the tree in either direction; None if the frames are not connected.
-
-        without: a child whose edge to its parent is left out.
-        """
+        """T_target_source (4, 4) through the tree in either direction; None if the frames are not connected. without: a child
+        whose edge to its parent is left out."""
         found = self._reached(target, without)
         return found[source][0] if source in found else None
 

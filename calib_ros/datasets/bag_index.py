@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
-from calib_ros.datasets.bag_file import TF, BagFile, Matrix, StaticTransforms, peek_header
+from calib_ros.datasets.bag_file import TF, BagFile, StaticTransforms, peek_header
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import decode_camera_info
@@ -18,17 +19,13 @@ from calib_ros.stamps import Stamps, nearest_index
 
 Span = tuple[int, int]  # [start, stop) of recording times, ns
 MAX_KEPT = 256 * 2**20  # bytes of messages held in memory: thirty frames of 2 Mpx in colour with their clouds
-# Static transforms are latched: recorders hold each once or a few times. Where they are repeated more often, reading all of them
-# is reading the bag, and those at its beginning and before the windows are enough.
+# Where static transforms are repeated more often than this, those at the bag's beginning and before the windows are enough.
 FEW_TRANSFORMS, BEGINNING = 100, 5 * NANOSECONDS
 
 
 class BagIndex:
-    """What is needed to pair the messages of a bag and to fetch them one by one, with its cameras and static transforms.
-
-    Nothing is read before `read` or `read_spans`; both end with `finish`. Keeps some tens of bytes per message, and the messages
-    of `read_spans` themselves, up to MAX_KEPT.
-    """
+    """What is needed to pair the messages of a bag and to fetch them one by one, with its cameras and static transforms. Nothing
+    is read before `read` or `read_spans`; the messages of the latter are kept, up to MAX_KEPT."""
 
     def __init__(self, bag: BagFile, image_topic: str, points_topic: str, info_topic: str, rectified: bool) -> None:
         self._bag, self._rectified = bag, rectified
@@ -51,7 +48,7 @@ class BagIndex:
                 self._transforms.append((recorded, self._bag.decode(topic, data)))
             else:
                 self._add(topic, recorded, data)
-        self.finish()
+        self._finish()
 
     def read_spans(self, spans: list[Span]) -> None:
         """Read only what was recorded in these spans, which neither overlap nor have been read; CameraInfo and static transforms
@@ -60,14 +57,13 @@ class BagIndex:
             self._kept = {}
         info_period = self._bag.period(self.info.topic)
         for start, stop in spans:
-            beside = info_period > (stop - start) / 2
-            topics = [self.image.topic, self.cloud.topic] + ([] if beside else [self.info.topic])
+            rare = info_period > (stop - start) / 2
+            topics = [self.image.topic, self.cloud.topic] + ([] if rare else [self.info.topic])
             for message in self._bag.raw(topics, start, stop):
                 self._add(*message)
-            if beside:
-                for message in self._bag.raw([self.info.topic], start - info_period, stop + info_period):
-                    self._add(*message)
-        self.finish(self._read_transforms(spans))
+            for message in self._bag.raw([self.info.topic], start - info_period, stop + info_period) if rare else ():
+                self._add(*message)
+        self._finish(self._read_transforms(spans))
 
     def _add(self, topic: str, recorded: int, data: bytes) -> None:
         with located(self._bag.path, topic):
@@ -86,7 +82,7 @@ class BagIndex:
         count = sum(self._bag.topics[topic].messages for topic in self._statics)
         if count <= FEW_TRANSFORMS:
             if not self._transforms:
-                self._transforms = self._all_transforms()
+                self._transforms = self._transforms_within()
             return False
         if not self._transforms:
             self._transforms += self._transforms_within(self._bag.start, self._bag.start + BEGINNING)
@@ -96,14 +92,11 @@ class BagIndex:
         self._transforms.sort(key=lambda one: one[0])
         return True
 
-    def _all_transforms(self) -> list[tuple[int, Any]]:
-        return self._transforms_within(None, None)
-
-    def _transforms_within(self, start: int | None, stop: int | None) -> list[tuple[int, Any]]:
+    def _transforms_within(self, start: int | None = None, stop: int | None = None) -> list[tuple[int, Any]]:
         found = self._bag.raw(self._statics, start, stop)
         return [(recorded, self._bag.decode(topic, data)) for topic, recorded, data in found]
 
-    def finish(self, more_transforms: bool = False) -> None:
+    def _finish(self, more_transforms: bool = False) -> None:
         """Put in order what was read. more_transforms: look for others if those read do not connect camera and LiDAR."""
         self.camera_frame = self.image.frame or self.info.frame
         self.lidar_frame = self.cloud.frame
@@ -113,21 +106,13 @@ class BagIndex:
         self._cameras = [self._found_cameras[i] for i in self.info.order]
         self._references = _references(self._transforms, self.camera_frame, self.lidar_frame)
         if more_transforms and not self._references:
-            self._transforms = self._all_transforms()
+            self._transforms = self._transforms_within()
             self._references = _references(self._transforms, self.camera_frame, self.lidar_frame)
 
     @property
-    def is_complete(self) -> bool:
-        """Whether there is a message of every topic."""
-        return all(len(index) for index in self._by_topic.values())
-
-    def check_complete(self) -> None:
-        """BadInputError if a topic has no message at all."""
-        for index in self._by_topic.values():
-            if not len(index):
-                raise BadInputError(
-                    f"bag {self._bag.path}: no message on {index.topic} is readable; copy it again or record it again"
-                )
+    def missing(self) -> list[str]:
+        """Topics without any message."""
+        return [topic for topic, index in self._by_topic.items() if not len(index)]
 
     def kept(self, topic: str, recorded: int, header: int) -> bytes | None:
         """A message that is in memory."""
@@ -154,10 +139,8 @@ class BagIndex:
 
 
 class TopicIndex:
-    """Where the messages of one topic are.
-
-    After `finish`, sorted by stamp, in ns: stamps (n,), headers (n,) of the headers, recorded (n,) recording times.
-    """
+    """Where the messages of one topic are. After `finish`, sorted by stamp, in ns: stamps (n,), headers (n,) of the headers,
+    recorded (n,) recording times."""
 
     def __init__(self, topic: str) -> None:
         self.topic = topic

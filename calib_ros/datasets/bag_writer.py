@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,13 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud
 
-TF_STATIC = "/tf_static"
+IMAGES, CAMERA_INFO, POINTS, TF_STATIC = "/camera/image_raw", "/camera/camera_info", "/velodyne_points", "/tf_static"
 MAX_STAMP_NS = 2**31 * NANOSECONDS  # what a message can hold
 SPACING_NS = NANOSECONDS // 10  # between frames that have no stamps of their own
 BAG_VERSION: Final = 8  # what every ROS 2 release from Humble on reads
 STORAGE = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 DATATYPES = {"<f4": 7, "<u2": 4}  # of sensor_msgs/PointField, by numpy's
+Message = tuple[int, str, Any]  # stamp in ns, topic, message object of rosbags
 _NEVER = QosTime(9223372036, 854775807)
 LATCHED = Qos(
     QosHistory.KEEP_LAST,
@@ -44,13 +45,10 @@ def write_bag(
     source: Source,
     path: str | Path,
     storage: str = "mcap",
-    *,
-    image_topic: str = "/camera/image_raw",
-    camera_info_topic: str = "/camera/camera_info",
-    points_topic: str = "/velodyne_points",
+    positions: Sequence[int] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write all frames of a source into a new bag folder and return its path.
+    """Write frames of a source, by default all, into a new bag folder and return its path.
 
     Writes Image, CameraInfo (with the image's stamp), PointCloud2 and, if the source knows it, T_camera_lidar on /tf_static
     (again when it changes), in the order of their stamps. A frame whose stamp does not increase gets that of its predecessor
@@ -58,23 +56,20 @@ def write_bag(
 
     Raises BadInputError if the path exists or cannot be written; then, as after an interruption, nothing is left behind.
     """
-    path = Path(path)
-    topics = Topics(image_topic, camera_info_topic, points_topic)
+    path, positions = Path(path), range(len(source)) if positions is None else positions
     if storage not in STORAGE:
         raise BadInputError(f"storage '{storage}' is unknown; use one of {', '.join(STORAGE)}")
     if path.exists() or path.is_symlink():
         raise BadInputError(f"{path} exists already and is not overwritten; remove it or give another path")
-    if not len(source):
+    if not len(positions):
         raise BadInputError(f"{source.name} has no frames to write; give a source with frames")
-    if len({*topics, TF_STATIC}) < 4:
-        raise BadInputError(f"topics {', '.join(topics)} must differ from each other and from {TF_STATIC}; rename one")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # An interrupted conversion leaves no partial bag: the folder gets its name when it is complete.
         with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
             partial = Path(scratch) / path.name
             with Writer(partial, version=BAG_VERSION, storage_plugin=STORAGE[storage]) as writer:
-                _write(writer, _in_stamp_order(_messages(source, topics, progress)))
+                _write(writer, _in_stamp_order(_messages(source, positions, progress)))
             partial.rename(path)
     except OSError as error:
         raise BadInputError(
@@ -166,22 +161,6 @@ class MessageBuilder:
         return self._types["std_msgs/msg/Header"](time, frame)
 
 
-class Topics(NamedTuple):
-    """The topics of the bag."""
-
-    image: str
-    camera_info: str
-    points: str
-
-
-class Message(NamedTuple):
-    """A message to write: stamp in ns, topic, message object of rosbags."""
-
-    stamp: int
-    topic: str
-    content: Any
-
-
 def _write(writer: Writer, messages: Iterable[Message]) -> None:
     types = typestore()
     connections: dict[str, Connection] = {}
@@ -193,16 +172,14 @@ def _write(writer: Writer, messages: Iterable[Message]) -> None:
         writer.write(connections[topic], stamp, types.serialize_cdr(content, kind))
 
 
-def _messages(source: Source, topics: Topics, progress: Callable[[int, int], None] | None) -> Iterator[list[Message]]:
+def _messages(source: Source, positions: Sequence[int], progress: Callable[[int, int], None] | None) -> Iterator[list[Message]]:
     """The messages of each frame."""
     build = MessageBuilder(typestore(), source.camera_frame, source.lidar_frame)
     reference: NDArray[np.float64] | None = None
     previous: int | None = None
-    for index in range(len(source)):
+    for done, index in enumerate(positions, 1):
         frame = source[index]
-        stamp = frame.stamp
-        if previous is not None and stamp <= previous:
-            stamp = previous + SPACING_NS
+        stamp = frame.stamp if previous is None or frame.stamp > previous else previous + SPACING_NS
         previous = stamp
         delay = 0 if frame.cloud_stamp is None else frame.cloud_stamp - frame.stamp
         cloud_stamp = max(stamp + delay, 0)
@@ -211,18 +188,18 @@ def _messages(source: Source, topics: Topics, progress: Callable[[int, int], Non
                 f"frame {frame.name or index} of {source.name} is stamped {stamp / NANOSECONDS:.9g} s, its cloud "
                 f"{cloud_stamp / NANOSECONDS:.9g} s, which no message can hold; correct the timestamps of the source"
             )
-        messages = [
-            Message(stamp, topics.image, build.image(stamp, frame.image)),
-            Message(stamp, topics.camera_info, build.camera_info(stamp, frame.camera)),
-            Message(cloud_stamp, topics.points, build.cloud(cloud_stamp, frame.cloud)),
+        messages: list[Message] = [
+            (stamp, IMAGES, build.image(stamp, frame.image)),
+            (stamp, CAMERA_INFO, build.camera_info(stamp, frame.camera)),
+            (cloud_stamp, POINTS, build.cloud(cloud_stamp, frame.cloud)),
         ]
         if frame.reference is not None and (reference is None or not np.array_equal(reference, frame.reference)):
             reference = frame.reference
             first = min(stamp, cloud_stamp)
-            messages.insert(0, Message(first, TF_STATIC, build.static_transform(first, reference)))
+            messages.insert(0, (first, TF_STATIC, build.static_transform(first, reference)))
         yield messages
         if progress is not None:
-            progress(index + 1, len(source))
+            progress(done, len(positions))
 
 
 def _in_stamp_order(frames: Iterable[list[Message]]) -> Iterator[Message]:
@@ -231,11 +208,11 @@ def _in_stamp_order(frames: Iterable[list[Message]]) -> Iterator[Message]:
     waiting: list[tuple[int, int, Message]] = []
     count = 0
     for messages in frames:
-        earliest = min(message.stamp for message in messages)
+        earliest = min(stamp for stamp, _, _ in messages)
         while waiting and waiting[0][0] < earliest:
             yield heapq.heappop(waiting)[2]
         for message in messages:
-            heapq.heappush(waiting, (message.stamp, count, message))
+            heapq.heappush(waiting, (message[0], count, message))
             count += 1  # keeps equal stamps in order, and messages from being compared
     while waiting:
         yield heapq.heappop(waiting)[2]

@@ -30,11 +30,10 @@ CLOUD_COMPARE = "scalar_"  # before the names of fields in PLY files that CloudC
 
 
 def read_cloud(path: Path, stamp: int = 0) -> PointCloud:
-    """The points of a file by its ending: .pcd, .ply, .bin (float32 x, y, z, intensity) or .npz.
+    """The points of a file by its ending: .pcd, .ply, .bin (float32 x, y, z, intensity) or .npz; NaN points are kept.
 
-    stamp: of the cloud, ns, from which absolute times of points count. Fields the file lacks are None; NaN points are kept.
-    Raises BadInputError, with the path, for a damaged file or one without x, y, z; MissingDependencyError without the library
-    that reads it.
+    stamp: of the cloud, ns, from which absolute times of points count. Raises BadInputError for a damaged file or one without
+    x, y, z; MissingDependencyError without the library that reads it.
     """
     suffix = path.suffix.lower()
     if suffix == ".bin":

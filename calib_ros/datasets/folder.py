@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from calib_ros import io, se3
+from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
 from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, read_cloud
 from calib_ros.datasets.source import describe_camera
@@ -22,20 +23,12 @@ from calib_ros.messages.image_encodings import picture_to_bgr
 from calib_ros.messages.pictures import decode_picture
 from calib_ros.messages.wire import shown
 
-Matrix = NDArray[np.float64]
 IMAGES, CLOUDS, CALIBRATION, TIMES = "images", "clouds", "calibration.yaml", "times.csv"
 EXPECTED_FOLDER = f"{IMAGES}/, {CLOUDS}/ and {CALIBRATION} (plain folder)"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 PERIOD_NS = NANOSECONDS // 10  # between frames without times.csv: most scanners turn at 10 Hz
 MAX_STAMP = 2**63
 SHOWN_NAMES = 5  # of files without partner
-
-
-class FrameStamps(NamedTuple):
-    """Stamps of a frame's image and cloud, ns; cloud None = unknown."""
-
-    image: int
-    cloud: int | None
 
 
 class FolderSource:
@@ -53,8 +46,7 @@ class FolderSource:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.name = self.path.resolve().name
-        calibration = FolderCalibration.read(self.path / CALIBRATION)
-        self.camera, self.reference, self.camera_frame = calibration
+        self.camera, self.reference, self.camera_frame = _read_calibration(self.path / CALIBRATION)
         self._images = named_files(self.path / IMAGES, IMAGE_SUFFIXES)
         self._clouds = named_files(self.path / CLOUDS, CLOUD_SUFFIXES)
         names = sorted(self._images.keys() & self._clouds.keys(), key=_natural)
@@ -65,10 +57,10 @@ class FolderSource:
             )
         self._has_times = (self.path / TIMES).exists()
         if self._has_times:
-            self._stamps = read_times(self.path / TIMES, names)
-            names.sort(key=lambda name: self._stamps[name].image)
+            self._stamps = _read_times(self.path / TIMES, names)
+            names.sort(key=lambda name: self._stamps[name][0])
         else:
-            self._stamps = {name: FrameStamps(k * PERIOD_NS, None) for k, name in enumerate(names)}
+            self._stamps = {name: (k * PERIOD_NS, None) for k, name in enumerate(names)}
         self.names = names
         self._read_image(names[0])
 
@@ -92,11 +84,8 @@ class FolderSource:
         """What the folder holds: label -> text."""
         first = self[0].cloud
         fields = [name for name in ("intensity", "ring", "time") if getattr(first, name) is not None]
-        alone = [
-            _alone(self._images, self._clouds, "image without cloud"),
-            _alone(self._clouds, self._images, "cloud without image"),
-        ]
-        left_out = "; ".join(text for text in alone if text) or "none"
+        unused = _alone(self._images, self._clouds, "image", "cloud"), _alone(self._clouds, self._images, "cloud", "image")
+        left_out = "; ".join(text for text in unused if text) or "none"
         return {
             "kind": "folder",
             "path": str(self.path),
@@ -144,50 +133,35 @@ def named_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     return found
 
 
-class FolderCalibration(NamedTuple):
-    """Content of calibration.yaml: camera, T_camera_lidar (4, 4) if given, name of the camera's frame."""
-
-    camera: Camera
-    reference: Matrix | None
-    camera_frame: str
-
-    @classmethod
-    def read(cls, path: Path) -> FolderCalibration:
-        """Read a file. BadInputError, with its path, if it is missing, no such file, or contradicts itself."""
-        wanted = "what ROS camera_calibration writes: image_width, image_height, camera_matrix, distortion_coefficients"
-        if not path.is_file():
-            raise BadInputError(f"calibration {path} is missing; put there {wanted}")
-        try:
-            values = io.load(io.read_text(path, "calibration", wanted))
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
-            line = f" (line {error.problem_mark.line + 1})" if getattr(error, "problem_mark", None) else ""  # type: ignore[union-attr]
-            raise BadInputError(f"calibration {path} is not valid YAML{line}; give {wanted}") from None
-        if not isinstance(values, dict):
-            raise BadInputError(f"calibration {path} has no names; give {wanted}")
-        try:
-            return cls(
-                decode_camera_info(
-                    SimpleNamespace(
-                        width=_integer(values, "image_width"),
-                        height=_integer(values, "image_height"),
-                        k=_numbers(values, "camera_matrix", 9),
-                        d=_numbers(values, "distortion_coefficients") if values.get("distortion_coefficients") else np.zeros(0),
-                        distortion_model=values.get("distortion_model") or "",
-                    )
-                ),
-                None if values.get("T_camera_lidar") is None else se3.as_transform(values["T_camera_lidar"], "T_camera_lidar"),
-                shown(values.get("camera_name") or "camera"),
-            )
-        except BadInputError as error:
-            raise BadInputError(f"calibration {path}: {str(error).removeprefix('CameraInfo: ')}") from error
+def _read_calibration(path: Path) -> tuple[Camera, Matrix | None, str]:
+    """Camera, T_camera_lidar (4, 4) if given, and name of the camera's frame."""
+    wanted = "what ROS camera_calibration writes: image_width, image_height, camera_matrix, distortion_coefficients"
+    if not path.is_file():
+        raise BadInputError(f"calibration {path} is missing; put there {wanted}")
+    try:
+        values = io.load(io.read_text(path, "calibration", wanted))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise BadInputError(f"calibration {path} is not valid YAML{io.what_is_wrong(error)}; give {wanted}") from None
+    if not isinstance(values, dict):
+        raise BadInputError(f"calibration {path} has no names; give {wanted}")
+    try:
+        info = SimpleNamespace(
+            width=_integer(values, "image_width"),
+            height=_integer(values, "image_height"),
+            k=_numbers(values, "camera_matrix", 9),
+            d=_numbers(values, "distortion_coefficients") if values.get("distortion_coefficients") else np.zeros(0),
+            distortion_model=values.get("distortion_model") or "",
+        )
+        T = values.get("T_camera_lidar")
+        reference = None if T is None else se3.as_transform(T, "T_camera_lidar")
+        return decode_camera_info(info), reference, shown(values.get("camera_name") or "camera")
+    except BadInputError as error:
+        raise BadInputError(f"calibration {path}: {str(error).removeprefix('CameraInfo: ')}") from error
 
 
-def read_times(path: Path, names: list[str]) -> dict[str, FrameStamps]:
-    """Stamps of the frames from a table with the columns name, image_ns and, optionally, cloud_ns.
-
-    BadInputError, with its path, for other columns, values that are no whole nanoseconds, or a frame missing or there twice.
-    """
-    stamps: dict[str, FrameStamps] = {}
+def _read_times(path: Path, names: list[str]) -> dict[str, tuple[int, int | None]]:
+    """Stamps, ns, of each frame's image and, if given, cloud."""
+    stamps: dict[str, tuple[int, int | None]] = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file, skipinitialspace=True)
@@ -198,7 +172,7 @@ def read_times(path: Path, names: list[str]) -> dict[str, FrameStamps]:
                 where, name, cloud = f"{path}, line {table.line_num}", values.get("name", ""), values.get("cloud_ns")
                 if name in stamps:
                     raise BadInputError(f"{where}: frame {shown(name)} has stamps already; keep one line for each frame")
-                stamps[name] = FrameStamps(_stamp(values.get("image_ns", ""), where), _stamp(cloud, where) if cloud else None)
+                stamps[name] = _stamp(values.get("image_ns", ""), where), _stamp(cloud, where) if cloud else None
     except OSError as error:
         raise BadInputError(f"{path} cannot be read ({error.strerror}); check the file") from error
     except (UnicodeDecodeError, csv.Error):
@@ -245,9 +219,8 @@ def _natural(name: str) -> tuple[int, int, str]:
     return (0, int(name), name) if name.isdecimal() else (1, 0, name)
 
 
-def _alone(files: dict[str, Path], others: dict[str, Path], what: str) -> str:
+def _alone(files: dict[str, Path], others: dict[str, Path], kind: str, other: str) -> str:
     """'2 images without cloud (000003.jpg, 000007.jpg)'; empty if every file has a partner."""
     alone = [files[name].name for name in files if name not in others]
-    first, _, rest = what.partition(" ")
     some = ", ".join(shown(name) for name in alone[:SHOWN_NAMES]) + (", ..." if len(alone) > SHOWN_NAMES else "")
-    return f"{len(alone)} {first}{'s' if len(alone) > 1 else ''} {rest} ({some})" if alone else ""
+    return f"{len(alone)} {kind}{'s' if len(alone) > 1 else ''} without {other} ({some})" if alone else ""

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.arrays import Transform
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.kitti_files import (
     IMAGE_SUFFIXES,
     CalibrationFile,
-    Matrix,
     ScanMotion,
     Timestamps,
     image_moment,
@@ -42,10 +41,8 @@ _PARENT_FOLDER = re.compile(r"\d{4}_\d\d_\d\d|sequences|dataset|raw|odometry|obj
 class KittiSource:
     """Frames of a KITTI raw drive, odometry sequence or object folder, for one of the cameras 0 to 3.
 
-    A frame is a number with an image and a scan; files are read on access. Stamps belong to the number, so that missing frames
-    leave gaps. Frames of raw drives have point times, the exposure of the image as stamp and, with oxts, the LiDAR's twist. In
-    the object layout each frame has its own calibration: `camera` and `reference` are those of the first frame, Frame.camera
-    and Frame.reference the frame's own.
+    A frame is a number with an image and a scan; files are read on access. Frames of raw drives have point times, the exposure of
+    the image as stamp and, with oxts, the LiDAR's twist. In the object layout each frame has its own calibration.
 
     Raises BadInputError, with the path and what to do, for another folder, a missing camera, missing or damaged files.
     """
@@ -243,11 +240,8 @@ def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Dr
 
 
 def _extrinsic(P: Matrix, R0_rect: Matrix, Tr: Transform, path: Path) -> Transform:
-    """T_camN_velo = [I | inv(K) P[:, 3]] R0_rect Tr (4, 4): scanner, camera 0, rectified camera 0, camera N.
-
-    Geiger et al., Vision meets Robotics, 2013, eq. 4-8. The last column of P holds the offset between the rectified cameras,
-    about 6 cm for camera 2.
-    """
+    """T_camN_velo = [I | inv(K) P[:, 3]] R0_rect Tr (4, 4) (Geiger et al., Vision meets Robotics, 2013, eq. 4-8)."""
+    # The last column of P holds the offset between the rectified cameras, about 6 cm for camera 2.
     K = P[:, :3]
     if abs(np.linalg.det(K)) < 1e-9:
         raise BadInputError(f"calibration {path}: a projection matrix is singular; download the calibration again")

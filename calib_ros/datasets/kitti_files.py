@@ -10,17 +10,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros.messages.pictures import decode_picture
 
-Matrix = NDArray[np.float64]
-Floats = NDArray[np.float64]
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # KITTI has PNG; copies are often recompressed
 DIGITS = 10  # of a frame number; longer names are not frames
 DATE = re.compile(r"(19|20)\d\d-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 MAX_STAMP_S = 2**31  # that a ROS message can hold
-POINT_BYTES = 16  # x, y, z, reflectance as float32
 OXTS_FIELDS = 30
 ATTITUDE, VELOCITY, RATES = slice(3, 5), slice(8, 11), slice(17, 20)  # roll, pitch; vf, vl, vu; wx, wy, wz
 # T_velo_imu without calib_imu_to_velo.txt: aligned axes (they are to 0.9 deg) and the lever arm of the recordings' cars, m.
@@ -28,10 +26,8 @@ NOMINAL_LEVER_ARM = (-0.81, 0.32, -0.80)
 PERIOD_S = 0.1033  # of a revolution, without timestamps_start.txt and timestamps_end.txt
 TURN_LIMITS_S = (0.02, 0.5)  # stamps of start and end that give another duration are ignored
 # The scanner triggers the cameras as it faces forward, which is when a scan is stamped (Geiger et al., Vision meets Robotics,
-# 2013), and the exposure takes 2 ms at most. So an image does not show the moment of its own stamp, 10.5 ms after the scan's: it
-# arrived then. The delay was measured on drive 0005, with the scans moved by oxts: the score at the recording's own
-# extrinsic is highest at 3 ms (29 frames) and 4 ms (the faster 13), that of the re-estimated extrinsic at 4.5 to 5 ms; a
-# millisecond is 4 to 6 mm along the road.
+# 2013). An image's own stamp, 10.5 ms later, is when it arrived. On drive 0005, with the scans moved by oxts, the score at the
+# recording's extrinsic is highest at 3 ms (29 frames) and 4 ms (the faster 13), that of the re-estimated one at 4.5 to 5 ms.
 TRIGGER_TO_IMAGE_NS = 4_000_000
 MAX_IMAGE_DELAY_NS = 50_000_000  # images stamped later were not triggered by this scan
 
@@ -46,15 +42,20 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 
 def read_scan(path: Path) -> PointCloud:
     """A Velodyne .bin in the order of the file, intensity 0..1, without rings and times. BadInputError if damaged."""
+    points = read_points(path, 4)  # x, y, z, reflectance
+    return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
+
+
+def read_points(path: Path, columns: int) -> NDArray[np.float32]:
+    """Points (n, columns) of a file of so many float32 each. BadInputError if damaged."""
     try:
         values = np.fromfile(path, "<f4")
         size = path.stat().st_size
     except OSError as error:
         raise BadInputError(f"scan {path} cannot be read ({error.strerror}); check the file") from error
-    if size == 0 or size % POINT_BYTES:
-        raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {POINT_BYTES}; copy it again")
-    points = values.reshape(-1, 4)
-    return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
+    if size == 0 or size % (4 * columns):
+        raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {4 * columns}; copy it again")
+    return values.reshape(-1, columns)
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
@@ -141,7 +142,7 @@ class Oxts:
             parts = se3.from_parts(file.matrix("R", 3, 3), file.matrix("T", 3, 1)[:, 0])
             self._T_velo_imu = se3.as_transform(parts, f"the calibration {calibration}")
 
-    def twist(self, number: int) -> Floats | None:
+    def twist(self, number: int) -> Matrix | None:
         """(rx, ry, rz, tx, ty, tz) of the LiDAR in its frame, rad/s and m/s; None without a file. BadInputError if damaged."""
         path = self.folder / f"{number:010d}.txt"
         if not path.is_file():
@@ -155,12 +156,9 @@ class Oxts:
         return lidar_twist(values, self._T_velo_imu)
 
 
-def lidar_twist(values: Floats, T_velo_imu: Floats) -> Floats:
-    """Numbers of an oxts file (30,) -> twist (6,) of the LiDAR in its own frame, rad/s and m/s.
-
-    vf, vl, vu are level with the ground (dataformat.txt), wx, wy, wz are in the frame of the car's body: roll and pitch separate
-    the two.
-    """
+def lidar_twist(values: Matrix, T_velo_imu: Transform) -> Matrix:
+    """Numbers of an oxts file (30,) -> twist (6,) of the LiDAR in its own frame, rad/s and m/s."""
+    # vf, vl, vu are level with the ground (dataformat.txt), wx, wy, wz in the body's frame: roll and pitch separate the two.
     roll, pitch = values[ATTITUDE]
     R_level_body = Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix()
     R, t = T_velo_imu[:3, :3], T_velo_imu[:3, 3]
@@ -183,7 +181,7 @@ class ScanMotion:
         """Whether the drive has velocities."""
         return self._oxts.folder.is_dir()
 
-    def twist(self, number: int) -> Floats | None:
+    def twist(self, number: int) -> Matrix | None:
         """See Oxts.twist."""
         return self._oxts.twist(number)
 
@@ -199,10 +197,7 @@ class ScanMotion:
         return PERIOD_S
 
     def times(self, cloud: PointCloud, number: int) -> NDArray[np.float32]:
-        """(n,) s after the scan's stamp.
-
-        The scanner turns clockwise and faces forward at the stamp; a scan begins and ends behind the car, at azimuth +-pi.
-        """
+        """(n,) s after the scan's stamp, at which the scanner, which turns clockwise, faces forward."""
         azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
         return np.asarray(-azimuth * (self.period_s(number) / (2 * np.pi)), np.float32)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
-from calib_ros.datasets.kitti_files import read_picture
+from calib_ros.datasets.kitti_files import read_picture, read_points
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -25,7 +25,6 @@ T = TypeVar("T")
 EXPECTED_NUSCENES = "v1.0-*/sample_data.json and samples/ (nuScenes)"
 CAMERA, LIDAR = "CAM_FRONT", "LIDAR_TOP"
 STAMP_NS = 1000  # stamps of the tables are in microseconds
-FIELDS = 5  # of a point: x, y, z, intensity, ring as float32
 MAX_GAP_NS = 300_000_000  # between two poses whose difference is a velocity; scans are 50 ms apart
 SHOWN_SCENES = 10  # all of v1.0-mini
 
@@ -33,9 +32,8 @@ SHOWN_SCENES = 10  # all of v1.0-mini
 class NuScenesSource:
     """The key frames of a nuScenes scene, for one of its cameras: about 40, half a second apart.
 
-    Stamps are those of sample_data. The scans are motion-compensated to their stamp, the moment of their last packet; the
-    LiDAR's twist, from the ego poses of the scans before and after, takes them from there to the image's. The reference is the
-    mount in calibrated_sensor: T_camera_lidar = inv(T_ego_camera) T_ego_lidar.
+    The scans are motion-compensated to their stamp; the LiDAR's twist, from the ego poses of the scans before and after, takes
+    them from there to the image's. The reference is T_camera_lidar = inv(T_ego_camera) T_ego_lidar of calibrated_sensor.
 
     Parameters
     ----------
@@ -185,10 +183,7 @@ class SceneTables:
         return [(image, scans[image.sample]) for image in self._of(channel) if image.key and image.sample in scans]
 
     def twist(self, scan: Record) -> Matrix | None:
-        """(rx, ry, rz, tx, ty, tz) of the LiDAR at a scan's stamp, rad/s and m/s, in its own frame; None without neighbours.
-
-        Between the poses at the scans before and after it, twice as far apart as two scans are: half the noise.
-        """
+        """(rx, ry, rz, tx, ty, tz) of the LiDAR at a scan's stamp, rad/s and m/s, in its own frame; None without neighbours."""
         stamps, poses = self._lidar_poses
         at = int(np.searchsorted(stamps, scan.stamp))
         near = [k for k in (at - 1, at, at + 1) if 0 <= k < len(stamps) and abs(stamps[k] - scan.stamp) <= MAX_GAP_NS]
@@ -264,14 +259,7 @@ def _numbers(value: Any) -> Matrix:
 
 def read_sweep(path: Path) -> PointCloud:
     """A .pcd.bin of x, y, z, intensity and ring, five float32 a point, in the order of the file. BadInputError if damaged."""
-    try:
-        values = np.fromfile(path, "<f4")
-        size = path.stat().st_size
-    except OSError as error:
-        raise BadInputError(f"scan {path} cannot be read ({error.strerror}); check the file") from error
-    if size == 0 or size % (4 * FIELDS):
-        raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {4 * FIELDS}; copy it again")
-    points = values.reshape(-1, FIELDS)
+    points = read_points(path, 5)
     with np.errstate(invalid="ignore"):
         return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy(), points[:, 4].astype(np.int32))
 

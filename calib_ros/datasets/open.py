@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,6 @@ from calib_ros.extensions import SOURCES, source_of
 from calib_ros.extensions import names as installed
 
 __all__ = ["Source", "open_dataset", "open_source"]
-BAG_OPTIONS = {
-    "image_topic",
-    "points_topic",
-    "camera_info_topic",
-    "tolerance_s",
-    "rectified",
-    "motion",
-    "T_camera_lidar",
-    "windows",
-}
 
 
 def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **options: Any) -> Source:
@@ -31,26 +22,15 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
 
     Parameters
     ----------
-    path_or_text : str or Path
-        Path of a bag, of a KITTI raw, odometry or object folder, of a folder with images/, clouds/ and calibration.yaml (see
-        `FolderSource`), or of nuScenes (``"ROOT#scene-0061"``, by default the first scene; see `NuScenesSource`). Or
-        ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as ``"synthetic[:name=value,...]"``, the simulated drive.
-    camera : int or str, optional
-        Camera of a KITTI folder, 0 to 3 (default 2), or of nuScenes, its channel or number (default CAM_FRONT). Other sources
-        have one camera.
-    **options
-        Of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion, T_camera_lidar, windows (see
-        `BagSource`); None = default.
+    path_or_text : path of a bag, of a KITTI raw, odometry or object folder, of a folder with images/, clouds/ and
+        calibration.yaml (see `FolderSource`), or of nuScenes (``"ROOT#scene-0061"``, by default the first scene; see
+        `NuScenesSource`). Or ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as
+        ``"synthetic[:name=value,...]"``, the simulated drive.
+    camera : of a KITTI folder, 0 to 3 (default 2), or of nuScenes, its channel or number (default CAM_FRONT).
+    **options : of a bag, see `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion,
+        T_camera_lidar, windows; None = default.
 
-    Returns
-    -------
-    Source
-        A sequence of `Frame` with ``name``, ``camera``, ``reference`` (None if unknown), ``camera_frame`` and ``lidar_frame``.
-
-    Raises
-    ------
-    BadInputError
-        The path is none of these (the message names what was looked for), or an option does not belong to the dataset.
+    Raises BadInputError if the path is none of these, or an option does not belong to the dataset.
     """
     options = {name: value for name, value in options.items() if value is not None}
     text = str(path_or_text)
@@ -72,7 +52,8 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     if is_bag(path):
         from calib_ros.datasets.bag import BagSource
 
-        _refuse({name: options[name] for name in options.keys() - BAG_OPTIONS}, text)
+        known = list(signature(BagSource).parameters)[1:]
+        _refuse({name: options[name] for name in options.keys() - known}, text)
         return BagSource(path, **options)
     if is_folder_dataset(path):
         _refuse(options, text)

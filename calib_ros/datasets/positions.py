@@ -11,9 +11,7 @@ ADVICE = "give all, a list like 0,4,8 or a range like 0:100:5"
 
 def frame_positions(text: str, count: int) -> list[int]:
     """'all', '0,4,8' or '0:100:5' (0-based, end excluded, as Python slices) -> positions in a source of `count` frames.
-
-    BadInputError for other text, positions out of range or named twice, or an empty selection.
-    """
+    BadInputError for other text, positions out of range or named twice, or an empty selection."""
     selection = _selection(text)
     positions: Sequence[int] = range(count)[selection] if isinstance(selection, slice) else selection
     wrong = [i for i in positions if not 0 <= i < count]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -14,10 +14,12 @@ from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
+from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
 
 Stamped = tuple[int, PointCloud]
 CACHED_CLOUDS = 4
+RUN_S, ENOUGH = 5.0, 0.8  # s of frames from which motion is estimated, and the share of it that is enough
+CENTRES = (0.5, 0.2, 0.8, 0.0, 1.0)  # around which of the chosen frames, as shares of their number
 
 
 class Source(Protocol):
@@ -60,10 +62,8 @@ def describe_camera(camera: Camera) -> str:
 
 
 class WithMotion:
-    """A source whose frames without a twist get it from the scans before and after them, if these are near enough in time.
-
-    warn: called once with a message if small_gicp is missing; frames then stay as they are.
-    """
+    """A source whose frames without a twist get it from the scans before and after them, if these are near enough in time. warn:
+    called once with a message if small_gicp is missing; frames then stay as they are."""
 
     def __init__(self, source: Source, config: MotionConfig, warn: Callable[[str], None] | None = None) -> None:
         self._source, self._config, self._warn = source, config, warn
@@ -109,10 +109,8 @@ class WithMotion:
     def _cloud(self, index: int) -> Stamped | None:
         """The cloud of a frame with its stamp; None if unusable."""
         if index not in self._clouds:
-            try:
-                self._keep(index, _stamped(self._source[index]) if 0 <= index < len(self) else None)
-            except CalibrationError:  # a damaged neighbour does not make this frame unusable
-                self._keep(index, None)
+            frame = _readable(self._source, index)  # a damaged neighbour does not make this frame unusable
+            self._keep(index, None if frame is None else _stamped(frame))
         return self._clouds[index]
 
     def _keep(self, index: int, cloud: Stamped | None) -> None:
@@ -120,6 +118,45 @@ class WithMotion:
         self._clouds.move_to_end(index)
         while len(self._clouds) > CACHED_CLOUDS:
             self._clouds.popitem(last=False)
+
+
+def neighbours(source: Source, positions: Sequence[int]) -> list[Frame]:
+    """Frames that follow each other within MAX_GAP_S around some of the given positions, in the order of their stamps. Together
+    they last for RUN_S, or as long as there are any; a frame that cannot be read ends a run."""
+    found: dict[int, Frame] = {}
+    total = 0.0
+    for share in CENTRES:
+        centre = positions[min(int(share * len(positions)), len(positions) - 1)]
+        first = None if centre in found else _readable(source, centre)
+        if first is None:
+            continue
+        found[centre] = first
+        total += sum(_extend(source, centre, step, found) for step in (1, -1))
+        if total >= ENOUGH * RUN_S:
+            break
+    return sorted({frame.moment_of_cloud: frame for frame in found.values()}.values(), key=lambda frame: frame.moment_of_cloud)
+
+
+def _extend(source: Source, start: int, step: int, found: dict[int, Frame]) -> float:
+    """Adds the frames after (step 1) or before (-1) position `start`, up to those found already; the seconds that they last."""
+    last, lasted, k = found[start], 0.0, start + step
+    while lasted < RUN_S / 2 and k not in found:
+        frame = _readable(source, k)
+        if frame is None:
+            break
+        gap = step * (frame.moment_of_cloud - last.moment_of_cloud) / NANOSECONDS
+        if not 0 < gap <= MAX_GAP_S:
+            break
+        found[k], last = frame, frame
+        lasted, k = lasted + gap, k + step
+    return lasted
+
+
+def _readable(source: Source, position: int) -> Frame | None:
+    try:
+        return source[position] if 0 <= position < len(source) else None
+    except CalibrationError:
+        return None
 
 
 def _stamped(frame: Frame) -> Stamped | None:

@@ -1,7 +1,7 @@
 """Oriented, multi-level image edge maps of the fast score.
 
-A left/right range jump of the scan is a vertical line in the image and must meet a horizontal gradient; an upward jump must meet
-a vertical one. Keeping the two apart removes false optima whose score exceeds that of the truth.
+A left/right range jump of the scan must meet a horizontal gradient, an upward jump a vertical one: keeping the two apart removes
+false optima whose score exceeds that of the truth.
 """
 
 from __future__ import annotations
@@ -41,11 +41,8 @@ SMALLEST_BLUR, MIN_SHRUNK = 2.0, 8  # px of a shrunk image: sigma at least, and 
 
 @dataclass(frozen=True, eq=False)
 class EdgeLevel:
-    """One resolution of the edge maps.
-
-    packed: (c, h, w) int16, `maps` in units of UNIT: keyframes take half the memory, and the score half the time to look them up.
-    scale: full size = h * scale. sigma: blur in full-size pixels.
-    """
+    """One resolution of the edge maps. packed: (c, h, w) int16, `maps` in units of UNIT: keyframes take half the memory, and the
+    score half the time to look them up. scale: full size = h * scale. sigma: blur in full-size pixels."""
 
     packed: NDArray[np.int16]
     scale: int
@@ -88,12 +85,7 @@ def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig, used: Mask | No
 
 def smallest_magnitude(magnitude: Map, used: Mask | None = None) -> float:
     """Sobel magnitude (H, W) -> the magnitude from which on it counts as an edge: above some 98 % of the picture's own noise.
-
-    Night pictures are noise after equalisation. With a fixed limit two single frames of a synthetic park at night end 0.6 and
-    0.4 deg off, with this one 0.1 and 0.2. By day, of 12 frames of five real vehicles all that were accepted stay so and within
-    0.05 deg, one more is accepted, and two refused ends move by 0.3 deg, to 0.4 and 0.6.
-    used: (H, W), the pixels that are asked; None = all.
-    """
+    used: (H, W), the pixels that are asked; None = all."""
     rows, columns = (max(min(TILES, size // MIN_TILE), 1) for size in magnitude.shape)
     scales = []
     for band in np.array_split(np.arange(magnitude.shape[0]), rows):
@@ -122,12 +114,9 @@ def _percentile(values: Map, percentile: float) -> float:
 
 def _is_ridge(magnitude: Map, axis: int) -> NDArray[np.bool_]:
     out = np.ones(magnitude.shape, bool)
-    before, after = [slice(None)] * 2, [slice(None)] * 2
-    before[axis], after[axis] = slice(None, -1), slice(1, None)
-    lower = magnitude[tuple(after)] >= magnitude[tuple(before)]
-    upper = magnitude[tuple(before)] >= magnitude[tuple(after)]
-    out[tuple(after)] &= lower
-    out[tuple(before)] &= upper
+    before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+    out[after] &= magnitude[after] >= magnitude[before]
+    out[before] &= magnitude[before] >= magnitude[after]
     return out
 
 
@@ -189,11 +178,8 @@ def _blurred(edge: Map, sigma: float, scale: int, local_contrast: bool) -> NDArr
 
 
 def _normalised(edge: Map, sigma: float) -> Map:
-    """(a - b) / (b + OFFSET mean b): an edge map a, blurred by sigma, relative to its local mean b.
-
-    Without it a coarse level measures how many edges there are, not where: a cloud that is pulled over the busiest part of the
-    picture scores more than at the true extrinsic.
-    """
+    """(a - b) / (b + OFFSET mean b): an edge map a, blurred by sigma, relative to its local mean b."""
+    # Without it a coarse level measures how many edges there are: a cloud over the busiest part scores more than the truth.
     wide = _wide_blur(edge, float(np.sqrt(LOCAL_MEAN**2 - 1)) * sigma)
     offset = np.float32(LOCAL_OFFSET * cv2.mean(wide)[0] + 1e-6)
     np.subtract(edge, wide, out=edge)
@@ -203,11 +189,7 @@ def _normalised(edge: Map, sigma: float) -> Map:
 
 
 def _wide_blur(values: Map, sigma: float) -> Map:
-    """Gaussian blur of (h, w), px, on a smaller image where that is as smooth: the time of a kernel grows with its width.
-
-    The box filter of the shrinking and the triangle of the enlarging are part of the blur, which differs from cv2.GaussianBlur's
-    by 1 to 2 % of the mean value (root mean square).
-    """
+    """Gaussian blur of (h, w), px, to 1 or 2 % of the mean, on a smaller image: the time of a kernel grows with its width."""
     height, width = values.shape
     scale = 1 << max(int(np.log2(sigma / SMALLEST_BLUR)), 0)
     scale = min(scale, max(height // MIN_SHRUNK, 1), max(width // MIN_SHRUNK, 1))
@@ -217,6 +199,7 @@ def _wide_blur(values: Map, sigma: float) -> Map:
     below, right = margin - height % -scale, margin - width % -scale
     whole = cv2.copyMakeBorder(values, margin, below, margin, right, cv2.BORDER_REFLECT_101)
     small = cv2.resize(whole, (whole.shape[1] // scale, whole.shape[0] // scale), interpolation=cv2.INTER_AREA)
+    # The box filter of the shrinking and the triangle of the enlarging are part of the blur.
     rest = np.sqrt(sigma**2 - (scale**2 - 1) / 12 - scale**2 / 6) / scale
     wide = cv2.resize(cv2.GaussianBlur(small, (0, 0), rest), (whole.shape[1], whole.shape[0]))
     return np.asarray(wide[margin : margin + height, margin : margin + width], np.float32)

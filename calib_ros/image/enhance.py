@@ -40,10 +40,8 @@ def equalize(image: Image, config: ImageConfig) -> Image:
 
 
 def equalize_global(gray: Image) -> Image:
-    """Histogram equalisation of the whole image, eq. 3.1 to 3.4, grey (H, W) uint8.
-
-    cv2.equalizeHist leaves the darkest level out of the distribution, so that it always becomes black.
-    """
+    """Histogram equalisation of the whole image, eq. 3.1 to 3.4, grey (H, W) uint8. cv2.equalizeHist leaves the darkest level out
+    of the distribution, so that it always becomes black."""
     share = np.cumsum(np.bincount(gray.ravel(), minlength=256)) / gray.size
     return np.asarray(np.rint(255 * share).astype(np.uint8)[gray])
 

@@ -21,10 +21,8 @@ FAR_WEIGHT = 1e-3  # of the mean of the whole image, beside used pixels nearby; 
 
 
 def used_pixels(config: ImageConfig, width: int, height: int) -> Mask | None:
-    """Pixels (height, width) of the recorded image that ``image.mask`` and ``image.ignored_boxes`` leave; None = all.
-
-    Raises BadInputError if the mask cannot be read, has another size than the image, or hardly leaves a pixel.
-    """
+    """Pixels (height, width) of the recorded image that ``image.mask`` and ``image.ignored_boxes`` leave; None = all. Raises
+    BadInputError if the mask cannot be read, has another size than the image, or hardly leaves a pixel."""
     used = _read(Path(config.mask), width, height) if config.mask else np.ones((height, width), bool)
     for left, top, right, bottom in np.reshape(config.ignored_boxes, (-1, 4)):
         x, y = np.rint(np.array([left, right]) * width).astype(int), np.rint(np.array([top, bottom]) * height).astype(int)
@@ -64,9 +62,7 @@ def without_border(used: Mask, reach: int) -> Mask:
 
 def filled(values: Map, used: Mask) -> Map:
     """`values` (H, W) with the local mean of the used pixels in place of the others, by normalised convolution (Knutsson 1993).
-
-    Zeros there would be a region without edges, whose outline is one in every map that compares a place with its surroundings.
-    """
+    Zeros there would be a region without edges, whose outline is one in every map that compares a place with its surroundings."""
     if not used.any():
         return np.zeros_like(values)
     size = (max(values.shape[1] // FILL_SCALE, 1), max(values.shape[0] // FILL_SCALE, 1))

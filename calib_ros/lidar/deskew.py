@@ -1,8 +1,7 @@
 """Motion compensation: points of a moving scanner, moved to where they are at the image's stamp.
 
-The velocity of the LiDAR is a twist xi = (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame, constant during a scan: tau
-seconds after the image's stamp the LiDAR's pose in its frame at the image's stamp is exp(xi tau), and a point p measured then is
-at exp(xi tau) p in that frame.
+The velocity of the LiDAR is a twist xi = (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame, constant during a scan: a
+point p measured tau seconds after the image's stamp is at exp(xi tau) p in the LiDAR's frame at that stamp.
 """
 
 from __future__ import annotations
@@ -33,10 +32,8 @@ def used_twist(frame: Frame, config: MotionConfig) -> Floats | None:
 
 
 def deskewed_edges(edges: EdgePoints, frame: Frame, config: MotionConfig) -> EdgePoints:
-    """Edge points of a frame's scan at the image's stamp; unchanged if the frame has no twist.
-
-    Raises BadTimesError for times that cannot be those of one scan.
-    """
+    """Edge points of a frame's scan at the image's stamp; unchanged if the frame has no twist. Raises BadTimesError for times
+    that cannot be those of one scan."""
     twist = used_twist(frame, config)
     if twist is None:
         return edges
@@ -97,11 +94,8 @@ def has_times(cloud: PointCloud) -> bool:
 
 
 def scan_times(xyz: NDArray[np.floating], config: MotionConfig, pose: ScannerPose = CLOUD_FRAME) -> Floats:
-    """Times of points (n, 3) of a spinning scanner by their azimuth, (n,) s after the cloud's stamp.
-
-    The azimuth is that about the spin axis, which points to the cloud's z also where the scanner hangs upside down.
-    """
-    if pose.axis[2] < 0:
+    """Times of points (n, 3) of a spinning scanner by their azimuth, (n,) s after the cloud's stamp."""
+    if pose.axis[2] < 0:  # about an axis that points to the cloud's z also where the scanner hangs upside down
         pose = pose.turned_over()
     xyz = pose.to_scanner(xyz)
     sign = SPINS[config.spin]
@@ -114,11 +108,8 @@ def scan_times(xyz: NDArray[np.floating], config: MotionConfig, pose: ScannerPos
 
 
 def moved(xyz: NDArray[np.floating], twist: ArrayLike, tau: NDArray[np.floating]) -> Floats:
-    """exp(twist tau_i) applied to each point: xyz (n, 3) m, twist (6,) rad/s and m/s, tau (n,) s -> (n, 3).
-
-    Exact for any angle. With u = w x p + v the point moves by tau u + (1 - cos a) / w^2 w x u + (a - sin a) / w^3 w x (w x u),
-    a = |w| tau: the exponential series of the 4x4 matrix in closed form.
-    """
+    """exp(twist tau_i) applied to each point: xyz (n, 3) m, twist (6,) rad/s and m/s, tau (n,) s -> (n, 3). With u = w x p + v, a
+    = |w| tau a point moves by tau u + (1 - cos a) / w^2 w x u + (a - sin a) / w^3 w x (w x u)."""
     twist, time = np.asarray(twist, float), np.asarray(tau, float)
     out = np.empty((len(xyz), 3))
     for k in range(0, len(xyz), BLOCK):

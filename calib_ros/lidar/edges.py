@@ -22,9 +22,7 @@ Mask = NDArray[np.bool_]
 SIDE_JUMP_RATIO, TOP_JUMP_RATIO = 0.02, 0.05  # smallest range jumps relative to the range: less is a surface seen at an angle
 JUMP_SATURATION = 3.0  # m; range jump of full edge strength, which is the square root of the ratio
 OUTWARD_SHIFT = 0.5  # share of the angular step by which edge points move outward: the last return lies inside the object
-TOP_SPREAD = (
-    1.0  # share of the step to the next ring that upward edges spread over: one height for an outline biases by its error
-)
+TOP_SPREAD = 1.0  # share of the step to the next ring that upward edges spread over: one height would bias by its error
 GAP_STEPS = 6  # empty columns that make an edge against the sky; fewer are lost returns
 CLEAR_RINGS = 3  # rings without a return above a cell that make an edge against the sky
 GRAZING = float(np.deg2rad(15.0))  # of the light that a matt surface returns head-on, a quarter comes back
@@ -33,15 +31,13 @@ R2_STEPS = (0.7548776662466927, 0.5698402909980532)  # of the two-dimensional se
 PART_HEIGHT = float(np.deg2rad(0.4))  # rad; of the parts into which an upward edge is divided
 MAX_PARTS = 8
 MAX_CELL_POINTS = 12  # points of a cell that are examined, without rings
-# Reflectivity: how many times the noise an edge exceeds (noise is the median of steps, and the largest of 20,000 normal ones 4.3
-# standard deviations), share of the steps that are larger than is usual, and a noise below which intensities are rounded.
+# How many times the noise a reflectivity edge exceeds, share of unusually large steps, noise below which intensities are rounded.
 ABOVE_NOISE, UNUSUAL_SHARE, LEAST_NOISE = 6.4, 0.05, 6e-5
 REFLECTIVITY_STEP = 0.12  # share of full scale that makes an edge wherever it exceeds the noise: lane markings of usual paint
 REFLECTIVITY_MAX_RANGE = 40.0  # m; farther, the beam is wider than a lane marking
 REFLECTIVITY_MAX_JUMP = 0.2  # m; a step of the reflectivity at a larger one of the range is a range edge
 USUAL_STRENGTH, MAX_STRENGTH = 0.12, 0.5  # of a step that is just unusual, and of any
-# Columns between a reflectivity edge and the border of its surface: the two that are averaged on either side, and one more. The
-# rays at a border return less, because they graze what is round or meet it in part; the image has no edge there.
+# Columns between a reflectivity edge and the border of its surface, where rays return less: the image has no edge there.
 SURFACE_COLUMNS = 3
 
 
@@ -96,12 +92,13 @@ def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
     cells = edge_cells(scan, config)
     locate = between_points if scan.layout == "projection" else between_rays
     samples = [locate(scan, found) for found in cells]
-    index = np.concatenate([s.index for s in samples])
+    xyz, index, strength = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    kind = np.repeat(np.array([found.kind for found in cells], np.uint8), [len(own) for _, own, _ in samples])
     spacing = float(np.median(-np.diff(scan.elevation))) if len(scan.elevation) > 1 else np.pi
     return EdgePoints(
-        np.concatenate([s.xyz for s in samples]),
-        np.concatenate([s.strength for s in samples]).astype(np.float32),
-        np.concatenate([np.full(len(s.index), found.kind, np.uint8) for found, s in zip(cells, samples, strict=True)]),
+        xyz,
+        strength.astype(np.float32),
+        kind,
         spacing,
         None if scan.cloud.time is None else scan.cloud.time[index],
         None if scan.cloud.label is None else scan.cloud.label[index],
@@ -111,10 +108,8 @@ def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
 
 @dataclass(frozen=True, eq=False)
 class EdgeCells:
-    """Cells (m,) of a range image on the near side of edges of one kind.
-
-    side: +1 if the edge is counter-clockwise of the cell, -1 clockwise, 0 above. strength: (m,) float32.
-    """
+    """Cells (m,) of a range image on the near side of edges of one kind. side: +1 if the edge is counter-clockwise of the cell,
+    -1 clockwise, 0 above. strength: (m,) float32."""
 
     row: NDArray[np.intp]
     column: NDArray[np.intp]
@@ -124,10 +119,8 @@ class EdgeCells:
 
 
 def edge_cells(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
-    """Cells on edges, of every kind that the scan allows.
-
-    Edges against the sky need rings: a cell of a scanner without rings may be empty by chance.
-    """
+    """Cells on edges, of every kind that the scan allows. Edges against the sky need rings: a cell of a scanner without rings may
+    be empty by chance."""
     found = [*_side_edges(scan, config), _top_edges(scan, config)]
     if scan.layout == "rings":
         fading = _grazed(scan)
@@ -138,10 +131,7 @@ def edge_cells(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
 
 
 def _side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
-    """The near side of each left/right range jump; without rings also across one empty cell.
-
-    A wall at a grazing angle is not an edge: the jump is measured from the continuation of the wall.
-    """
+    """The near side of each left/right range jump from the continued surface; without rings also across one empty cell."""
     R = scan.range
     usable = _measured(scan, config, config.max_range)
     found: list[EdgeCells] = []
@@ -161,10 +151,7 @@ def _side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
 
 
 def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
-    """Cells above which the range grows more than the continued surface below (sloping ground is not an edge).
-
-    Extrapolating the range instead of its inverse would make a whole flat road an edge for scanners of few rings.
-    """
+    """Cells above which the range grows more than the continued surface below (sloping ground is not an edge)."""
     R = scan.range * np.cos(scan.elevation)[:, None].astype(np.float32)  # horizontal: its inverse is linear in the tangent
     height = np.tan(scan.elevation)[:, None]
     steps = np.ones_like(height)  # ring spacing above over ring spacing below
@@ -183,11 +170,8 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
 
 
 def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Horizontal range at which the surface through the two cells above meets each cell's ring; NaN where one is empty.
-
-    A cell on that surface does not occlude it: behind a kerb the pavement continues, higher than the road predicts, and its
-    points would become edges a whole ring above the kerb.
-    """
+    """Horizontal range at which the surface through the two cells above meets each cell's ring; NaN where one is empty."""
+    # A cell on that surface does not occlude it: pavement behind a kerb would become edges a whole ring above the kerb.
     above, far = _above(R, 1), _above(R, 2)
     steps = np.ones_like(height)  # ring spacing below over ring spacing above
     steps[2:] = (height[1:-1] - height[2:]) / np.maximum(height[:-2] - height[1:-1], 1e-6)
@@ -196,8 +180,7 @@ def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDA
 
 
 def _sky_side_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> list[EdgeCells]:
-    """Cells beside a gap of GAP_STEPS cells that is not the border of the field of view. fading: cells that are no edge, see
-    _grazed."""
+    """Cells, but for fading ones (see _grazed), beside a gap of GAP_STEPS cells that is not the border of the field of view."""
     empty = np.isnan(scan.range)
     usable = _measured(scan, config, config.max_range) & _inside_field(scan) & ~fading
     found = []
@@ -230,11 +213,8 @@ def _sky_top_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> EdgeC
 
 
 def _grazed(scan: RangeImage) -> Mask:
-    """Cells whose surface, from the cell below to them, is seen at less than GRAZING; False where the cell below is empty.
-
-    Ground that is seen so flat returns too little from some distance on: where it ends, there is no edge. On an open road such
-    ends are most of a scan's edges against the sky, and pull the horizon down to them.
-    """
+    """Cells whose surface, from the cell below to them, is seen at less than GRAZING; False where the cell below is empty."""
+    # Ground that is seen so flat returns too little from some distance on: where it ends on an open road, there is no edge.
     below = _below(scan.range)
     step = np.diff(scan.elevation, append=scan.elevation[-1:])[:, None].astype(np.float32)  # to the ring below
     # Of the triangle of scanner, cell and cell below: the angle at the cell.
@@ -292,8 +272,8 @@ def _jump_strength(jump: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _measured(scan: RangeImage, config: LidarConfig, max_range: float) -> Mask:
-    """Cells that may be edges. The vehicle's own are not, but stay in the range image: where they were missing, what is beside
-    them would be an edge against the sky."""
+    """Cells that may be edges."""
+    # The vehicle's own are none, but stay in the range image: what is beside them would be an edge against the sky.
     measured = (scan.index >= 0) & (scan.range < max_range)
     if any(config.ego_box):
         low, high = np.reshape(config.ego_box, (3, 2)).T
@@ -302,14 +282,10 @@ def _measured(scan: RangeImage, config: LidarConfig, max_range: float) -> Mask:
     return np.asarray(measured)
 
 
-def _extrapolated(
-    R: NDArray[np.float32], before: NDArray[np.float32], steps: NDArray[np.floating] | float = 1.0
-) -> NDArray[np.floating]:
-    """Range of the next cell if the surface through `before` and R continues: at least R, inf beyond its horizon.
-
-    The inverse range is extrapolated, which is linear in small angles on a plane. steps: spacing to the next cell over spacing
-    to the one before. R where `before` is empty.
-    """
+def _extrapolated(R: NDArray[np.float32], before: NDArray[np.float32], steps: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Range of the next cell, `steps` spacings on, if the surface through `before` and R continues: at least R, inf beyond its
+    horizon, R where `before` is empty."""
+    # The inverse range is extrapolated, which is linear in small angles on a plane.
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = 1 / R + np.fmin(1 / R - 1 / before, 0) * steps
         return np.where(inverse <= 0, np.inf, 1 / inverse)
@@ -327,22 +303,14 @@ def _below(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeSamples:
-    """Points on edges; an upward edge may give several. xyz: (m, 3) float32, m. index: (m,) into the cloud. strength: (m,)."""
-
-    xyz: NDArray[np.float32]
-    index: NDArray[np.int32]
-    strength: NDArray[np.float32]
+# Points on edges, of which an upward edge may give several: (m, 3) float32, m, index (m,) into the cloud, and strength (m,).
+EdgeSamples = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
 
 
 def between_rays(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
-    """Edge points of a scanner with rings: moved outward by a share of the step to the next ray, along the ring or upward.
-
-    The edge lies between the last ray that hits the near surface and the first that misses it; ignoring this is the largest
-    single error. Upward, where rings are far apart, a single height for an outline would bias the estimate by the error of that
-    height: neighbouring points are spread over all heights that the edge may have.
-    """
+    """Edge points of a scanner with rings: moved outward by a share of the step to the next ray, along the ring or upward."""
+    # The edge lies between the last ray that hits the near surface and the first that misses it. Upward, where rings are far
+    # apart, neighbouring points are spread over all heights that the edge may have: a single one would bias by its error.
     row, column = found.row, found.column
     if found.kind not in UPWARD:
         index = scan.index[row, column]
@@ -368,7 +336,7 @@ def _in_scanner(scan: RangeImage, index: NDArray[np.integer]) -> NDArray[np.floa
 
 def _samples(scan: RangeImage, P: NDArray[np.float64], index: NDArray[np.integer], strength: NDArray[np.float32]) -> EdgeSamples:
     """Samples at the points P (m, 3) of the scanner's frame."""
-    return EdgeSamples(scan.pose.to_cloud(P).astype(np.float32), index.astype(np.int32), strength)
+    return scan.pose.to_cloud(P).astype(np.float32), index.astype(np.int32), strength
 
 
 def _upward_parts(scan: RangeImage) -> int:
@@ -387,19 +355,16 @@ def _ring_step(scan: RangeImage, row: NDArray[np.intp], distance: NDArray[np.flo
 def between_points(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
     """Edge points of a scanner without rings, whose points lie anywhere in their cells: between the outermost point of the near
     surface and the innermost point of the far one, by the same share."""
-    row, column = found.row, found.column
-    columns = scan.range.shape[1]
+    row, column, columns, samples = found.row, found.column, scan.range.shape[1], scan.samples
     index = scan.index[row, column]
-    samples = scan.samples
     assert samples is not None
     near = samples.distance[index] + 0.5 * JUMP_MIN
-    along = samples.elevation if found.kind in UPWARD else found.side * samples.azimuth
+    upward = found.kind in UPWARD
+    along = samples.elevation if upward else found.side * samples.azimuth
     centre = along[index]
     cells = [row * columns + column]
     for k in (1, 2):
-        cells.append(
-            (row - k).clip(0) * columns + column if found.kind in UPWARD else row * columns + (column + found.side * k) % columns
-        )
+        cells.append((row - k).clip(0) * columns + column if upward else row * columns + (column + found.side * k) % columns)
     last, outermost = np.full(len(row), -np.inf), index.copy()
     offsets, far = [], []
     for k, cell in enumerate(cells):
@@ -418,7 +383,7 @@ def between_points(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
     first = np.where(np.isfinite(first), first, last + scan.azimuth_step)
     angle = OUTWARD_SHIFT * (first - last)
     P = _in_scanner(scan, outermost)
-    if found.kind in UPWARD:
+    if upward:
         rho = np.hypot(P[:, 0], P[:, 1])
         P[:, 2] = rho * np.tan(np.arctan2(P[:, 2], rho) + angle)
     else:

@@ -1,8 +1,4 @@
-"""Velocity of the LiDAR from two consecutive scans, for data without odometry.
-
-Both scans are downsampled and aligned by GICP (Segal et al. 2009, implementation of small_gicp), first as measured, then
-compensated for the motion just found.
-"""
+"""Velocity of the LiDAR from two consecutive scans, for data without odometry, by GICP (Segal et al. 2009; small_gicp)."""
 
 from __future__ import annotations
 
@@ -31,17 +27,14 @@ MAX_SPEED, MAX_TURN_RATE = 60.0, 2.0  # m/s, rad/s; beyond what vehicles do, an 
 MATCH_DISTANCES = (4.0, 1.0)  # m; maximum distance of matches in the first and the second alignment
 NEIGHBOURS = 10  # from which the surface around a point is estimated
 MIN_STEP = 1e-3  # rad and m; smaller steps end the alignment
-# Curvature of the alignment's error along its weakest direction, per point. Below it scans slide along each other freely: it is
-# 0.5 on a flat field, 1 to 5 for scans of different places, 7 to 34 in streets, KITTI's and synthetic ones.
+# Of the error along its weakest direction, per point: 0.5 on a flat field, 1 to 5 for other places, 7 to 34 in streets.
 MIN_CURVATURE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason.
-
-    matched: share of the points with a match in the other scan.
-    """
+    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason. matched: share
+    of the points with a match in the other scan."""
 
     twist: Floats | None
     reason: str = ""
@@ -54,19 +47,15 @@ def needs_ego_motion(frame: Frame, config: MotionConfig) -> bool:
         return False
     if frame.twist is not None or frame.compensated or frame.cloud_stamp is None:
         return False
-    # By azimuth only if configured: the azimuth at the stamp differs from driver to driver, and a wrong guess moves points
-    # farther than the motion of the vehicle did.
+    # By azimuth only if configured: drivers differ, and a wrong guess moves points farther than the vehicle did.
     return config.from_scans == "always" or has_times(frame.cloud)
 
 
 def estimate_motion(
     before: PointCloud, cloud: PointCloud, gap_s: float, config: MotionConfig, start: ArrayLike | None = None
 ) -> Motion:
-    """Mean velocity between two scans, `gap_s` seconds apart by their stamps.
-
-    Points have their own times, or those of their azimuth. start: twist (6,) to start from, if known; zero is tried too if that
-    fails. Deterministic. Raises MissingDependencyError without small_gicp.
-    """
+    """Mean velocity between two scans, `gap_s` seconds apart by their stamps. Deterministic. start: twist (6,) to start from, if
+    known; zero is tried too if that fails. Raises MissingDependencyError without small_gicp."""
     if not MIN_GAP_S <= gap_s <= MAX_GAP_S:
         return Motion(None, f"the scans are {gap_s:.3g} s apart, outside {MIN_GAP_S:g} to {MAX_GAP_S:g} s")
     scans = _downsampled(before, config), _downsampled(cloud, config)

@@ -63,11 +63,10 @@ class RangeImage:
 
 
 def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
-    """Range image of a point cloud; the nearest return wins a cell.
-
-    Raises TooFewFeaturesError for fewer than MIN_POINTS returns beyond ``config.min_range``.
-    """
-    given = given_pose(config)
+    """Range image of a point cloud; the nearest return wins a cell. Raises TooFewFeaturesError for fewer than MIN_POINTS returns
+    beyond ``config.min_range``."""
+    auto = config.scanner_pose == "auto"
+    given = None if auto else ScannerPose.given(config.scanner_position_m, config.scanner_rpy_deg)
     pose, ring = given or CLOUD_FRAME, None
     cloud, own, distance = _beyond(cloud.finite(), pose, config.min_range)
     if config.layout != "projection":
@@ -82,13 +81,6 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
     if ring is None and config.layout != "rings":
         return _project(cloud, Samples(azimuth, elevation, distance), pose)
     return _from_rings(cloud, own, even_rows(elevation) if ring is None else ring, azimuth, elevation, distance, pose)
-
-
-def given_pose(config: LidarConfig) -> ScannerPose | None:
-    """The scanner's pose that the configuration gives; None = to be found."""
-    if config.scanner_pose == "auto":
-        return None
-    return ScannerPose.given(config.scanner_position_m, config.scanner_rpy_deg)
 
 
 def _beyond(cloud: PointCloud, pose: ScannerPose, min_range: float) -> tuple[PointCloud, Ranges, Ranges]:
@@ -109,10 +101,8 @@ def require_returns(cloud: PointCloud) -> None:
 
 
 def reflectivity(intensity: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-    """Intensity (n,) in the driver's unit -> 0..1. Units in use: 0..1 (KITTI), 0..255 (most drivers), counts (Ouster).
-
-    None without intensity, or if it is constant (drivers without intensity fill in a constant).
-    """
+    """Intensity (n,) in the driver's unit -> 0..1. Units in use: 0..1 (KITTI), 0..255 (most drivers), counts (Ouster). None
+    without intensity, or if it is constant (drivers without intensity fill in a constant)."""
     if intensity is None or len(intensity) == 0:
         return None
     values = np.nan_to_num(intensity, nan=0.0, posinf=0.0, neginf=0.0)
@@ -123,13 +113,10 @@ def reflectivity(intensity: NDArray[np.float32] | None) -> NDArray[np.float32] |
     return np.asarray(np.clip(values / np.float32(full_scale), 0, 1), np.float32)
 
 
-def isolated_returns(ranges: Ranges, jump: float, ratio: float) -> Mask:
-    """Mask (rows, columns) of returns that show no surface: rain, dust, and beams that hit a near and a far surface at once.
-
-    jump, ratio: ranges that differ by less than `jump` m, or less than this share of the range, belong to one surface. A pole
-    one column wide is not isolated: it continues above or below.
-    """
-    limit = np.maximum(np.float32(jump), np.float32(ratio) * ranges)
+def isolated_returns(ranges: Ranges) -> Mask:
+    """Mask (rows, columns) of returns that show no surface: rain, dust, and beams that hit a near and a far surface at once. A
+    pole one column wide is not isolated: it continues above or below."""
+    limit = np.maximum(np.float32(JUMP_MIN), np.float32(SAME_SURFACE) * ranges)
     alone = ~_near(ranges, np.roll(ranges, 1, 1), limit) & ~_near(ranges, np.roll(ranges, -1, 1), limit)
     alone &= ~np.isnan(ranges)
     row, column = np.nonzero(alone)
@@ -138,8 +125,7 @@ def isolated_returns(ranges: Ranges, jump: float, ratio: float) -> Mask:
     # Few cells are left; their other neighbours are tested one by one.
     rows, columns = ranges.shape
     R, own = ranges[row, column], limit[row, column]
-    upright = np.zeros(len(row), bool)
-    diagonal = np.zeros(len(row), bool)
+    upright, diagonal = np.zeros((2, len(row)), bool)
     for up in (-1, 1):
         inside = (row + up >= 0) & (row + up < rows)
         beyond = np.clip(row + up, 0, rows - 1)
@@ -179,7 +165,7 @@ def _from_rings(
     index.ravel()[cell[order]] = order
     hit = index >= 0
     ranges[hit] = distance[index[hit]]
-    index[isolated_returns(ranges, JUMP_MIN, SAME_SURFACE)] = -1
+    index[isolated_returns(ranges)] = -1
     _fill_single_holes(ranges)
     cones = ring_cones(row, own, len(row_elevation))
     return RangeImage(ranges, index, row_elevation, step, cloud, reflectivity(cloud.intensity), cones, None, pose)
@@ -187,9 +173,8 @@ def _from_rings(
 
 def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Ring numbers (n,) in any order -> row from the top (n,) and the median elevation of each row, rad."""
-    order = np.argsort(
-        ring.astype(np.int16) if np.abs(ring).max() < 2**15 else ring, kind="stable"
-    )  # 16 bits sort in linear time
+    short = ring.astype(np.int16) if np.abs(ring).max() < 2**15 else ring  # 16 bits sort in linear time
+    order = np.argsort(short, kind="stable")
     names, first = np.unique(ring[order], return_index=True)
     medians = np.array([np.median(part) for part in np.split(elevation[order], first[1:])])
     from_top = np.argsort(-medians, kind="stable")
@@ -223,11 +208,7 @@ class Samples:
 
 
 def _project(cloud: PointCloud, samples: Samples, pose: ScannerPose) -> RangeImage:
-    """Range image of a scanner without rings: the nearest return wins a cell, single holes are interpolated.
-
-    Ranges are those of the surface at the cell centre: on a road, points at different heights of one cell lie metres apart, and
-    that is not an edge.
-    """
+    """Range image of a scanner without rings: the nearest return wins a cell, single holes are interpolated."""
     azimuth, elevation, distance = samples.azimuth, samples.elevation, samples.distance
     step = cell_size(azimuth, elevation)
     columns = max(round(2 * np.pi / step), 3)
@@ -244,8 +225,8 @@ def _project(cloud: PointCloud, samples: Samples, pose: ScannerPose) -> RangeIma
     centre = np.asarray(top - (np.arange(rows) + 0.5) * step, np.float64)
     measured = np.where(index >= 0, distance[index], np.nan).astype(np.float32)
     ranges = _range_at_centre(measured, index, samples, centre, step)
-    index[isolated_returns(ranges, JUMP_MIN, SAME_SURFACE)] = -1
-    _fill(ranges, SAME_SURFACE)
+    index[isolated_returns(ranges)] = -1
+    _fill(ranges)
     cones = np.stack([np.zeros(rows), np.tan(centre)], axis=1)
     own = Samples(azimuth, elevation, distance, order, start)
     return RangeImage(ranges, index, centre, step, cloud, reflectivity(cloud.intensity), cones, own, pose)
@@ -286,11 +267,8 @@ def _cells_hit(azimuth: Angles, elevation: Angles, size: float) -> int:
 
 
 def _range_at_centre(raw: Ranges, index: NDArray[np.int32], samples: Samples, middle: NDArray[np.float64], step: float) -> Ranges:
-    """Ranges at the cell centres, extrapolated on the plane through neighbouring cells.
-
-    On a plane the inverse range is linear in small angles. Of the slopes to both sides the smaller one counts, so that a
-    surface is not bent towards what lies behind it.
-    """
+    """Ranges at the cell centres, extrapolated on the plane through neighbouring cells: on it the inverse range is linear."""
+    # On a road, points at different heights of one cell lie metres apart, and that is not an edge.
     q = 1 / raw.astype(np.float64)
     up = np.where(index >= 0, samples.elevation[index], np.nan)
     left = np.where(index >= 0, samples.azimuth[index], np.nan)
@@ -322,14 +300,14 @@ def _slope(q: NDArray[np.float64], angle: NDArray[np.float64], axis: int, step: 
         return np.where(a * b > 0, both, 0.0)
 
 
-def _fill(ranges: Ranges, ratio: float) -> None:
+def _fill(ranges: Ranges) -> None:
     """Interpolate empty cells whose neighbours left and right, or above and below, lie on one surface."""
     with np.errstate(invalid="ignore"):
         for axis in (1, 0):
             before, after = np.roll(ranges, 1, axis), np.roll(ranges, -1, axis)
             if axis == 0:
                 before[0], after[-1] = np.nan, np.nan
-            hole = np.isnan(ranges) & (np.abs(before - after) < ratio * 0.5 * (before + after))
+            hole = np.isnan(ranges) & (np.abs(before - after) < SAME_SURFACE * 0.5 * (before + after))
             ranges[hole] = 2 / (1 / before[hole] + 1 / after[hole])
 
 

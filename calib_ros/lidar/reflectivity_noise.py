@@ -10,11 +10,7 @@ STEPS, PARTS = 20_000, 16  # steps of a scan that tell its noise, and parts into
 
 def reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
     """Noise of a scan's reflectivity, by its steps (n,) and the mean reflectivities (n,) around them: at level 0, and its slope.
-
-    Corrected for distance it is about the same everywhere; the signal itself has noise in proportion, and is many times larger
-    near the scanner. So it is the highest rising line below the median steps of parts of the levels: edges raise the medians
-    between two materials, and nothing lowers them.
-    """
+    The highest rising line below the median steps of parts of the levels: edges raise the medians, and nothing lowers them."""
     every = max(len(steps) // STEPS, 1)
     known = np.flatnonzero(~np.isnan(steps[::every]) & ~np.isnan(levels[::every])) * every
     parts = np.array_split(known[np.argsort(levels[known], kind="stable")], PARTS)
@@ -27,11 +23,8 @@ def reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32]) 
 
 def line_below(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[np.float32, np.float32]:
     """Of the lines a + b x that neither fall, nor begin below 0, nor pass above any of the points (n,), the one with the least
-    total distance from them: a and b, reflectivity.
-
-    A linear program of two unknowns, whose solution is at a corner: a line through two of the points, through one and the origin,
-    or level at the lowest.
-    """
+    total distance from them: a and b, reflectivity."""
+    # A linear program, solved at a corner: a line through two points, through one and the origin, or level at the lowest.
     x, y = x.astype(np.float64), y.astype(np.float64)
     i, j = np.triu_indices(len(x), 1)
     apart = x[j] != x[i]

@@ -5,6 +5,7 @@ Drivers differ in what they say about rings, so each property is estimated from 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +16,8 @@ from calib_ros.lidar.scanner_pose import CLOUD_FRAME, RingFit, ScannerPose, fitt
 
 Angles = NDArray[np.floating]
 MIN_RINGS, MAX_RINGS = 4, 256
-# Spread of elevation within rings, as a share of that of the whole scan. Rings found by order: real ones keep theirs well below,
-# even tilted by motion compensation (0.16). Rings of the source: higher, since the cloud may be given in the frame of a vehicle
-# that is tilted against the scanner.
+# Spread of elevation within rings, as a share of the whole scan's: of rings by order (0.16 where motion compensation tilts them),
+# and of the source's, whose cloud may be in the frame of a vehicle that is tilted against the scanner.
 MAX_RUN_SPREAD, MAX_RING_SPREAD = 0.3, 0.6
 MAX_BACKWARD_SHARE = 0.25  # of azimuth steps against the turn in rings stored in order: KITTI 0.02, lines scanned to and fro 0.5
 EVEN_ROWS = 64  # rows of a scanner without rings, where rows are needed
@@ -37,8 +37,7 @@ DEFAULT_STEP = float(np.deg2rad(0.2))  # rad; if no ring has two points
 MAX_BEAM_SPREAD, MAX_OWN_SPREAD = float(np.deg2rad(0.15)), 0.35
 FEWEST_POINTS = 1000  # from which a pose is sought
 SETTLING_ROUNDS = 3
-# As RINGS_APART: of rings that the driver numbers, which are not mixed up (0.05), and of runs by order, which mix two rings
-# where their ends are seen from a wrong pose. Scan lines of a MEMS mirror come to 0.3 to 0.4 about an axis far aside.
+# As RINGS_APART: of rings that the driver numbers (0.05), and of runs by order, which may mix two. Scan lines: 0.3 to 0.4.
 FIELD_APART, RUNS_APART = 0.2, 0.5
 MUCH_SHARPER = 0.5  # share to which another pose of the scanner must lower the spread of the rings
 
@@ -46,12 +45,13 @@ MUCH_SHARPER = 0.5  # share to which another pose of the scanner must lower the 
 def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDArray[np.int32] | None, ScannerPose]:
     """Ring number of each point, (n,) int32, or None if the scan has no rings; and the pose of the scanner in the cloud's frame.
 
-    That is the cloud's frame itself, unless `given`, or unless another pose makes the rings cones: vehicles' drivers may give
-    clouds in the frame of the vehicle, and scanners may be tilted in theirs. The pose may be known without the rings.
+    That is the cloud's frame itself, unless `given`, or unless another pose makes the rings cones. It may be known without the
+    rings.
     """
     xyz = cloud.xyz
     if given is not None:
-        return _rings_at(cloud, given), given
+        own = given.to_scanner(xyz)
+        return find_rings(cloud, *angles(own), own), given
     ring = find_rings(cloud, *angles(xyz))
     if len(xyz) < FEWEST_POINTS:
         return ring, CLOUD_FRAME
@@ -77,11 +77,9 @@ def _in_own_frame(fit: RingFit) -> bool:
 
 
 def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], ScannerPose] | None:
-    """Rings and pose that agree with each other, from a rough pose; None if there are none.
-
-    Rings by order or elevation, found at a rough pose, are in part mixed up: their fit is better than it, and so in turn.
-    """
+    """Rings and pose that agree with each other, from a rough pose; None if there are none."""
     count, runs = 0, None
+    # Rings by order or elevation, found at a rough pose, are in part mixed up: their fit is better than it, and so in turn.
     for _ in range(SETTLING_ROUNDS):
         own = pose.to_scanner(cloud.xyz)
         azimuth, elevation = angles(own)
@@ -101,12 +99,6 @@ def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], S
     return None if runs is None else (runs, pose)
 
 
-def _rings_at(cloud: PointCloud, pose: ScannerPose) -> NDArray[np.int32] | None:
-    """Rings as seen from a pose."""
-    own = pose.to_scanner(cloud.xyz)
-    return find_rings(cloud, *angles(own), own)
-
-
 def angles(xyz: NDArray[np.floating]) -> tuple[Angles, Angles]:
     """Azimuth and elevation (n,) in rad of points (n, 3) in the scanner's frame."""
     x, y, z = xyz.T
@@ -116,12 +108,10 @@ def angles(xyz: NDArray[np.floating]) -> tuple[Angles, Angles]:
 def find_rings(
     cloud: PointCloud, azimuth: Angles, elevation: Angles, xyz: NDArray[np.floating] | None = None
 ) -> NDArray[np.int32] | None:
-    """Ring number of each point, (n,) int32, or None if the scan has no rings.
+    """Ring number of each point, (n,) int32, or None if the scan has no rings: by the driver's ring field, the order of the
+    points, or peaks of the elevation histogram.
 
     azimuth, elevation: (n,) rad, and xyz: (n, 3) m, in the scanner's frame; by default that is the cloud's.
-
-    Taken from the driver's ring field, else from the order of the points (ring after ring, as KITTI stores them), else from
-    peaks of the elevation histogram.
     """
     ring = _ring_field(cloud)
     # Drivers of scanners without rings fill the field with laser or scan line numbers, each of which sweeps the whole view.
@@ -153,43 +143,35 @@ def keeps_elevation(ring: NDArray[np.int32], elevation: Angles) -> bool:
 
 
 def rings_by_order(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
-    """Rings as runs of monotonic azimuth, (n,) int32; None if the points are not stored ring after ring.
-
-    A revolution may start at any azimuth and turn either way. The starts tried are forward, backward and the first point; the
-    one whose runs spread least in elevation wins.
-    """
+    """Rings as runs of monotonic azimuth, (n,) int32; None if the points are not stored ring after ring. Of the starts tried, the
+    one whose runs spread least in elevation wins."""
     turn, sign = _turns(azimuth)
     if turn is None:
         return None
     limit = MAX_RUN_SPREAD * _mean_deviation(elevation)
     every = max(len(azimuth) // HISTOGRAM_POINTS, 1) | 1
-    best: tuple[float, NDArray[np.int32]] | None = None
-    for start in (0.0, np.pi, float(azimuth[0]) - sign * 1e-3):
-        ring = _runs_from(start, sign, azimuth)
-        spread = np.inf if ring is None else _ring_spread(ring[::every], elevation[::every])
-        if ring is not None and spread < limit and (best is None or spread < best[0]):
-            best = (spread, ring)
-    return None if best is None else best[1]
+    starts = (0.0, np.pi, float(azimuth[0]) - sign * 1e-3)
+    return _best_runs(azimuth, sign, starts, lambda ring: _ring_spread(ring[::every], elevation[::every]), limit)
 
 
 def _runs(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
-    """Runs of monotonic azimuth, (n,) int32, as seen from a wrong pose; None if the points are not stored in such.
-
-    They end where the elevation jumps to that of another ring. The spread of elevation would not tell: a start half a turn aside
-    mixes neighbouring rings evenly, which a tilt of half their spacing makes good.
-    """
+    """Runs of monotonic azimuth, (n,) int32, as seen from a wrong pose; None if the points are not stored in such."""
     turn, sign = _turns(azimuth)
     if turn is None:
         return None
+    # They end where the elevation jumps to another ring's. Its spread does not tell: a start half a turn aside mixes evenly.
     step = np.abs(np.diff(elevation))
     starts = (0.0, np.pi, float(azimuth[0]) - sign * 1e-3, _cut(azimuth, step, sign * float(np.median(np.abs(turn)))))
-    best: tuple[float, NDArray[np.int32]] | None = None
-    for start in starts:
-        ring = _runs_from(start, sign, azimuth)
-        jump = -1.0 if ring is None else float(np.median(step[np.diff(ring) > 0]))
-        if ring is not None and (best is None or jump > best[0]):
-            best = (jump, ring)
-    return None if best is None else best[1]
+    return _best_runs(azimuth, sign, starts, lambda ring: -float(np.median(step[np.diff(ring) > 0])), np.inf)
+
+
+def _best_runs(
+    azimuth: Angles, sign: float, starts: Sequence[float], cost: Callable[[NDArray[np.int32]], float], limit: float
+) -> NDArray[np.int32] | None:
+    """Of the runs of azimuths that begin at each of the starts, those of the least cost below the limit."""
+    tried = [ring for start in starts if (ring := _runs_from(start, sign, azimuth)) is not None]
+    least, best = min(((cost(ring), k) for k, ring in enumerate(tried)), default=(np.inf, 0))
+    return tried[best] if least < limit else None
 
 
 def _turns(azimuth: Angles) -> tuple[Angles | None, float]:
@@ -209,10 +191,7 @@ def _runs_from(start: float, sign: float, azimuth: Angles) -> NDArray[np.int32] 
 
 
 def _cut(azimuth: Angles, step: Angles, turn: float) -> float:
-    """The azimuth at which most rings end, rad: where many of the largest steps (n - 1,) of the elevation are at one azimuth.
-
-    turn: the usual step of the azimuth.
-    """
+    """The azimuth at which many of the largest steps (n - 1,) of the elevation are, rad. turn: usual step of the azimuth."""
     after = azimuth[1:][step >= np.quantile(step, LARGE_STEPS)]
     cell = ((after + np.pi) / CUT_BIN).astype(np.intp)
     count = np.bincount(cell, minlength=round(2 * np.pi / CUT_BIN) + 1)
@@ -226,10 +205,8 @@ def _ring_field(cloud: PointCloud) -> NDArray[np.int32] | None:
 
 
 def rings_by_elevation(xyz: NDArray[np.floating], elevation: Angles) -> NDArray[np.int32] | None:
-    """Rings as peaks of the elevation histogram, (n,) int32; None if it has no clear peaks. xyz: (n, 3) m.
-
-    Rays need not meet in the origin of the cloud: of several apex heights, that with the sharpest histogram is used.
-    """
+    """Rings as peaks of the elevation histogram, from the apex height where it is sharpest, (n,) int32; None if it has no clear
+    peaks. xyz: (n, 3) m."""
     sample = xyz[:: max(len(xyz) // HISTOGRAM_POINTS, 1)].astype(np.float64)
     distance, height = np.hypot(sample[:, 0], sample[:, 1]), sample[:, 2]
     sharp = [_histogram_sharpness(np.arctan2(height - z, distance)) for z in APEX_HEIGHTS]
@@ -240,11 +217,7 @@ def rings_by_elevation(xyz: NDArray[np.floating], elevation: Angles) -> NDArray[
 
 
 def azimuth_step(row: NDArray[np.int32], azimuth: NDArray[np.floating]) -> float:
-    """Most frequent azimuth difference of neighbours in a ring, rad. row: (n,) ring of each point, azimuth: (n,) rad.
-
-    Lost returns leave multiples of the step, and second returns of one firing differences of all sizes near 0; neither is as
-    frequent.
-    """
+    """Most frequent azimuth difference of neighbours in a ring, rad. row: (n,) ring of each point, azimuth: (n,) rad."""
     every = max(len(row) // STEP_POINTS, 1)
     some = row % every == 0
     if not some.any():
@@ -262,11 +235,8 @@ def azimuth_step(row: NDArray[np.int32], azimuth: NDArray[np.floating]) -> float
 
 
 def columns_of(row: NDArray[np.int32], azimuth: NDArray[np.floating], columns: int) -> NDArray[np.intp]:
-    """Column of each point, (n,), such that the firings of its ring fall on cell centres.
-
-    Firings on cell borders (simulators start at exactly -180 deg) would by rounding share one cell and leave the next empty,
-    and a range jump across an empty cell is not detected as an edge.
-    """
+    """Column of each point, (n,), such that the firings of its ring fall on cell centres."""
+    # On cell borders they would by rounding share one cell and leave the next empty, across which no edge is seen.
     turn = azimuth.astype(np.float64) * columns
     every = max(len(row) // PHASE_POINTS, 1) | 1  # odd: a power of two would take the same lasers of every firing
     some, rows = row[::every], int(row.max(initial=0)) + 1

@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from calib_ros.arrays import Matrix as Floats
 from calib_ros.lidar.segmentation import fit_ground
+from calib_ros.se3 import skew
 
-Floats = NDArray[np.float64]
-# Points of the two rounds of the fit, the first by far ones. After the second, errors are below 0.02 deg and 1 cm on all scanners
-# tried.
+# Points of the two rounds of the fit, the first by far ones: errors are below 0.02 deg and 1 cm on all scanners tried.
 FIRST_POINTS, FIT_POINTS = 1000, 4000
 PAIR_POINTS, NEIGHBOURS = 1500, 4
-MUCH_ALIKE = (
-    0.15  # share to which a pose must lower the differences of neighbours: right ones 0.02 to 0.1, wrong ones 0.25 and more
-)
+# Share to which a pose must lower the differences of neighbours: right ones 0.02 to 0.1, wrong ones 0.25 and more.
+MUCH_ALIKE = 0.15
 # The search for a ground above: points at most so far away, number of them, their least height, a plane's share of them, and
 # what the best plane below may hold of it. On 18 rigs and 7 vehicles the ground holds 0.14 to 0.69, planes opposite 0.01 to 0.11.
 NEAR_GROUND, GROUND_POINTS, MIN_HEIGHT, GROUND_SHARE, MAX_BELOW = 20.0, 1500, 0.2, 0.13, 0.55
@@ -44,10 +43,8 @@ APEX_SIGMA, HEIGHT_SIGMA = 0.15, 0.02  # m; spread of apex heights about the cen
 
 @dataclass(frozen=True, eq=False)
 class ScannerPose:
-    """Pose of the scanner in the frame of its cloud.
-
-    centre : (3,) m, where the rays meet. rotation : (3, 3), T_cloud_scanner's rotation; its last column is the spin axis.
-    """
+    """Pose of the scanner in the frame of its cloud. centre : (3,) m, where the rays meet. rotation : (3, 3), T_cloud_scanner's
+    rotation; its last column is the spin axis."""
 
     centre: Floats = field(default_factory=lambda: np.zeros(3))
     rotation: Floats = field(default_factory=lambda: np.eye(3))
@@ -92,10 +89,8 @@ CLOUD_FRAME = ScannerPose()
 
 @dataclass(frozen=True)
 class RingFit:
-    """A pose, and how well the rings are cones about its axis.
-
-    spread: rad, robust deviation of the points from the cone of their ring. spacing: rad, median step between neighbouring rings.
-    """
+    """A pose, and how well the rings are cones about its axis. spread: rad, robust deviation of the points from the cone of their
+    ring. spacing: rad, median step between neighbouring rings."""
 
     pose: ScannerPose
     spread: float
@@ -113,12 +108,10 @@ def ring_fit(xyz: NDArray[np.floating], ring: NDArray[np.int32], pose: ScannerPo
 
 
 def fitted_pose(xyz: NDArray[np.floating], ring: NDArray[np.int32], start: ScannerPose | None = None) -> RingFit:
-    """The pose at which every ring (n,) of the points (n, 3) is a cone about the spin axis.
+    """The pose at which every ring (n,) of the points (n, 3) is a cone about the spin axis, which points to the cloud's z.
 
-    Robust Gauss-Newton on the elevation: centre (3) and axis (2) such that all points of a ring have one elevation, which is a
-    nuisance per ring. Started from several axes and heights, so that any mount is found; along directions that the scan does
-    not show (the height, in an empty plane) the centre stays near the origin. The axis points to the cloud's z, of which the
-    rings say nothing. start: a pose that is near, if one is known.
+    Robust Gauss-Newton on the elevation, from several axes and heights; along directions that the scan does not show the centre
+    stays near the origin. start: a pose that is near, if one is known.
     """
     P, row = _far_half(*_sample(xyz, ring, 2 * FIRST_POINTS))
     starts = [ScannerPose(height * np.eye(3)[2], upright(np.eye(3)[axis])) for axis, height in STARTS]
@@ -136,11 +129,8 @@ def fitted_pose(xyz: NDArray[np.floating], ring: NDArray[np.int32], start: Scann
 
 def pose_by_neighbours(xyz: NDArray[np.floating]) -> ScannerPose | None:
     """The pose at which neighbouring points of (n, 3) have the same elevation, without knowing any ring; None if there is none.
-
-    Points are denser along rings than across, so that most of a point's nearest neighbours are of its ring; of the others as
-    many are above as below. Good to 0.2 deg and 0.2 m, from which rings can be told apart and fitted. Where points are as dense
-    across the rings, and without rings, no pose makes the neighbours' elevations much more alike than any other.
-    """
+    Good to 0.2 deg and 0.2 m, from which rings can be told apart and fitted."""
+    # Points are denser along rings than across: most of a point's neighbours are of its ring, of the rest half are above.
     tree = KDTree(xyz, balanced_tree=False, compact_nodes=False)
     some = np.arange(0, len(xyz), max(len(xyz) // PAIR_POINTS, 1) | 1)
     near = tree.query(xyz[some], np.arange(2, 2 + NEIGHBOURS))[1]
@@ -159,10 +149,7 @@ def _unlikeness(P: Floats, pose: ScannerPose) -> float:
 
 
 def hangs_upside_down(xyz: NDArray[np.floating]) -> bool:
-    """Whether the ground is above: points (n, 3) in the scanner's frame.
-
-    It is where most of the near points lie, in one plane, with no such plane below; under a ceiling there are two.
-    """
+    """Whether the ground is above: a plane with most of the near points (n, 3) in the scanner's frame, and no such one below."""
     near = xyz[:: max(len(xyz) // (4 * GROUND_POINTS), 1) | 1]
     near = near[np.einsum("ij,ij->i", near, near) < NEAR_GROUND**2]
     if np.count_nonzero(near[:, 2] > 0) <= len(near) / 2:
@@ -196,23 +183,15 @@ def stays(xyz: NDArray[np.floating], ring: NDArray[np.int32], spread: float) -> 
 
 def ring_cones(row: NDArray[np.int32], xyz: NDArray[np.floating], rows: int) -> Floats:
     """Cone z = offset + slope * distance from the axis, fitted to the points (n, 3) of each row -> (rows, 2), offset m and slope.
-
-    The rays of a ring run on a cone about the sensor's axis whose apex need not be the origin of the cloud: the lasers of an
-    HDL-64E sit 0.12 m to 0.21 m above it. Near points of a ring then have another elevation than far ones, and the next ring
-    is not where the elevations would put it.
-    """
+    Its apex need not be the origin of the cloud: the lasers of an HDL-64E sit 0.12 m to 0.21 m above it."""
     every = max(len(row) // CONE_POINTS, 1) | 1
     if every > 1 and len(np.unique(row[::every])) == rows:
         row, xyz = row[::every], xyz[::every]
     z = xyz[:, 2].astype(np.float64)
     rho = np.hypot(xyz[:, 0], xyz[:, 1]).astype(np.float64)
     weight = 1 / np.maximum(rho, 0.1)  # errors of tilted rays grow with the distance
-    count, s_r, s_rr = (
-        np.bincount(row, weight, rows),
-        np.bincount(row, weight * rho, rows),
-        np.bincount(row, weight * rho * rho, rows),
-    )
-    s_z, s_rz = np.bincount(row, weight * z, rows), np.bincount(row, weight * rho * z, rows)
+    values = (weight, weight * rho, weight * rho * rho, weight * z, weight * rho * z)
+    count, s_r, s_rr, s_z, s_rz = (np.bincount(row, value, rows) for value in values)
     n = np.asarray(count + (HEIGHT_SIGMA / APEX_SIGMA) ** 2)  # a ring at a single distance: apex at the origin
     determinant = np.maximum(n * s_rr - s_r**2, 1e-12)
     return np.stack([(s_z * s_rr - s_r * s_rz) / determinant, (n * s_rz - s_r * s_z) / determinant], axis=1)
@@ -224,7 +203,7 @@ def upright(axis: Floats) -> Floats:
     v, c = np.cross(z, axis), float(axis[2])
     if c < -1 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])
-    V = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    V = skew(v)
     return np.asarray(np.eye(3) + V + V @ V / (1 + c))
 
 
@@ -236,11 +215,8 @@ def _sample(xyz: NDArray[np.floating], ring: NDArray[np.int32], points: int) -> 
 
 
 def _far_half(P: Floats, row: NDArray[np.intp]) -> tuple[Floats, NDArray[np.intp]]:
-    """The farther half of points (n, 3) with their compact ring numbers (n,).
-
-    A centre that is metres off turns the elevations of the nearest, the own vehicle's, by tens of degrees: the fit has local
-    optima then, which it does not have with these.
-    """
+    """The farther half of points (n, 3) with their compact ring numbers (n,)."""
+    # A centre that is metres off turns the elevations of the nearest by tens of degrees: the fit would have local optima.
     distance = np.linalg.norm(P, axis=1)
     far = distance >= np.median(distance)
     return P[far], np.unique(row[far], return_inverse=True)[1].astype(np.intp).ravel()

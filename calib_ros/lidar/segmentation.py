@@ -34,11 +34,10 @@ class Plane:
 def fit_ground(
     xyz: NDArray[np.float32], threshold: float, iterations: int, max_tilt_deg: float, min_share: float, seed: int
 ) -> Plane | None:
-    """The plane with the most points of xyz (n, 3) within `threshold` m, of `iterations` planes through three of them.
+    """The plane with the most points of xyz (n, 3) within `threshold` m, of `iterations` planes through three of them that are
+    tilted by at most max_tilt_deg, refitted to its inliers; None if it holds less than min_share. Deterministic for a seed.
 
-    RANSAC (thesis 3.3.2, algorithm 1; Fischler and Bolles 1981). Planes tilted by more than max_tilt_deg from the LiDAR's
-    horizontal are rejected. The best plane is refitted to its inliers if that gains inliers. None if no plane holds min_share of
-    the points. Deterministic for a seed.
+    RANSAC (thesis 3.3.2, algorithm 1; Fischler and Bolles 1981).
     """
     n = len(xyz)
     if n < 3:
@@ -95,18 +94,14 @@ def connected_parts(pairs: NDArray[np.intp], n: int) -> NDArray[np.intp]:
 
 
 def _dbscan(points: Floats, weight: NDArray[np.float64], eps: float, min_points: int) -> NDArray[np.intp]:
-    """Cluster (n,) of points (n, 3) that stand for so many each, numbered by their first core points; NOISE.
-
-    Core points are connected where they are neighbours; other neighbours of theirs join the first cluster that has one, as where
-    clusters grow one after the other.
-    """
+    """Cluster (n,) of points (n, 3) that stand for so many each, numbered by their first core points; NOISE."""
     n, pairs = len(points), KDTree(points).query_pairs(eps, output_type="ndarray")
     first, second = pairs.T
     core = weight + np.bincount(first, weight[second], n) + np.bincount(second, weight[first], n) >= min_points
     found = np.full(n, NOISE, np.intp)
     both = pairs[core[first] & core[second]]
     found[core] = np.unique(connected_parts(both, n)[core], return_inverse=True)[1]
-    joined = np.full(n, n, np.intp)  # beyond any cluster
+    joined = np.full(n, n, np.intp)  # beyond any; neighbours of core points join the first cluster that has one
     for own, other in ((first, second), (second, first)):
         beside = core[own] & ~core[other]
         np.minimum.at(joined, other[beside], found[own[beside]])

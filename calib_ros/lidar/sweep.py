@@ -1,8 +1,4 @@
-"""When a scan sweeps the camera's view: the moment by which it belongs to an image.
-
-Drivers stamp a scan at its start, its middle or its end, while cameras are exposed when the scanner faces their view, or at any
-other time. The nearest header stamp is then that of another scan, or the two nearest stamps are equally near.
-"""
+"""When a scan sweeps the camera's view: the moment by which it belongs to an image, wherever its driver stamps it."""
 
 from __future__ import annotations
 
@@ -18,20 +14,15 @@ from calib_ros.lidar.deskew import MAX_TIME, has_times, scan_times
 Floats = NDArray[np.float64]
 MAX_POINTS = 4000  # of a scan that are projected, in 1 ms; a tenth of them in view tell the median to 1 ms
 MIN_POINTS = 30  # in view; fewer are a wrong extrinsic or a covered scanner
-# A new median replaces the last one where the times of the points lie that much closer to it. The start and the end of a scan may
-# both be in the view of a camera that looks back, half of the points each: which of them it is must not change with every scan.
+# A new median must lie that much closer to the times: start and end of a scan may both be in the view of a camera looking back.
 CLOSER = 0.8
-# Offsets are multiples of this: the scene and the error of the start move the median by less, and must not change the pairs. And
-# a camera that the scanner triggers when it faces its view stays an exact match.
+# Offsets are multiples of this: the scene moves the median by less; cameras that the scanner triggers match exactly.
 STEP_S = 0.005
 BLIND_CLOUDS = 10  # without points in view, after which nothing is known
 
 
 class SweepOffset:
-    """Learns how long after its stamp a scan sweeps the camera's view. Not thread-safe.
-
-    config may be replaced at any time.
-    """
+    """Learns how long after its stamp a scan sweeps the camera's view. Not thread-safe. config may be replaced at any time."""
 
     def __init__(self, config: MotionConfig) -> None:
         self.config = config
@@ -75,10 +66,8 @@ class SweepOffset:
 
 
 def view_times(cloud: PointCloud, camera: Camera, T_camera_lidar: NDArray[np.floating], config: MotionConfig) -> Floats | None:
-    """Times (n,), s after the cloud's stamp, at which points in the camera's view were measured, of some thousand points.
-
-    None if all points count as measured at the stamp.
-    """
+    """Times (n,), s after the cloud's stamp, at which points in the camera's view were measured, of some thousand points. None if
+    all points count as measured at the stamp."""
     if config.deskew == "off" or not (has_times(cloud) or states_stamping(config)):
         return None
     # An odd step, so that all rings remain in a scan stored firing by firing.

@@ -1,7 +1,4 @@
-"""ROS messages -> arrays, cameras and clouds, without ROS.
-
-Duck-typed: accepts the messages of rosbags and those of rclpy.
-"""
+"""ROS messages -> arrays, cameras and clouds, without ROS. Duck-typed: accepts the messages of rosbags and those of rclpy."""
 
 from calib_ros.messages.camera_info import decode_camera_info
 from calib_ros.messages.image_encodings import decode_compressed_image, decode_image

@@ -22,8 +22,7 @@ class Encoding(NamedTuple):
     planar_420: bool = False  # a full plane of luma, then a half-height plane of interleaved chroma
 
 
-# ROS names a Bayer pattern by its first two rows, OpenCV by the second and third pixel of the second row:
-# RGGB is "BG" there.
+# ROS names a Bayer pattern by its first two rows, OpenCV by the second and third pixel of the second row: RGGB is "BG" there.
 BAYER = {
     "bayer_rggb": cv2.COLOR_BayerBG2BGR,
     "bayer_bggr": cv2.COLOR_BayerRG2BGR,
@@ -88,10 +87,8 @@ def decode_image(msg: Any) -> NDArray[np.uint8]:
 
 
 def decode_compressed_image(msg: Any) -> NDArray[np.uint8]:
-    """sensor_msgs/CompressedImage of JPEG, PNG or BMP -> uint8 (H, W) grey or (H, W, 3) BGR.
-
-    Raises BadInputError for depth images, truncated or damaged data, and other formats.
-    """
+    """sensor_msgs/CompressedImage of JPEG, PNG or BMP -> uint8 (H, W) grey or (H, W, 3) BGR. Raises BadInputError for depth
+    images, truncated or damaged data, and other formats."""
     layout = str(msg.format)
     if "compresseddepth" in layout.lower():
         raise BadInputError("CompressedImage: this is a depth image (compressedDepth); choose the topic of a camera picture")
@@ -115,11 +112,7 @@ def picture_to_bgr(picture: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def stretch_to_8bit(image: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """uint16 (H, W[, channels]) -> uint8, mapping the 0.5 and 99.5 percentiles to 0 and 255.
-
-    Cameras put 10, 12 or 14 bits into 16, and thermal cameras use a narrow band of them: dropping the low byte would leave a
-    black image without edges.
-    """
+    """uint16 (H, W[, channels]) -> uint8, mapping the 0.5 and 99.5 percentiles to 0 and 255, whichever bits a camera uses."""
     stride = int(np.sqrt(image.size / 2**16)) | 1  # odd, so that all colours of a Bayer mosaic are sampled
     low, high = np.percentile(image[::stride, ::stride], (0.5, 99.5))
     if high <= low:

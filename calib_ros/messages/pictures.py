@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 # More than any camera has; OpenCV allocates memory for all pixels before it reads the first one.
 MAX_PIXELS = 2**27
-# A header that claims more was not written by an encoder: deflate ends at 1032, JPEG at half of that. Of one-byte pixels;
-# PNG packs up to eight into one.
+# Of one-byte pixels, of which PNG packs up to eight into one; no encoder does better: deflate ends at 1032, JPEG at half of that.
 PIXELS_PER_BYTE = 1100
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8\xff"

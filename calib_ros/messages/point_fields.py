@@ -2,19 +2,16 @@
 
 How to add a LiDAR driver
 -------------------------
-POINT_FIELDS is the only place that knows the names drivers give to the fields of a point, INTEGER_TIME_UNITS and
-FLOAT_TIME_UNITS the only one that knows the units of their times. If `ros2 topic echo --once --field fields TOPIC` shows a name
-that is missing here, append it to the names of its quantity, in lower case; earlier names win where a cloud has several. A
-time unit is found from the duration of the scan, so that most drivers need no entry. Offsets, datatypes and byte order are read
-from the message. Tests: test/unit/messages/test_messages.py has one per layout (`test_velodyne_layout`) and one of all kinds of
-times (`test_point_times_in_every_unit`); add the driver there.
+If `ros2 topic echo --once --field fields TOPIC` shows a name that is missing in POINT_FIELDS, append it to the names of its
+quantity, in lower case; earlier names win where a cloud has several. A time unit is found from the duration of the scan, so that
+most drivers need no entry in INTEGER_TIME_UNITS and FLOAT_TIME_UNITS. Add the driver to test/unit/messages/test_messages.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,25 +20,16 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros.messages.wire import payload, stamp_ns
 
-
-class PointField(NamedTuple):
-    """A quantity of a point. names: lower-case field names that drivers use, preferred first."""
-
-    names: tuple[str, ...]
-    required: bool = False
-
-
-POINT_FIELDS: dict[str, PointField] = {
-    # m in the LiDAR frame.
-    "x": PointField(("x",), required=True),
-    "y": PointField(("y",), required=True),
-    "z": PointField(("z",), required=True),
+REQUIRED = ("x", "y", "z")  # m in the LiDAR frame
+# Quantity of a point -> lower-case field names that drivers use, preferred first.
+POINT_FIELDS: dict[str, tuple[str, ...]] = {
+    **{name: (name,) for name in REQUIRED},
     # In the driver's unit; lidar.range_image.reflectivity scales it to 0..1. Ouster has both intensity and reflectivity.
-    "intensity": PointField(("intensity", "intensities", "i", "reflectivity", "reflectance", "remission")),
+    "intensity": ("intensity", "intensities", "i", "reflectivity", "reflectance", "remission"),
     # Number of the laser, in any order.
-    "ring": PointField(("ring", "channel", "line", "laser_id", "laser", "laser_number", "scan_line", "beam")),
+    "ring": ("ring", "channel", "line", "laser_id", "laser", "laser_number", "scan_line", "beam"),
     # When the point was measured, in any of the units below, from the header stamp or absolute.
-    "time": PointField(("time", "t", "timestamp", "time_stamp", "time_offset", "offset_time", "timeoffset", "point_time")),
+    "time": ("time", "t", "timestamp", "time_stamp", "time_offset", "offset_time", "timeoffset", "point_time"),
 }
 # Units of times in ns per count, the usual one of the type first: Ouster's `t` is uint32 nanoseconds, Velodyne's `time` float32
 # seconds, Hesai's and Robosense's `timestamp` float64 seconds, Livox's `timestamp` float64 nanoseconds.
@@ -52,7 +40,6 @@ RELATIVE_NS = 2e9  # times within this of zero count from the header stamp, othe
 SAME_CLOCK_NS = 5e9  # an absolute time farther than this from the header stamp comes from another clock
 # Datatypes of sensor_msgs/PointField as numpy's; 9-11 exist since ROS 2 Lyrical.
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8", 11: "u1"}
-REQUIRED = tuple(name for field in POINT_FIELDS.values() if field.required for name in field.names)
 
 
 def decode_cloud(msg: Any) -> PointCloud:
@@ -67,23 +54,20 @@ def decode_cloud(msg: Any) -> PointCloud:
     if width * height == 0:
         return PointCloud(np.zeros((0, 3), np.float32))
     layout = _Layout.of(msg, width, height)
-    columns = {name: layout.column(field) for name, field in POINT_FIELDS.items()}
+    columns = {quantity: layout.column(names) for quantity, names in POINT_FIELDS.items()}
     return _cloud({name: column.ravel() for name, column in columns.items() if column is not None}, stamp_ns(msg.header.stamp))
 
 
 def cloud_of_columns(columns: Mapping[str, NDArray[Any]], stamp: int = 0) -> PointCloud:
-    """Columns (n,) of numbers by the field names of any driver, as files hold them -> PointCloud, as `decode_cloud`.
-
-    stamp: of the cloud, ns, from which absolute times count. Raises BadInputError without x, y, z, or for columns of different
-    lengths.
-    """
+    """Columns (n,) of numbers by the field names of any driver, as files hold them -> PointCloud, as `decode_cloud`. stamp: of
+    the cloud, ns, from which absolute times count. Raises BadInputError without x, y, z, or for columns of different lengths."""
     known = {name.strip().lower(): column for name, column in columns.items() if column.dtype.kind in "iufb"}
     missing = [name for name in REQUIRED if name not in known]
     if missing:
         raise BadInputError(f"no field {', '.join(missing)} among ({', '.join(columns) or 'none'}); a point needs x, y and z")
     chosen: dict[str, NDArray[Any]] = {}
-    for quantity, field in POINT_FIELDS.items():
-        name = next((name for name in field.names if name in known), None)
+    for quantity, names in POINT_FIELDS.items():
+        name = next((name for name in names if name in known), None)
         if name is None:
             continue
         if known[name].shape != (len(known["x"]),):
@@ -113,9 +97,8 @@ def _cloud(columns: Mapping[str, NDArray[Any]], stamp: int) -> PointCloud:
 def seconds_from_stamp(values: NDArray[Any], stamp: int) -> tuple[NDArray[np.float32] | None, str]:
     """Times (n,) of any number type and the header stamp in ns -> (n,) float32 seconds from that stamp, or None and why.
 
-    PointField has no unit: the first unit in which the scan lasts as long as a scan can is used. Points without a time (zero or
-    NaN) get 0. Where the stamp is unknown (0), absolute times count from the earliest point. None if no unit fits, if they are of
-    another clock than the stamp, or if they are absolute but all the same, as in a float32, which cannot hold them.
+    The first unit in which the scan lasts as long as a scan can is used. Points without a time (zero or NaN) get 0. Where the
+    stamp is unknown (0), absolute times count from the earliest point.
     """
     integers = values.dtype.kind in "iub"
     counts = values.astype(np.int64 if integers else np.float64)
@@ -158,17 +141,13 @@ def _time_unit(span: float, units: tuple[int, ...]) -> int | None:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where each field of each point lies in the message's bytes, checked against their number.
+    """Where each field of each point lies in the message's bytes, checked against their number."""
 
-    fields: the message's PointFields by lower-case name. shape: height, width. strides: bytes from row to row and from point to
-    point. byte_order: of numpy's dtypes.
-    """
-
-    fields: dict[str, Any]
+    fields: dict[str, Any]  # the message's PointFields by lower-case name
     data: NDArray[np.uint8]
-    shape: tuple[int, int]
-    strides: tuple[int, int]
-    byte_order: str
+    shape: tuple[int, int]  # height, width
+    strides: tuple[int, int]  # bytes from row to row and from point to point
+    byte_order: str  # of numpy's dtypes
 
     @classmethod
     def of(cls, msg: Any, width: int, height: int) -> _Layout:
@@ -199,12 +178,10 @@ class _Layout:
             )
         return cls(fields, data, (height, width), (row_step, point_step), ">" if msg.is_bigendian else "<")
 
-    def column(self, quantity: PointField) -> NDArray[Any] | None:
-        """A quantity of all points (height, width) as a view of the first of its fields that the message has, else None.
-
-        Of an array field the first element.
-        """
-        for name in quantity.names:
+    def column(self, names: tuple[str, ...]) -> NDArray[Any] | None:
+        """A quantity of all points (height, width) as a view of the first of its fields that the message has, else None. Of an
+        array field the first element."""
+        for name in names:
             field = self.fields.get(name)
             if field is not None and int(field.datatype) in DATATYPES:
                 dtype = np.dtype(self.byte_order + DATATYPES[int(field.datatype)])

@@ -22,10 +22,8 @@ def shown(text: object) -> str:
 
 
 def payload(data: Any) -> NDArray[np.uint8]:
-    """A message's `data` -> (n,) uint8 that shares its memory.
-
-    rosbags has numpy arrays, rclpy array.array or bytes; only a plain list of numbers is copied.
-    """
+    """A message's `data` -> (n,) uint8 that shares its memory. rosbags has numpy arrays, rclpy array.array or bytes; only a plain
+    list of numbers is copied."""
     if isinstance(data, np.ndarray):
         return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
     if isinstance(data, (list, tuple)):

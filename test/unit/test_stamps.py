@@ -31,13 +31,10 @@ def test_the_period_is_found_whatever_is_missing(period, lost):
         assert found == pytest.approx(period, rel=0.06)
 
 
-def test_doubled_and_late_stamps_do_not_change_the_period():
+def test_doubled_late_and_standing_stamps():
     stamps = regular(100.0, 64, 2.0)
     stamps = np.r_[stamps[:20], stamps[10:15], stamps[20:30], stamps[30:] + 0.0, stamps[-3] + 1.0]
     assert rhythm(stamps).period / MS == pytest.approx(100.0, abs=4.0)
-
-
-def test_nothing_is_known_of_a_single_stamp_or_of_a_clock_that_stands_still():
     assert rhythm(np.array([5.0, 5.0, 5.0])).period == 0
     assert usual_period(np.zeros(0, np.int64)) == 0
 
@@ -77,16 +74,13 @@ def test_messages_at_random_times_lose_nothing():
 
 
 def test_the_tolerance_follows_the_longer_period():
-    assert pair_tolerance((33 * MS, 100 * MS), 0.0) == 60 * MS
-    assert pair_tolerance((100 * MS, 50 * MS), 0.0) == 60 * MS
-    assert pair_tolerance((50 * MS, 50 * MS), 0.0) == 30 * MS
-    assert pair_tolerance((0, 100 * MS), 0.0) == FIRST_TOLERANCE
-    assert pair_tolerance((1000 * MS, 100 * MS), 0.0) == WIDEST_TOLERANCE
-    # That of the user is an upper limit.
-    assert pair_tolerance((100 * MS, 100 * MS), 0.02) == 20 * MS
-    assert pair_tolerance((100 * MS, 100 * MS), 0.5) == 60 * MS
-    assert pair_tolerance((1000 * MS, 1000 * MS), 0.5) == 500 * MS
-    assert pair_tolerance((0, 0), 0.5) == 500 * MS
+    for periods_ms, limit_s, tolerance in (
+        *(((33, 100), 0.0, 60 * MS), ((100, 50), 0.0, 60 * MS), ((50, 50), 0.0, 30 * MS)),
+        *(((0, 100), 0.0, FIRST_TOLERANCE), ((1000, 100), 0.0, WIDEST_TOLERANCE)),
+        # That of the user is an upper limit.
+        *(((100, 100), 0.02, 20 * MS), ((100, 100), 0.5, 60 * MS), ((1000, 1000), 0.5, 500 * MS), ((0, 0), 0.5, 500 * MS)),
+    ):
+        assert pair_tolerance((periods_ms[0] * MS, periods_ms[1] * MS), limit_s) == tolerance
 
 
 def test_nearest_pairs_use_each_stamp_once():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -119,7 +120,7 @@ def test_configuration_is_used_and_fallback_reported(capsys, files, tmp_path, mo
     assert "image_classes: source" in out
 
 
-def test_failing_model_is_reported_and_the_others_are_tried(capsys, files, tmp_path):
+def test_failing_model_is_reported_and_the_others_are_tried(capsys, files, tmp_path, monkeypatch):
     (tmp_path / "short.yaml").write_text("semantics: {budget_s: 0.3}\n")
     for name, text, more in (
         ("none.onnx", "there is no such file", ()),
@@ -138,6 +139,11 @@ def test_failing_model_is_reported_and_the_others_are_tried(capsys, files, tmp_p
     code, _, err = run(capsys, SMALL, "--segment-anything", files / "encoder.onnx", "--cloud-classes", "")
     assert code == 2
     assert "set semantics.segment_anything_decoder" in err
+    lines = Mock(side_effect=ValueError("two lines\nof somebody's library"))
+    monkeypatch.setattr("calib_ros_semantics.models.image_classes.ImageClasses.segment", lines)
+    code, out, err = run(capsys, SMALL, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
+    assert (code, err) == (2, "calib-ros: semantics.image_classes: unexpected ValueError: two lines of somebody's library\n")
+    assert any(line.startswith("points: ") for line in parts(out)["cloud_classes"])
 
 
 def test_classes_that_cannot_be_right_are_told(capsys, files, drive):
@@ -145,34 +151,6 @@ def test_classes_that_cannot_be_right_are_told(capsys, files, drive):
     assert (code, err.count("\n")) == (1, 1)
     assert err.startswith(f"calib-ros: semantics.cloud_classes, {files / 'range.onnx'}: its classes are implausible: ")
     assert "points: " in out, "what it found is shown all the same"
-
-
-def test_classes_of_little_use_are_told(capsys, files, tmp_path):
-    net = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
-    (tmp_path / "net.yaml").write_text(f"labels: [{', '.join(['void'] * 18 + ['road'])}]\n")
-    code, _, err = run(capsys, SMALL, "--image-classes", net, "--cloud-classes", "source")
-    assert (code, err.count("\n")) == (1, 1)
-    assert "% have a class that is of no use here" in err
-
-
-def test_other_networks_are_not_taken_for_segment_anything(capsys, files, tmp_path):
-    classifier = segmentation(tmp_path / "mean.onnx", 19, outputs=[("mean", [1, 19])])
-    for path, kind in ((files / "net.onnx", "a network for classes of pixels"), (classifier, "a classifier of whole pictures")):
-        code, _, err = run(capsys, SMALL, "--segment-anything", path, "--image-classes", "source")
-        assert code == 2
-        assert f"this looks like {kind}" in err
-        assert "decoder" not in err
-
-
-def test_unexpected_errors_are_one_line(capsys, files, monkeypatch):
-    def surprising(*_: object) -> None:
-        raise ValueError("two lines\nof somebody's library")
-
-    monkeypatch.setattr("calib_ros_semantics.models.image_classes.ImageClasses.segment", surprising)
-    code, out, err = run(capsys, SMALL, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
-    assert (code, err) == (2, "calib-ros: semantics.image_classes: unexpected ValueError: two lines of somebody's library\n")
-    found = parts(out)
-    assert any(line.startswith("points: ") for line in found["cloud_classes"])
 
 
 def test_empty_segmentation_is_explained(capsys, files):

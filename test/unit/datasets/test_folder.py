@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from test_kitti import HEIGHT, WIDTH, write_image
 
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.cloud_files import read_cloud
 from calib_ros.datasets.folder import FolderSource
 from calib_ros.errors import BadInputError, MissingDependencyError
 
-WIDTH, HEIGHT = 40, 24
 CALIBRATION = """\
 image_width: 40
 image_height: 24
@@ -33,13 +33,6 @@ rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
 """
 REFERENCE = np.array([[0.0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]])
 ROWS = "T_camera_lidar:\n" + "".join(f"- {row}\n" for row in REFERENCE.tolist())
-
-
-def write_image(path: Path, seed: int = 0, size: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image = np.random.default_rng(seed).integers(0, 256, (*size, 3), np.uint8)
-    assert cv2.imwrite(str(path), image)
-    return image
 
 
 def cloud(seed: int = 0, count: int = 50) -> dict[str, np.ndarray]:
@@ -76,11 +69,6 @@ def records(columns: dict[str, np.ndarray]) -> np.ndarray:
     return np.rec.fromarrays(list(columns.values()), names=list(columns))
 
 
-def write_pcd(path: Path, columns: dict[str, np.ndarray]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(pcd_header(columns, "binary") + records(columns).tobytes())
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Images 2, 10 and 11, clouds 2, 10 and 12, a reference and no stamps."""
@@ -88,7 +76,7 @@ def folder(tmp_path: Path) -> Path:
     for number in (2, 10, 11):
         write_image(root / "images" / f"{number}.png", number)
     for number in (2, 10, 12):
-        write_pcd(root / "clouds" / f"{number}.pcd", cloud(number))
+        written(root / "clouds" / f"{number}.pcd", cloud(number))
     (root / "calibration.yaml").write_text(CALIBRATION + ROWS)
     return root
 
@@ -126,7 +114,7 @@ def written(path: Path, columns: dict[str, np.ndarray]) -> None:
             ".binary": ("binary", rows.tobytes()),
             ".compressed": ("binary_compressed", struct.pack("<II", len(packed := literal_lzf(blocks)), len(blocks)) + packed),
         }
-        kind, body = data[encoding]
+        kind, body = data.get(encoding, data[".binary"])
         path.write_bytes(pcd_header(columns, kind) + body)
     elif path.suffix == ".ply":
         names = {"f4": "float", "u2": "ushort", "f8": "double"}
@@ -203,6 +191,7 @@ def test_pcd_as_loosely_as_pcl_reads_it(tmp_path):
 def test_padding_in_pcd_and_prefixes_in_ply(tmp_path):
     """PCL pads its points with fields "_"; CloudCompare writes "scalar_" before the names of fields."""
     columns = cloud(3)
+    xyz = np.stack([columns[axis] for axis in "xyz"], axis=1)
     kinds = [(axis, "<f4") for axis in "xyz"] + [("_a", "u1", 4), ("intensity", "<f4"), ("ring", "<u2"), ("_b", "u1", 2)]
     rows = np.zeros(50, kinds)
     for name in ("x", "y", "z", "intensity", "ring"):
@@ -214,24 +203,11 @@ def test_padding_in_pcd_and_prefixes_in_ply(tmp_path):
     written(tmp_path / "a.ascii.ply", {name if name in "xyz" else f"scalar_{name.title()}": c for name, c in columns.items()})
     for path in (tmp_path / "a.pcd", tmp_path / "a.ascii.ply"):
         found = read_cloud(path)
-        assert np.array_equal(found.xyz, np.stack([columns[axis] for axis in "xyz"], axis=1))
-        assert np.array_equal(found.intensity, columns["intensity"])
-        assert np.array_equal(found.ring, columns["ring"])
+        for values, expected in ((found.xyz, xyz), (found.intensity, columns["intensity"]), (found.ring, columns["ring"])):
+            assert np.array_equal(values, expected)
 
 
-def test_absolute_times_of_points_count_from_the_clouds_stamp(folder):
-    columns = cloud(2)
-    stamp = 1_600_000_000_123_456_789
-    columns["timestamp"] = (stamp + np.round(columns.pop("time") * 1e9).astype("<i8")).astype("<u8")
-    write_pcd(folder / "clouds" / "2.pcd", columns)
-    (folder / "times.csv").write_text(
-        f"name,image_ns,cloud_ns\n2,{stamp + 7_000_000},{stamp}\n10,{stamp - 10**9},{stamp - 10**9}\n"
-    )
-    source = open_dataset(folder)
-    assert np.allclose(source[1].cloud.time, cloud(2)["time"], atol=1e-6)
-
-
-def test_times_give_stamps_and_order(folder):
+def test_times_give_stamps_and_order_and_points_count_from_the_clouds_stamp(folder):
     (folder / "times.csv").write_text(
         "name, image_ns, cloud_ns\n2, 1600000001000000001, 1600000000990000000\n10, 1600000000000000000,\n"
     )
@@ -239,6 +215,14 @@ def test_times_give_stamps_and_order(folder):
     stamps = [(source[i].name, source[i].stamp, source[i].cloud_stamp) for i in range(2)]
     assert stamps == [("10", 1_600_000_000_000_000_000, None), ("2", 1_600_000_001_000_000_001, 1_600_000_000_990_000_000)]
     assert source.describe()["stamps"] == "times.csv"
+    columns = cloud(2)
+    stamp = 1_600_000_000_123_456_789
+    columns["timestamp"] = (stamp + np.round(columns.pop("time") * 1e9).astype("<i8")).astype("<u8")
+    written(folder / "clouds" / "2.pcd", columns)
+    (folder / "times.csv").write_text(
+        f"name,image_ns,cloud_ns\n2,{stamp + 7_000_000},{stamp}\n10,{stamp - 10**9},{stamp - 10**9}\n"
+    )
+    assert np.allclose(open_dataset(folder)[1].cloud.time, cloud(2)["time"], atol=1e-6)
 
 
 def test_pictures_of_every_kind(folder):
@@ -306,33 +290,21 @@ def test_truncation_is_noticed_also_between_points(tmp_path):
             read_cloud(path)
 
 
-@pytest.mark.parametrize("name", ["a.binary.pcd", "a.ascii.ply", "a.columns.npz"])
-def test_a_cloud_without_coordinates_is_refused(tmp_path, name):
+def test_clouds_without_coordinates_and_arrays_of_wrong_shapes_are_refused(tmp_path):
     columns = cloud()
     columns["height"] = columns.pop("z")
-    if name.endswith("pcd"):
-        columns = {"x": columns.pop("x"), **columns}
-    written(tmp_path / name, columns)
-    with pytest.raises(BadInputError, match="z"):
-        read_cloud(tmp_path / name)
-
-
-def test_arrays_of_wrong_shapes_are_refused(tmp_path):
-    np.savez(tmp_path / "a.npz", xyz=np.zeros((5, 4)))
-    with pytest.raises(BadInputError, match=r"xyz has shape \(5, 4\), but must be \(n, 3\)"):
-        read_cloud(tmp_path / "a.npz")
-    np.savez(tmp_path / "a.npz", xyz=np.zeros((5, 3)), ring=np.zeros(4))
-    with pytest.raises(BadInputError, match=r"field ring has shape \(4,\), but there are 5 points"):
-        read_cloud(tmp_path / "a.npz")
-    np.savez(tmp_path / "a.npz", xyz=np.array([{}], object))
-    with pytest.raises(BadInputError, match="damaged"):
-        read_cloud(tmp_path / "a.npz")
-
-
-def test_a_name_with_two_endings_is_refused(folder):
-    write_image(folder / "images" / "10.jpg")
-    with pytest.raises(BadInputError, match=r"10\.jpg and 10\.png are of the same frame; keep one"):
-        open_dataset(folder)
+    for name in ("a.binary.pcd", "a.ascii.ply", "a.columns.npz"):
+        written(tmp_path / name, columns)
+        with pytest.raises(BadInputError, match="z"):
+            read_cloud(tmp_path / name)
+    for arrays, says in (
+        ({"xyz": np.zeros((5, 4))}, r"xyz has shape \(5, 4\), but must be \(n, 3\)"),
+        ({"xyz": np.zeros((5, 3)), "ring": np.zeros(4)}, r"field ring has shape \(4,\), but there are 5 points"),
+        ({"xyz": np.array([{}], object)}, "damaged"),
+    ):
+        np.savez(tmp_path / "a.npz", **arrays)
+        with pytest.raises(BadInputError, match=says):
+            read_cloud(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize(
@@ -350,7 +322,7 @@ def test_wrong_times_are_one_clear_error(folder, text, message):
         open_dataset(folder)
 
 
-def test_a_damaged_image_is_one_clear_error(folder):
+def test_damaged_and_doubled_images_are_one_clear_error(folder):
     data = (folder / "images/10.png").read_bytes()
     (folder / "images/10.png").write_bytes(data[:200])
     source = open_dataset(folder)
@@ -359,6 +331,9 @@ def test_a_damaged_image_is_one_clear_error(folder):
     (folder / "images/10.png").unlink()
     with pytest.raises(BadInputError, match=r"10\.png cannot be read"):
         source[1]
+    write_image(folder / "images" / "11.jpg", 0)
+    with pytest.raises(BadInputError, match=r"11\.jpg and 11\.png are of the same frame; keep one"):
+        open_dataset(folder)
 
 
 @pytest.mark.parametrize(("name", "library"), [("a.binary.pcd", "pypcd4"), ("a.binary.ply", "trimesh")])

@@ -9,43 +9,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import RenderedDrive
+from test_synthetic import matched
 
 from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
 from calib_ros.errors import BadInputError
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as Label
-from calib_ros_synthetic import scanners
+from calib_ros_synthetic import camera, lidar, rays, scanners, wide, windows
 from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_synthetic.rigs import RIGS
 from calib_ros_synthetic.scanners import MODELS, Order, Rings, scanner
 from calib_ros_synthetic.scenes import SCENES
+from calib_ros_synthetic.solids import Solids
 from calib_ros_synthetic.wide import WideView
 
 SPINNING = [name for name, model in MODELS.items() if model.table is not None]
 
 
-def moved_to_image(drive: SyntheticDrive, index: int) -> np.ndarray:
-    """Points (n, 3) of a frame in the frame of the cloud at the image's moment."""
-    frame = drive[index]
-    assert frame.twist is not None
-    return np.asarray(frame.cloud.xyz, float)
-
-
-def agreement(drive: SyntheticDrive, index: int, T: np.ndarray) -> float:
-    """Share of a frame's points that fall on a pixel of their own class, within a pixel."""
-    labels = drive.labels(index)
-    uv, inside = drive.camera.project(se3.transform(T, moved_to_image(drive, index)))
-    inside &= labels.points != UNLABELLED
-    u, v = np.rint(uv[inside]).astype(int).T
-    same = np.zeros(len(u), bool)
-    for dv in (-1, 0, 1):
-        for du in (-1, 0, 1):
-            row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
-            same |= labels.image[row, column] == labels.points[inside]
-    assert len(same) > 100
-    return float(same.mean())
+def agreement(drive: SyntheticDrive, T: np.ndarray) -> float:
+    """Share of the points of frame 1 that fall on a pixel of their own class, within a pixel."""
+    own, same = matched(drive, 1, T, 1)
+    assert np.count_nonzero(own != UNLABELLED) > 100
+    return float(same[own != UNLABELLED].mean())
 
 
 @pytest.mark.parametrize("name", SPINNING)
@@ -89,17 +76,17 @@ QUICK = ("hdl32e_front", "os1_64_robot")
 def test_points_fall_on_pixels_of_their_class_in_every_rig(rig: str) -> None:
     scene = list(SCENES)[list(RIGS).index(rig) % 2]  # houses or woods: other scenes are beside each other below
     drive = RenderedDrive(seed=2, frames=4, rig=rig, scene=scene, width=320, noise=0, speed=0)
-    true = agreement(drive, 1, drive.reference)
+    true = agreement(drive, drive.reference)
     # What stands between the two sensors is seen by one of them only.
     assert true > (0.95 if RIGS[rig].distance < 0.5 else 0.89)
     for axis in np.eye(3):
-        assert agreement(drive, 1, se3.perturb(drive.reference, 3 * axis, np.zeros(3))) < true - 0.01
+        assert agreement(drive, se3.perturb(drive.reference, 3 * axis, np.zeros(3))) < true - 0.01
 
 
 @pytest.mark.parametrize("scene", [pytest.param(n, marks=() if n in ("park", "warehouse") else pytest.mark.slow) for n in SCENES])
 def test_every_scene_is_its_own(scene: str) -> None:
     drive = RenderedDrive(seed=2, frames=4, rig="os1_64_robot", scene=scene, width=240, noise=0, speed=0)
-    assert agreement(drive, 1, drive.reference) > 0.93
+    assert agreement(drive, drive.reference) > 0.93
     labels = drive.labels(1)
     share = np.bincount(labels.image.ravel(), minlength=256) / labels.image.size
     assert (share[Label.SKY] < 0.06) == (scene in ("car_park", "warehouse"))
@@ -241,6 +228,29 @@ def test_a_mid_360_never_repeats_and_sees_all_around() -> None:
     assert drive[1].cloud.ring is None
     assert "rosette" in SyntheticDrive(1, rings=0).describe()["LiDAR"]
     assert len(drive[1].cloud) > 8000
+
+
+PLACES = [{"rig": "vlp16_narrow"}, {"rig": "mid360_90"}, {"rig": "os1_128_fisheye"}, {"rings": 16, "height": 60, "tilt_deg": 2.0}]
+
+
+@pytest.mark.parametrize("place", PLACES, ids=lambda place: next(iter(place.values())))
+def test_trying_every_solid_on_every_ray_finds_no_more(place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Solids are cast on the rays of their windows only."""
+    for module in (rays, windows, wide):
+        monkeypatch.setattr(module, "SMALLEST", 0.0)
+    drive = {"seed": 4, "frames": 1, "width": 96, "noise": 0.0, **place}
+    expected = SyntheticDrive(**drive)[0]
+
+    def everywhere(own: rays.Rays, solids: Solids, jobs: rays.Jobs, t: np.ndarray, ids: np.ndarray) -> None:
+        (rows, columns), n = own.shape, len(solids)
+        whole = np.stack([np.arange(n), np.zeros(n), np.full(n, rows), np.zeros(n), np.full(n, columns)], 1).astype(np.int32)
+        rays.cast(own, solids, rays.Jobs(whole, np.zeros(n)), t, ids)
+
+    for module in (camera, lidar):
+        monkeypatch.setattr(module, "cast", everywhere)
+    found = SyntheticDrive(**drive)[0]
+    np.testing.assert_array_equal(found.cloud.xyz, expected.cloud.xyz)
+    assert np.mean(found.image != expected.image) < 1e-3
 
 
 def test_the_page_of_the_rigs_lists_them_all() -> None:

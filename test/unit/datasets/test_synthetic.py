@@ -25,22 +25,23 @@ SMALL = {"rings": 16, "width": 160, "height": 96}
 SHARP = {"rings": 32, "width": 620, "height": 188, "speed": 0, "noise": 0}
 
 
+def matched(drive: SyntheticDrive, index: int, T: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Class of each point in view (n,), and whether it falls on a pixel of that class, or within `reach` pixels of one."""
+    labels = drive.labels(index)
+    uv, inside = drive.camera.project(se3.transform(T, drive[index].cloud.xyz))
+    u, v = np.rint(uv[inside]).astype(int).T
+    own = labels.points[inside]
+    same = np.zeros(len(own), bool)
+    for dv, du in itertools.product(range(-reach, reach + 1), repeat=2):
+        row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
+        same |= labels.image[row, column] == own
+    return own, same
+
+
 def agreement(drive: SyntheticDrive, frames: range, T: np.ndarray, reach: int = 0) -> dict[int, float]:
     """Class -> share of its points that fall on a pixel of the same class, or within `reach` pixels of one."""
-    good, count = np.zeros(10), np.zeros(10)
-    for i in frames:
-        labels, cloud = drive.labels(i), drive[i].cloud
-        uv, inside = drive.camera.project(se3.transform(T, cloud.xyz))
-        u, v = np.rint(uv[inside]).astype(int).T
-        own = labels.points[inside]
-        same = np.zeros(len(own), bool)
-        steps = range(-reach, reach + 1)
-        for dv, du in itertools.product(steps, steps):
-            row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
-            same |= labels.image[row, column] == own
-        good += np.bincount(own[same], minlength=10)
-        count += np.bincount(own, minlength=10)
-    return {k: good[k] / count[k] for k in range(10) if count[k] > 30}
+    own, same = (np.concatenate(parts) for parts in zip(*(matched(drive, i, T, reach) for i in frames), strict=True))
+    return {k: float(same[own == k].mean()) for k in range(10) if np.count_nonzero(own == k) > 30}
 
 
 def test_frames_do_not_depend_on_the_order_of_access_nor_on_the_length() -> None:
@@ -217,7 +218,7 @@ def test_noise_has_the_stated_size_and_can_be_switched_off() -> None:
     np.testing.assert_array_equal(clean.labels(2).image, noisy.labels(2).image)
 
 
-def test_source_text() -> None:
+def test_source_text_and_bad_parameters() -> None:
     drive = SyntheticDrive.from_text(" synthetic:seed=3, frames=16,rings=32,width=640,height=480,speed=0,noise=0.5 ")
     assert (drive.seed, len(drive), drive.rings, drive.speed, drive.noise) == (3, 16, 32, 0.0, 0.5)
     assert (drive.camera.width, drive.camera.height) == (640, 480)
@@ -235,9 +236,6 @@ def test_source_text() -> None:
     ):
         with pytest.raises(BadInputError, match=message):
             SyntheticDrive.from_text(text)
-
-
-def test_bad_parameters_are_refused_by_name() -> None:
     wrong = [("seed", -1), ("frames", 0), ("frames", 2.5), ("frames", True), ("rings", 48), ("width", 10), ("height", 0)]
     wrong += [("speed", float("nan")), ("stride", 0), ("noise", -0.1), ("noise", "much"), ("tilt_deg", 90)]
     for name, value in wrong:

@@ -59,6 +59,9 @@ def test_boxes_are_shares_of_the_picture():
     expected = np.ones((240, 320), bool)
     expected[180:] = expected[:120, :32] = False
     assert np.array_equal(used, expected)
+    for boxes in ((0.0, 0.5, 1.0), (0.5, 0.5, 0.5, 1.0), (0.0, 0.9, 1.0, 0.5), (0.1, 0.1, 0.2, 0.2, 0.0, 0.0, 1.0, 0.0)):
+        with pytest.raises(ConfigError, match="ignored_boxes"):
+            Config(image=ImageConfig(ignored_boxes=boxes))
 
 
 def test_a_mask_that_does_not_fit_says_what_to_do(tmp_path):
@@ -74,14 +77,6 @@ def test_a_mask_that_does_not_fit_says_what_to_do(tmp_path):
     ):
         with pytest.raises(BadInputError, match=says):
             used_pixels(ImageConfig(mask=mask), 320, 240)
-
-
-@pytest.mark.parametrize(
-    "boxes", [(0.0, 0.5, 1.0), (0.5, 0.5, 0.5, 1.0), (0.0, 0.9, 1.0, 0.5), (0.1, 0.1, 0.2, 0.2, 0.0, 0.0, 1.0, 0.0)]
-)
-def test_boxes_that_are_none_are_refused(boxes):
-    with pytest.raises(ConfigError, match="ignored_boxes"):
-        Config(image=ImageConfig(ignored_boxes=boxes))
 
 
 def test_the_outline_of_what_is_not_used_is_no_edge():

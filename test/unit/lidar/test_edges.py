@@ -451,9 +451,6 @@ def test_the_vehicle_itself_makes_no_edges_and_hides_what_is_behind_it():
     assert near_outline(edges_of(shapes, keep=cut_out)) > 10
     elsewhere = azimuth(with_mirror.xyz) < bearing[0] - 3
     assert np.array_equal(masked.xyz[azimuth(masked.xyz) < bearing[0] - 3], with_mirror.xyz[elsewhere])
-
-
-def test_a_box_of_the_vehicle_without_volume_is_refused():
     for box, says in (((1.0, 1.0, -1.0, 1.0, -1.0, 1.0), "is empty"), ((1.0, 2.0), "must have 6 elements")):
         with pytest.raises(ConfigError, match=says):
             Config(lidar=LidarConfig(ego_box=box))

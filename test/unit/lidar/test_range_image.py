@@ -155,17 +155,10 @@ def test_useless_points_are_dropped():
     assert np.nanmin(scan.range) >= CONFIG.min_range
 
 
-@pytest.mark.parametrize(
-    "xyz",
-    [np.zeros((0, 3)), np.zeros((5000, 3)), np.full((5000, 3), np.nan), np.full((5000, 3), 0.1), np.ones((99, 3)) * 5],
-    ids=["none", "zeros", "nan", "too near", "99"],
-)
-def test_clouds_without_valid_points(xyz):
-    with pytest.raises(TooFewFeaturesError, match="usable points"):
-        range_image(PointCloud(xyz.astype(np.float32)), CONFIG)
-
-
-def test_clouds_without_rings_or_sense_still_give_rows():
+def test_clouds_without_rings_or_sense_still_give_rows_but_not_those_without_points():
+    for xyz in (np.zeros((0, 3)), np.zeros((5000, 3)), np.full((5000, 3), np.nan), np.full((5000, 3), 0.1), np.ones((99, 3)) * 5):
+        with pytest.raises(TooFewFeaturesError, match="usable points"):
+            range_image(PointCloud(xyz.astype(np.float32)), CONFIG)
     some = np.random.default_rng(0).uniform(-1, 1, (5000, 3)) * [20, 20, 3] + [30, 0, 0]
     scan = range_image(PointCloud(some.astype(np.float32)), CONFIG)
     assert 16 <= len(scan.elevation) <= 64
@@ -187,23 +180,13 @@ def reflectivity(intensity: np.ndarray | None) -> np.ndarray | None:
     return range_image(PointCloud(xyz, None if intensity is None else intensity.astype(np.float32)), CONFIG).reflectivity
 
 
-@pytest.mark.parametrize(("unit", "scale"), [("share", 1.0), ("byte", 255.0), ("few bytes", 200.0), ("counts", 3000.0)])
-def test_intensity_in_any_unit_becomes_a_share(unit, scale):
-    values = reflectivity(STRIPES * scale)
-    full = {"share": 1, "byte": 255, "few bytes": 255, "counts": 0.8 * 3000}[unit]
-    assert np.allclose(values, STRIPES * scale / full, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "intensity",
-    [None, np.zeros(4000), np.full(4000, 100.0), np.full(4000, np.nan), np.where(np.arange(4000) == 5, 200.0, 7)],
-    ids=["none", "zeros", "constant", "nan", "one odd value"],
-)
-def test_constant_or_invalid_intensity_is_dropped(intensity):
-    assert reflectivity(intensity) is None
-
-
-def test_bright_outliers_and_gaps_do_not_darken_the_rest():
+def test_intensity_in_any_unit_becomes_a_share_and_constant_or_invalid_ones_are_dropped():
+    for scale, full in ((1.0, 1), (255.0, 255), (200.0, 255), (3000.0, 0.8 * 3000)):
+        assert np.allclose(reflectivity(STRIPES * scale), STRIPES * scale / full, atol=1e-5)
+    one_odd = np.where(np.arange(4000) == 5, 200.0, 7)
+    for intensity in (None, np.zeros(4000), np.full(4000, 100.0), np.full(4000, np.nan), one_odd):
+        assert reflectivity(intensity) is None
+    # Bright outliers and gaps do not darken the rest.
     counts = STRIPES * 1000
     counts[:2], counts[2:5] = 65535, np.nan
     values = reflectivity(counts)

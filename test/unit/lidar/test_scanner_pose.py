@@ -119,15 +119,12 @@ def test_a_given_pose_is_taken(scan, rings):
     assert np.abs(pose.to_scanner(edges.astype(float)) - expected).max() < 1e-3
 
 
-def test_roll_pitch_and_yaw_are_those_of_urdf():
+def test_roll_pitch_and_yaw_are_those_of_urdf_and_axes_are_reached_by_the_smallest_rotation():
     roll, pitch, yaw = 0.3, -0.2, 1.1
     pose = ScannerPose.given((0, 0, 0), np.rad2deg([roll, pitch, yaw]))
     one_by_one = [Rotation.from_rotvec(v).as_matrix() for v in ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])]
     assert np.allclose(pose.rotation, one_by_one[0] @ one_by_one[1] @ one_by_one[2])
     assert pose.tilt_deg == pytest.approx(np.rad2deg(np.arccos(np.cos(roll) * np.cos(pitch))))
-
-
-def test_the_smallest_rotation_to_an_axis():
     rng = np.random.default_rng(0)
     for axis in [*rng.normal(size=(20, 3)), np.array([0.0, 0, 1]), np.array([0.0, 0, -1])]:
         axis = axis / np.linalg.norm(axis)

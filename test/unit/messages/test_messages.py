@@ -260,19 +260,13 @@ def test_array_fields_and_count_zero(ros):
     )
     message = ros.cloud(points)
     message.fields[4].count = 0
-    cloud = decode_cloud(message)
+    for message.row_step in (0, 5, 10**9):  # of a single row it does not matter
+        cloud = decode_cloud(message)
     assert np.array_equal(cloud.xyz[:, 0], [1, 2])
     assert np.array_equal(cloud.intensity, [3, 4])
     message.fields[4].offset += 1  # a count of 0 stands for 1, which does not fit here
     with pytest.raises(BadInputError, match="field reflectivity ends at byte 27"):
         decode_cloud(message)
-
-
-@pytest.mark.parametrize("row_step", [0, 5, 10**9])
-def test_row_step_of_a_single_row_does_not_matter(ros, row_step):
-    message = ros.cloud(structured(4, VELODYNE, x=[1, 2, 3, 4]))
-    message.row_step = row_step
-    assert np.array_equal(decode_cloud(message).xyz[:, 0], [1, 2, 3, 4])
 
 
 SCAN = np.linspace(0, 0.1, 50)  # seconds from the stamp
@@ -297,11 +291,8 @@ def test_point_times_in_every_unit(ros):
     for kind, values in (("<f4", SCAN - 0.1), ("<f8", STAMP * 1e-9 + SCAN - 0.1)):  # before the stamp
         cloud = decode_cloud(ros.cloud(structured(50, [*VELODYNE[:3], ("time", kind)], time=values)))
         assert np.abs(cloud.time - (SCAN - 0.1)).max() < 2e-6
-
-
-def test_points_without_a_time(ros):
     values = STAMP * 1e-9 + SCAN
-    values[[3, 9]] = 0, np.nan
+    values[[3, 9]] = 0, np.nan  # points without a time
     cloud = decode_cloud(ros.cloud(structured(50, [*VELODYNE[:3], ("timestamp", "<f8")], timestamp=values)))
     assert (cloud.time[[3, 9]] == 0).all()
     assert np.abs(np.delete(cloud.time - SCAN, [3, 9])).max() < 2e-6
@@ -367,20 +358,17 @@ def test_camera_info(ros):
     assert rectified.is_pinhole
     loose = {"K": list(K.ravel()), "D": [0.1, 0, 0, 0], "P": list(P.ravel()), "distortion_model": "equidistant"}  # ROS 1's names
     assert decode_camera_info(SimpleNamespace(width=640, height=480, **loose)).model == "equidistant"
-
-
-def test_region_of_interest_and_binning(ros):
     camera = decode_camera_info(ros.camera_info(640, 480, K, roi=(20, 40, 400, 600), binning=2))
     assert (camera.width, camera.height) == (300, 200)
     assert np.array_equal(camera.K, [[350, 0, 150], [0, 355, 100], [0, 0, 1]])
 
 
 def test_unusable_camera_infos_say_why(ros):
-    with pytest.raises(BadInputError, match="K is all zero; calibrate"):
-        decode_camera_info(ros.camera_info(640, 480, np.zeros(9)))
-    with pytest.raises(BadInputError, match="P is all zero"):
-        decode_camera_info(ros.camera_info(640, 480, K), rectified=True)
-    with pytest.raises(BadInputError, match="got 3"):
-        decode_camera_info(ros.camera_info(640, 480, K, [0.1, 0.2, 0.3]))
-    with pytest.raises(BadInputError, match="K has 8 numbers, not 9"):
-        decode_camera_info(SimpleNamespace(width=1, height=1, k=[1] * 8, d=[], distortion_model=""))
+    for message, rectified, says in (
+        (ros.camera_info(640, 480, np.zeros(9)), False, "K is all zero; calibrate"),
+        (ros.camera_info(640, 480, K), True, "P is all zero"),
+        (ros.camera_info(640, 480, K, [0.1, 0.2, 0.3]), False, "got 3"),
+        (SimpleNamespace(width=1, height=1, k=[1] * 8, d=[], distortion_model=""), False, "K has 8 numbers, not 9"),
+    ):
+        with pytest.raises(BadInputError, match=says):
+            decode_camera_info(message, rectified)
