@@ -15,7 +15,7 @@ from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros_check.fleet import fleet as module
 from calib_ros_check.fleet.fleet import FleetOptions, check_fleet
-from calib_ros_check.fleet.jobs import CheckJob, Usage, options_key, run_checks
+from calib_ros_check.fleet.jobs import CheckJob, options_key, run_checks
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.recording import CheckOptions
 from calib_ros_semantics.models.weight_sets import of_package
@@ -112,16 +112,6 @@ def test_a_recording_that_is_gone_is_blamed_on_the_machine(tmp_path: Path) -> No
     assert answer["from"] == "other"
     (answer,) = run_checks(CheckOptions(), [CheckJob(str(tmp_path / "gone"), "", "o")])
     assert "does not exist" in answer["error"]
-
-
-def test_usage_counts_bytes_processor_and_memory(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(bytes(3_000_000))
-    usage = Usage()
-    data = (tmp_path / "file").read_bytes() + bytes(50_000_000)
-    used = usage.since()
-    assert 3_000_000 <= used["bytes_read"] < 3_200_000
-    assert used["peak_bytes"] > len(data)
-    assert used["cpu_s"] < 5
 
 
 def test_a_folder_of_recordings_from_the_command_line(drive, street_bag: Path, bad: Path, capsys) -> None:
