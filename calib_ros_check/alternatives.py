@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,10 @@ from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import search, search_decoy
-from calib_ros.result import CONVERGED, Evidence, Result
+from calib_ros.result import CONVERGED, Evidence, RefusalCode, Result
 from calib_ros_check.cameras import AsTaken, CameraGuess, camera_guesses, turned_over
-from calib_ros_check.candidate import Candidate, H, fit
 from calib_ros_check.causes import MIXED_UP, OFF, OTHER_FITS, distorts, instead, lens_findings, not_mixed_up, of_cameras
-from calib_ros_check.evidence import EVEN, GivenMatch, convinces, evidence, log_odds, rare_odds
+from calib_ros_check.evidence import EVEN, Candidate, H, Match, convinces, evidence, fit, log_odds, rare_odds
 from calib_ros_check.hypotheses import MixUp, hypotheses, of_pictures, says_more_than, simplest, upside_down
 from calib_ros_check.outcome import CauseFinding, Tolerance
 from calib_ros_check.sensors import LensChange, LensFit, fit_lens, judged, lenses
@@ -60,23 +58,15 @@ class CheckInputs:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
-    """What the scenes show. T: (4, 4), the extrinsic, an optimum of the score; covariance: (6, 6) of a left twist; shared: the
-    part of it that intrinsics and clocks leave open. T_corrected: the extrinsic that was checked, with what was mixed up put
-    right. result: of the estimate."""
+class Explanation(Match):
+    """What the scenes show. covariance: (6, 6) of a left twist; shared: the part of it that intrinsics and clocks leave open.
+    T_corrected: the extrinsic that was checked, with what was mixed up put right. result: of the estimate."""
 
-    score: PointScore
-    T: Transform
     covariance: Covariance
     T_corrected: Transform
     result: Result
     causes: tuple[CauseFinding, ...] = ()
     shared: Covariance | None = None
-
-    @property
-    def own_covariance(self) -> Covariance:
-        """What the scenes tell with these intrinsics and clocks."""
-        return self.covariance if self.shared is None else self.covariance - self.shared
 
 
 class Alternatives:
@@ -109,17 +99,17 @@ class Alternatives:
                 own = starts if guess.start is None else (guess.start,)
                 yield max((fit(guess, self.score(features, T), T) for T in own), key=_z_score)
 
-    def as_given(self, features: Sequence[FrameFeatures], T: Transform, optima: Sequence[Matrix]) -> GivenMatch | None:
+    def as_given(self, features: Sequence[FrameFeatures], T: Transform, optima: Sequence[Matrix]) -> Match | None:
         """The best match of the sensors as they are given: the optimum near T (4, 4), as of every hypothesis, or one of the
         optima that were met, beyond chance or not. None if all of them see too few points."""
-        matches: list[GivenMatch] = []
+        matches: list[Match] = []
         atlas: Atlas | None = None
         for start in (T, *optima):
             with suppress(TooFewFeaturesError):
                 score = self.score(features, start, atlas)
                 atlas = score.atlas
                 end = fit(LensChange(), score, start).T if start is T else start
-                matches.append(GivenMatch(score, end))
+                matches.append(Match(score, end))
         return max(matches, key=evidence, default=None)
 
     def mixed_up(
@@ -127,7 +117,7 @@ class Alternatives:
         features: Sequence[FrameFeatures],
         inputs: CheckInputs,
         tried: Sequence[Candidate[MixUp]],
-        given: GivenMatch | None,
+        given: Match | None,
     ) -> Explanation | None:
         """The explanation by something that was mixed up, if one matches beyond chance, and convinces against the extrinsic being
         off. tried: all hypotheses about these features, see `hypotheses`. given: see `as_given`."""
@@ -137,10 +127,13 @@ class Alternatives:
             for one in (simplest(best, tried), best):
                 odds = EVEN if _is_only_off(one, inputs) else rare_odds(len(tried))
                 if self._stands(found := self._searched(one), given, len(tried), odds):
-                    return _explained(found, features, inputs)
+                    # What holds on most vehicles has to hold exactly; else its optimum tells how far the extrinsic is off.
+                    if _is_only_off(found, inputs):
+                        return _explanation(found, features, inputs.T, not_mixed_up(OFF))
+                    return _explanation(found, features, found.hypothesis.T, instead(found.hypothesis.finding, MIXED_UP))
         return None
 
-    def _stands(self, candidate: Candidate[Any], given: GivenMatch | None, tried: int, odds: float) -> bool:
+    def _stands(self, candidate: Candidate[Any], given: Match | None, tried: int, odds: float) -> bool:
         """Does one of so many that were tried match beyond chance, and convince against the sensors as they are given, at these
         odds in advance?"""
         return self._beyond_chance(candidate, tried) and convinces(log_odds(candidate, given), odds)
@@ -153,7 +146,7 @@ class Alternatives:
         return max(candidate, other, key=evidence)
 
     def another_camera(
-        self, features: Sequence[FrameFeatures], inputs: CheckInputs, given: GivenMatch | None, tried: int
+        self, features: Sequence[FrameFeatures], inputs: CheckInputs, given: Match | None, tried: int
     ) -> Explanation | None:
         """The explanation by a camera that is quite another, by the same standard. tried: hypotheses so far.
 
@@ -163,7 +156,8 @@ class Alternatives:
         lens, changes = self._other_lens(features, some, inputs), list(lenses(features[0].camera, wide=True))
         count = tried + len(changes)
         if lens is not None and self._stands(lens, given, count, rare_odds(count)):
-            return _other_camera(lens, features, inputs, lens_findings(lens, NOT_JUDGED, self.camera))
+            findings = lens_findings(lens, NOT_JUDGED, self.camera)
+            return _explanation(lens, features, inputs.T, (*findings, *not_mixed_up(OTHER_FITS)))
         guesses = list(camera_guesses(self.camera))
         count += len(guesses)
         # One after the other: each holds the maps of all frames.
@@ -171,37 +165,33 @@ class Alternatives:
         if other is not None and len(some) < len(features):
             other = next(self.cameras([other.hypothesis], (inputs.T,), inputs), None)
         if other is not None and self._stands(other, given, count, rare_odds(count)):
-            return _other_camera(other, features, inputs, instead(other.hypothesis.finding, of_cameras(self.camera)))
+            findings = instead(other.hypothesis.finding, of_cameras(self.camera))
+            return _explanation(other, features, inputs.T, (*findings, *not_mixed_up(OTHER_FITS)))
         return None
 
     def hypotheses(
         self, features: Sequence[FrameFeatures], inputs: CheckInputs, only_pictures: bool = False
     ) -> list[Candidate[MixUp]]:
-        """All that may have been mixed up and says more than that the extrinsic is off, the best match first. only_pictures: not
-        transforms."""
-        camera, poses = features[0].camera, [f.points.pose for f in features]
-        of_all = partial(hypotheses, inputs.T, camera, poses, inputs.vehicle_frames)
-        tried = self._tried(features, list(of_pictures(inputs.T, camera)) if only_pictures else of_all(), inputs.progress)
-        if (
-            not only_pictures and inputs.as_taken is not None and distorts(self.camera)
-        ):  # rectified upside down, a picture is bent
-            with suppress(TooFewFeaturesError, BadInputError):
-                guess = upside_down(inputs.T)
-                tried.append(_fit_mix_up(guess, self.score(inputs.as_taken(turned_over(self.camera), None), guess.T)))
-        return sorted((own for own in tried if says_more_than(own, inputs.T)), key=lambda own: -own.z_score)
-
-    def _tried(
-        self, features: Sequence[FrameFeatures], guesses: Sequence[MixUp], progress: Callback | None
-    ) -> list[Candidate[MixUp]]:
-        """All hypotheses that leave enough points in view, the best match first."""
-        tried, watch, atlas = [], Progress(progress, MIX_UPS), None
+        """All that may have been mixed up, leaves enough points in view and says more than that the extrinsic is off, the best
+        match first. only_pictures: not transforms."""
+        camera, T = features[0].camera, inputs.T
+        if only_pictures:
+            guesses = list(of_pictures(T, camera))
+        else:
+            guesses = hypotheses(T, camera, [f.points.pose for f in features], inputs.vehicle_frames)
+        tried, watch, atlas = [], Progress(inputs.progress, MIX_UPS), None
         for k, guess in enumerate(guesses):
             watch(k / len(guesses))
             with suppress(TooFewFeaturesError):
                 score = self.score(features, guess.T, atlas)
                 atlas = score.atlas  # one for all: each would take as much memory as the maps of all frames
-                tried.append(_fit_mix_up(guess, score))
-        return sorted(tried, key=lambda own: -own.z_score)
+                tried.append(fit(guess, guess.seen_by(score), guess.T))
+        # Rectified upside down, a picture is bent.
+        if not only_pictures and inputs.as_taken is not None and distorts(self.camera):
+            with suppress(TooFewFeaturesError, BadInputError):
+                guess = upside_down(T)
+                tried.append(fit(guess, self.score(inputs.as_taken(turned_over(self.camera), None), guess.T), guess.T))
+        return sorted((own for own in tried if says_more_than(own, T)), key=lambda own: -own.z_score)
 
     def _other_lens(self, features: Sequence[FrameFeatures], some: Sequence[int], inputs: CheckInputs) -> LensFit | None:
         """The best match of another camera near the extrinsic; None if none matches clearly better, or it cannot be judged.
@@ -232,20 +222,8 @@ class Alternatives:
         return self._calibrator.objectives(features, T, T, atlas=atlas).edges.score
 
 
-def _fit_mix_up(guess: MixUp, score: PointScore) -> Candidate[MixUp]:
-    """score: of the points that are near the image where the mix-up predicts the extrinsic."""
-    return fit(guess, guess.seen_by(score), guess.T)
-
-
 def _z_score(match: Candidate[Any]) -> float:
     return match.z_score
-
-
-def _other_camera(
-    match: Candidate[Any], features: Sequence[FrameFeatures], inputs: CheckInputs, findings: Iterable[CauseFinding]
-) -> Explanation:
-    causes = (*findings, *not_mixed_up(OTHER_FITS))
-    return Explanation(match.score, match.T, covariance_of(match.score, match.T), inputs.T, _matched(match, features), causes)
 
 
 def _is_only_off(one: Candidate[MixUp], inputs: CheckInputs) -> bool:
@@ -253,20 +231,37 @@ def _is_only_off(one: Candidate[MixUp], inputs: CheckInputs) -> bool:
     return one.hypothesis.usual and not inputs.tolerance.covers(one.hypothesis.T, one.T)
 
 
-def _explained(one: Candidate[MixUp], features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation:
-    """What a hypothesis says. One that holds on most vehicles, nearly, has to hold exactly; else its optimum tells how far the
-    extrinsic is off."""
-    C = covariance_of(one.score, one.T)
-    if _is_only_off(one, inputs):
-        return Explanation(one.score, one.T, C, inputs.T, _matched(one, features), not_mixed_up(OFF))
-    return Explanation(one.score, one.T, C, one.hypothesis.T, _matched(one, features), instead(one.hypothesis.finding, MIXED_UP))
-
-
-def _matched(match: Candidate[Any], features: Sequence[FrameFeatures]) -> Result:
-    """What is known of a match that is no estimate."""
-    return Result(match.T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
+def _explanation(
+    match: Candidate[Any], features: Sequence[FrameFeatures], T_corrected: Transform, causes: Iterable[CauseFinding]
+) -> Explanation:
+    """Of a match that is no estimate."""
+    known = Result(match.T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
+    return Explanation(match.score, match.T, covariance_of(match.score, match.T), T_corrected, known, tuple(causes))
 
 
 def covariance_of(score: PointScore, T: Transform) -> Covariance:
     """Covariance (6, 6) of an optimum T (4, 4)."""
     return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))
+
+
+class Looks:
+    """The looks of one check from the extrinsic, one after the other. optima: T_camera_lidar (4, 4) of all, by chance or not."""
+
+    def __init__(self, inputs: CheckInputs) -> None:
+        self.optima: list[Matrix] = []
+        self._inputs = inputs
+
+    def match(self, calibrator: Calibrator, features: Sequence[FrameFeatures], box: SearchBox | None) -> Result | None:
+        """The match of a refinement (None), or of a search in a box; None if it is one of chance."""
+        result = calibrator.estimate(features, self._inputs.T, box, self._inputs.progress)
+        optimum = result.T_camera_lidar if result.converged else result.optimum
+        if optimum is not None:
+            self.optima.append(optimum)
+        if result.refusal is RefusalCode.WRONG_TIMES and result.evidence is not None:  # an optimum that matches for all that
+            return result if result.evidence.p_value <= calibrator.config.refine.max_p_value else None
+        return result if result.converged else None
+
+
+def match_of(result: Result) -> float:
+    """z-score of a match."""
+    return result.evidence.z_score if result.evidence is not None else -np.inf

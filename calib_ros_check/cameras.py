@@ -17,7 +17,6 @@ from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.parameters import REACH, noise_of
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
-from calib_ros_check.candidate import Candidate, H
 from calib_ros_check.causes import (
     ALREADY_RECTIFIED,
     UNRECTIFIED_FISHEYE,
@@ -26,6 +25,7 @@ from calib_ros_check.causes import (
     focal_finding,
     of_another_size,
 )
+from calib_ros_check.evidence import Candidate, H
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState
 from calib_ros_check.sensors import SIZES, LensChange
 

@@ -14,20 +14,8 @@ from calib_ros.result import RefusalCode, Result
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, Tolerance
 from calib_ros_check.sensors import LensChange, LensFit, scaled
 
-MIXED_UP = (
-    Cause.INVERSE_TRANSFORM,
-    Cause.BODY_FRAME,
-    Cause.CLOUD_FRAME,
-    Cause.MIRRORED_IMAGE,
-    Cause.ROTATED_IMAGE,
-)
-OF_CAMERAS = (
-    Cause.FOCAL_LENGTH,
-    Cause.PRINCIPAL_POINT,
-    Cause.OTHER_CAMERA,
-    Cause.NOT_RECTIFIED,
-    Cause.ALREADY_RECTIFIED,
-)
+MIXED_UP = (Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.CLOUD_FRAME, Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
+OF_CAMERAS = (Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.OTHER_CAMERA, Cause.NOT_RECTIFIED, Cause.ALREADY_RECTIFIED)
 OTHER_FITS = "another cause fits better"
 AS_GIVEN = "the extrinsic matches as it is given"
 OFF = "the extrinsic is off"
@@ -153,10 +141,7 @@ def _lens_words(lens: LensChange, cause: Cause | None, camera: Camera) -> str:
             f"the image shows a lens distortion that its CameraInfo does not have: corners lie {abs(lens.barrel):.0%} of "
             f"the radius {way} the centre; take the rectified topic, or the CameraInfo of the camera as it is"
         )
-    parts = []
-    if lens.focal:
-        parts.append(_focal_words(lens.focal))
-    parts += _centre_words(lens, camera)
+    parts = [_focal_words(lens.focal)] * bool(lens.focal) + _centre_words(lens, camera)
     other = ""
     if cause is Cause.OTHER_CAMERA:
         of_size = _fits_size(lens, camera)
@@ -169,12 +154,12 @@ def _focal_words(share: float) -> str:
 
 
 def _centre_words(lens: LensChange, camera: Camera) -> list[str]:
-    parts = []
-    if round(lens.u * camera.width):
-        parts.append(f"a principal point {abs(lens.u) * camera.width:.0f} px further {'right' if lens.u > 0 else 'left'}")
-    if round(lens.v * camera.width):
-        parts.append(f"a principal point {abs(lens.v) * camera.width:.0f} px further {'down' if lens.v > 0 else 'up'}")
-    return parts
+    moved = ((lens.u, "right", "left"), (lens.v, "down", "up"))
+    return [
+        f"a principal point {abs(share) * camera.width:.0f} px further {more if share > 0 else less}"
+        for share, more, less in moved
+        if round(share * camera.width)
+    ]
 
 
 def of_another_size(scale: float) -> str:

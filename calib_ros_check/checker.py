@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_ros import se3
-from calib_ros.arrays import Matrix, Transform
+from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
@@ -32,9 +32,18 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import FRUITLESS_ROUNDS
 from calib_ros.result import CONVERGED, RefusalCode, Result
-from calib_ros_check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, CheckInputs, Classified, Explanation, covariance_of
+from calib_ros_check.alternatives import (
+    LENS,
+    NEAR,
+    NOT_JUDGED,
+    Alternatives,
+    CheckInputs,
+    Explanation,
+    Looks,
+    covariance_of,
+    match_of,
+)
 from calib_ros_check.cameras import (
-    AsTaken,
     CameraGuess,
     gain_over,
     other_centre,
@@ -42,7 +51,6 @@ from calib_ros_check.cameras import (
     rectified_already,
     unrectified_fisheye,
 )
-from calib_ros_check.candidate import PARAMETER_PENALTY, Candidate
 from calib_ros_check.causes import (
     AS_GIVEN,
     OFF,
@@ -58,8 +66,7 @@ from calib_ros_check.causes import (
     of_cameras,
     possible_causes,
 )
-from calib_ros_check.evidence import freedom, is_off, shows_noise
-from calib_ros_check.looks import Looks, match_of
+from calib_ros_check.evidence import PARAMETER_PENALTY, Candidate, freedom, is_off, shows_noise
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.sensors import LensChange, LensFit, centre_instead, centre_of, fit_lens, judged, moves_by, without_change
 from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, undecided, unknown
@@ -68,20 +75,15 @@ from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, undecided, 
 FAR = SearchBox(25.0, 0.75)
 CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
 CENTRES = 3  # principal points that are tried, one after the other
+NOT_THE_CLOCKS = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
 
 
 class Checker:
     """Checks extrinsics by frames of one camera.
 
-    Parameters
-    ----------
-    camera : Camera
-        The intrinsics that the frames were taken with, as they are claimed to be.
-    config : Config, optional
-        All settings; a check accepts any uncertainty, since it says what it is.
-    segmentation : Segmentation, optional
-        The models of ``config.semantics``, where they are loaded already.
+    camera: the intrinsics that the frames were taken with, as they are claimed to be. config: all settings; any uncertainty is
+    accepted. segmentation: the models of ``config.semantics``, where they are loaded already.
     """
 
     def __init__(self, camera: Camera, config: Config | None = None, segmentation: Segmentation | None = None) -> None:
@@ -107,29 +109,11 @@ class Checker:
         progress: Callback | None = None,
         vehicle_frames: Mapping[str, Matrix] | None = None,
     ) -> CheckResult:
-        """Check an extrinsic by frames.
+        """Check T_camera_lidar (4, 4) by frames, at least one. One that cannot be used is left out and noted.
 
-        Parameters
-        ----------
-        frames : sequence of Frame
-            At least one. One that cannot be used is left out and noted.
-        T_camera_lidar : array_like, shape (4, 4)
-            The extrinsic that is claimed to be right.
-        tolerance : Tolerance, optional
-            What counts as right.
-        progress : callable, optional
-            Called with the name of a stage and the share of it that is done, 0..1.
-        vehicle_frames : mapping, optional
-            T_camera_F (4, 4) of other frames F of the vehicle, by name, in which the clouds may really be.
-
-        Returns
-        -------
-        CheckResult
-
-        Raises
-        ------
-        BadInputError
-            No frames, frames of different cameras, or no rigid transform.
+        progress: called with the name of a stage and the share of it that is done, 0..1; may raise, which ends the check.
+        vehicle_frames: T_camera_F (4, 4) of other frames F of the vehicle, by name, in which the clouds may really be. Raises
+        BadInputError for no frames, frames of different cameras, or no rigid transform.
         """
         started, cpu = time.perf_counter(), time.process_time()
         T = se3.as_transform(T_camera_lidar, "the extrinsic")
@@ -147,36 +131,20 @@ class Checker:
             chosen = used if numbers is None else [used[k] for k in numbers]
             return [extract.seen_anew(own, frame.image) for frame, own in chosen]
 
-        features = [own for _, own in used]
         in_doubt = classified if calibrator.segmentation.active else None
-        result = self.check_features(features, T, tolerance, in_doubt, progress, vehicle_frames, as_taken)
-        return replace(
-            result,
-            notes=(*notes, *result.notes),
-            elapsed_s=time.perf_counter() - started,
-            cpu_s=time.process_time() - cpu,
-        )
+        inputs = CheckInputs(T, tolerance or Tolerance(), in_doubt, as_taken, vehicle_frames or {}, progress)
+        result = self.check_features([own for _, own in used], inputs)
+        elapsed_s, cpu_s = time.perf_counter() - started, time.process_time() - cpu
+        return replace(result, notes=(*notes, *result.notes), elapsed_s=elapsed_s, cpu_s=cpu_s)
 
-    def check_features(
-        self,
-        features: Sequence[FrameFeatures],
-        T: Transform,
-        tolerance: Tolerance | None = None,
-        classified: Classified | None = None,
-        progress: Callback | None = None,
-        vehicle_frames: Mapping[str, Matrix] | None = None,
-        as_taken: AsTaken | None = None,
-    ) -> CheckResult:
-        """The same from features. classified: makes features with classes, asked for in doubt; as_taken: makes those that
-        another camera would have; None = there are none. progress: as of `check`; it may raise, which ends the check, and is
-        called at least once for everything that is tried. Its time is for the caller to take."""
-        tolerance = tolerance or Tolerance()
-        inputs = CheckInputs(T, tolerance, classified, as_taken, vehicle_frames or {}, progress)
+    def check_features(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> CheckResult:
+        """The same from features; progress is called at least once for everything that is tried. Its time is for the caller to
+        take."""
         found = self._find(features, inputs) if features else None
         if found is not None:
-            result = self._judged(found, T, tolerance)
+            result = self._judged(found, inputs)
         else:
-            result = self._nothing_found(T, tolerance, NOTHING_MATCHES if features else "no frame can be used")
+            result = self._nothing_found(inputs, NOTHING_MATCHES if features else "no frame can be used")
         return replace(
             result,
             frame_names=tuple(f.name or str(k) for k, f in enumerate(features)),
@@ -212,7 +180,7 @@ class Checker:
             better = self._lens_instead(as_stamped, features, result, inputs.progress)
             if better is not None:
                 features, result = as_stamped, better
-                clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
+                clocks = NOT_THE_CLOCKS
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
         fit = self._other_lens(score, found, inputs) if judged(score) else None
@@ -226,7 +194,7 @@ class Checker:
             found, score, C = significant[0].T, significant[0].score, None
             lens = instead(significant[0].hypothesis.finding, of_cameras(self.camera))
             if clocks.state is CauseState.FOUND:
-                clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
+                clocks = NOT_THE_CLOCKS
         elif fit is not None and fit.significant:
             found, score, C = fit.T, fit.hypothesis.seen_by(score), None
         elif fit is not None and clocks.state is not CauseState.FOUND and not inputs.tolerance.covers(inputs.T, found):
@@ -335,10 +303,12 @@ class Checker:
         better = fit.significant and fit.penalised_gain > gain - PARAMETER_PENALTY
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 
-    def _judged(self, found: Explanation, T: Transform, tolerance: Tolerance) -> CheckResult:
+    def _judged(self, found: Explanation, inputs: CheckInputs) -> CheckResult:
         """The verdict about what was found."""
+        tolerance = inputs.tolerance
         judgement = judge(found.T_corrected, found.T, found.covariance, tolerance, freedom(found.score), found.shared)
-        if judgement.verdict is CheckVerdict.FAIL and not is_off(found, found.own_covariance, found.T_corrected, tolerance):
+        told = found.covariance if found.shared is None else found.covariance - found.shared  # by the scenes themselves
+        if judgement.verdict is CheckVerdict.FAIL and not is_off(found, told, found.T_corrected, tolerance):
             judgement = undecided(judgement)
         cause = next((own for own in found.causes if own.state is CauseState.FOUND), None)
         result, evidence = found.result, found.result.evidence
@@ -346,7 +316,7 @@ class Checker:
             **vars(judgement) | {"verdict": judgement.verdict if cause is None else CheckVerdict.FAIL},
             reason=reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is CauseState.POSSIBLE]),
             tolerance=tolerance,
-            T_checked=T,
+            T_checked=inputs.T,
             T_estimated=found.T,
             covariance=found.covariance,
             causes=complete(found.causes, self.camera),
@@ -357,7 +327,7 @@ class Checker:
             frames_used=result.frames_used,
         )
 
-    def _nothing_found(self, T: Transform, tolerance: Tolerance, why: str) -> CheckResult:
+    def _nothing_found(self, inputs: CheckInputs, why: str) -> CheckResult:
         causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
-        known = {"tolerance": tolerance, "T_checked": T, "T_estimated": None, "covariance": None}
+        known = {"tolerance": inputs.tolerance, "T_checked": inputs.T, "T_estimated": None, "covariance": None}
         return CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)

@@ -6,7 +6,7 @@ import argparse
 
 from calib_ros.cli.inputs import configuration
 from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
-from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
+from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
 from calib_ros_check.recording import Checked, CheckOptions, check_source
 
 EXIT = {CheckVerdict.PASS: 0, CheckVerdict.FAIL: 1, CheckVerdict.INCONCLUSIVE: 3}
@@ -50,14 +50,9 @@ def summary(checked: Checked) -> str:
     result = checked.result
     lines = [f"{result.verdict.value}: {result.reason}"]
     lines += [f"  {axis.name}  {axis.verdict.value:<12}  {axis.words}" for axis in result.axes]
-    lines += [f"  {finding.cause.value}: {finding.message}" for finding in _told(result)]
+    # What the frames do not tell. A cause that was found is the reason of the verdict.
+    untold = [own for own in result.causes if own.state is CauseState.NOT_JUDGED and result.T_estimated is not None]
+    lines += [f"  {finding.cause.value}: {finding.message}" for finding in untold]
     lines += [f"  {line}" for line in result.notes]
     lines.append(f"  {result.frames_used} of {len(result.frame_names)} frames, {result.cpu_s:.1f} s of CPU")
     return "\n".join(lines)
-
-
-def _told(result: CheckResult) -> list[CauseFinding]:
-    """Findings that are worth a line: what the frames do not tell. One that was found is the reason of the verdict."""
-    if result.T_estimated is None:
-        return []
-    return [finding for finding in result.causes if finding.state is CauseState.NOT_JUDGED]

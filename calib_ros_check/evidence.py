@@ -8,17 +8,30 @@ rare the better one is in advance. An explanation under which a scene is symmetr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+from scipy.special import ndtri
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.registration.acceptance.significance import null_distribution
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.covariance import REGIONS, USUAL_CELLS, effective_frames, effective_points
-from calib_ros.registration.nuisance.parameters import GROSSLY, LEVELS, NEAR_LEVELS, POINTS, TOLERANCE_DEG, noise_of, refined
+from calib_ros.registration.nuisance.parameters import (
+    GROSSLY,
+    LEVELS,
+    NEAR_LEVELS,
+    POINTS,
+    REACH,
+    TOLERANCE_DEG,
+    noise_of,
+    refined,
+)
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, unlimited
 from calib_ros_check.outcome import Tolerance
@@ -27,25 +40,82 @@ from calib_ros_check.tolerance import CONFIDENCE
 ROUNDS = 50  # of the fixed point
 UNKNOWNS = 6  # of an extrinsic
 EVEN = 1.0  # prior odds, that an extrinsic which somebody checks is off
+SMALLEST_SCORE = 1e-9
+FALSE_ALARMS = 0.01  # share of right cameras that may be taken for another one
+PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
 INDEPENDENT = 2.0  # frames; one scene alone does not tell noise from what is wrong in it
 
 
-class AtOptimum(Protocol):
-    """An explanation at its optimum T (4, 4), with the score of the frames as they look if it holds."""
-
-    @property
-    def score(self) -> PointScore: ...
-
-    @property
-    def T(self) -> Transform: ...
-
-
 @dataclass(frozen=True, eq=False)
-class GivenMatch:
-    """The match of the sensors as they are given, at T (4, 4)."""
+class Match:
+    """An explanation at its optimum T (4, 4), with the score of the frames as they look if it holds."""
 
     score: PointScore
     T: Transform
+
+
+class CheckHypothesis(Protocol):
+    """What may differ from the claim. unknowns: how many things. min_relative_gain: share of the score that it has to gain."""
+
+    @property
+    def unknowns(self) -> int: ...
+
+    @property
+    def min_relative_gain(self) -> float: ...
+
+
+H = TypeVar("H", bound=CheckHypothesis)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate(Match, Generic[H]):
+    """A hypothesis at its optimum.
+
+    value: of the score there. gain: in log-likelihood, over what is claimed; relative_gain: the same, as a share of the score.
+    tried: of how many candidates it is the best. parts: log-likelihood that is lost without each of the things that the
+    hypothesis changes.
+    """
+
+    hypothesis: H
+    value: float
+    gain: float = 0.0
+    relative_gain: float = 0.0
+    tried: int = 1
+    parts: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def z_score(self) -> float:
+        """Of the match, against extrinsics around it."""
+        return null_distribution(self.score, self.T).z_score
+
+    @property
+    def deviations(self) -> float:
+        """The gain in standard deviations of the score."""
+        return float(np.sqrt(2 * max(self.gain, 0.0)))
+
+    @property
+    def penalised_gain(self) -> float:
+        """Gain in log-likelihood, its unknowns paid for."""
+        return self.gain - PARAMETER_PENALTY * self.hypothesis.unknowns
+
+    @property
+    def significant(self) -> bool:
+        """True if it is clearly better than what is claimed."""
+        by_chance = -float(ndtri(FALSE_ALARMS / self.tried))
+        enough = self.deviations > by_chance and self.relative_gain > self.hypothesis.min_relative_gain
+        return self.hypothesis.unknowns > 0 and enough
+
+    def against(self, value: float, noise: float) -> Candidate[H]:
+        """With what it gains over a score of this value. noise: see `noise_of`."""
+        gain = self.value - value
+        return replace(self, gain=gain / noise, relative_gain=gain / max(abs(value), SMALLEST_SCORE))
+
+
+def fit(hypothesis: H, score: PointScore, start: Transform, levels: tuple[int, ...] = LEVELS) -> Candidate[H]:
+    """The optimum of a hypothesis near a start (4, 4). score: of the frames as they look if it holds."""
+    part = score.subset(POINTS, np.random.default_rng(0))
+    T, value = refined(part, start, Limits(start, REACH), levels, TOLERANCE_DEG)
+    return Candidate(score, T, hypothesis, value)
 
 
 def freedom(score: PointScore) -> float:
@@ -59,12 +129,12 @@ def shows_noise(score: PointScore) -> bool:
     return effective_frames(score) >= INDEPENDENT
 
 
-def evidence(match: AtOptimum) -> float:
+def evidence(match: Match) -> float:
     """What the points together say for a match: their score times how many there are, since other extrinsics see others."""
     return match.score.at(-1).value(match.T) * effective_points(match.score)
 
 
-def log_odds(better: AtOptimum, other: AtOptimum | None) -> float:
+def log_odds(better: Match, other: Match | None) -> float:
     """Log-likelihood ratio of two matches of the same frames, by the noise at the better one; negative if it is none. other: None
     = nothing is in view.
 
@@ -73,12 +143,8 @@ def log_odds(better: AtOptimum, other: AtOptimum | None) -> float:
     score, T = better.score, better.T
     noise = noise_of(score, T, unlimited(T)) * inflation(disagreement(score, T, unlimited(T)))
     gain = (evidence(better) - (evidence(other) if other is not None else 0.0)) / effective_points(score) / noise
-    return math.copysign(_log_ratio(abs(gain), freedom(score)), gain)
-
-
-def _log_ratio(gain: float, degrees: float) -> float:
-    """Of a gain in log-likelihood, if noise were known, by Student's distribution. degrees: of freedom."""
-    return 0.5 * (degrees + 1) * math.log1p(2 * gain / degrees)
+    degrees = freedom(score)
+    return math.copysign(0.5 * (degrees + 1) * math.log1p(2 * abs(gain) / degrees), gain)
 
 
 def convinces(log_ratio: float, prior_odds: float) -> bool:
@@ -91,7 +157,7 @@ def rare_odds(tried: int) -> float:
     return GROSSLY / (1 - GROSSLY) / tried
 
 
-def is_off(optimum: AtOptimum, covariance: Covariance, T_checked: Transform, tolerance: Tolerance) -> bool:
+def is_off(optimum: Match, covariance: Covariance, T_checked: Transform, tolerance: Tolerance) -> bool:
     """Whether an optimum convinces against every extrinsic within the tolerance of T_checked (4, 4). Its covariance (6, 6) tells
     where the best of these is, but knows one top of the score only."""
     part = optimum.score.subset(POINTS, np.random.default_rng(0))
@@ -100,8 +166,8 @@ def is_off(optimum: AtOptimum, covariance: Covariance, T_checked: Transform, tol
     limits, ends = Limits(T_checked, half / np.sqrt(3)), [nearest]
     for start, levels in product((T_checked, limits.clip(nearest)), (LEVELS, NEAR_LEVELS)):
         ends.append(refined(part, start, limits, levels, TOLERANCE_DEG)[0])
-    best = max((GivenMatch(part, T) for T in ends), key=evidence)
-    return convinces(log_odds(GivenMatch(part, optimum.T), best), EVEN)
+    best = max((Match(part, T) for T in ends), key=evidence)
+    return convinces(log_odds(Match(part, optimum.T), best), EVEN)
 
 
 def _nearest_within(error: Matrix, covariance: Covariance, half: Matrix) -> Matrix:

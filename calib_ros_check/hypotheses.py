@@ -17,7 +17,7 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros_check.candidate import Candidate
+from calib_ros_check.evidence import Candidate
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState
 
 _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
@@ -61,14 +61,13 @@ class MixUp:
 
 
 def predicted(candidate: Candidate[MixUp]) -> float:
-    """How far its optimum lies from what a mix-up predicts, in units of half a degree and 10 cm."""
+    """How far its optimum lies from what a mix-up predicts, see `_distance`."""
     return _distance(candidate.T, candidate.hypothesis.T)
 
 
 def says_more_than(candidate: Candidate[MixUp], T: Transform) -> bool:
     """Whether the optimum is nearer to what a mix-up predicts than to the extrinsic T (4, 4) as it was given: else the latter is
-    just off. Some mix-ups, such as a rotation applied twice, lead back to where most cameras are. A mirrored or moved picture has
-    no extrinsic that could be compared."""
+    just off. A mirrored or moved picture has no extrinsic that could be compared."""
     of_picture = candidate.hypothesis.mirrored or any(candidate.hypothesis.centre)
     return of_picture or predicted(candidate) < _distance(candidate.T, T)
 
@@ -119,17 +118,14 @@ def of_pictures(T: Transform, camera: Camera) -> Iterator[MixUp]:
     yield MixUp(Cause.MIRRORED_IMAGE, T, mirrored, mirrored=True, centre=(right, 0.0))
     for deg, how in _TURNS.items():
         centre = (right, down) if deg == 180 else (0.0, 0.0)
-        turned = se3.from_parts(_rotation(2, deg), np.zeros(3)) @ T
-        yield MixUp(Cause.ROTATED_IMAGE, turned, TURNED.format(how), False, centre)
-    upside = se3.from_parts(_rotation(2, 180), np.zeros(3)) @ T
+        yield MixUp(Cause.ROTATED_IMAGE, _turned(T, deg), TURNED.format(how), False, centre)
     flipped = "the image is mirrored upside down; flip it, or switch the driver's mirroring off"
-    yield MixUp(Cause.MIRRORED_IMAGE, upside, flipped, mirrored=True, centre=(0.0, down))
+    yield MixUp(Cause.MIRRORED_IMAGE, _turned(T, 180), flipped, mirrored=True, centre=(0.0, down))
 
 
 def upside_down(T: Transform) -> MixUp:
     """The image is upside down, seen by a camera whose principal point is turned as well."""
-    turned = se3.from_parts(_rotation(2, 180), np.zeros(3)) @ T
-    return MixUp(Cause.ROTATED_IMAGE, turned, TURNED.format(_TURNS[180]))
+    return MixUp(Cause.ROTATED_IMAGE, _turned(T, 180), TURNED.format(_TURNS[180]))
 
 
 def _clouds(T: Transform, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix]) -> Iterator[MixUp]:
@@ -185,10 +181,9 @@ def _axes_of(R: Matrix) -> str:
     return ", ".join(f"{'-' if row[np.abs(row).argmax()] < 0 else ''}{AXIS_LETTERS[np.abs(row).argmax()]}" for row in R)
 
 
-def _rotation(axis: int, deg: float) -> Matrix:
-    twist = np.zeros(6)
-    twist[axis] = np.deg2rad(deg)
-    return se3.exp(twist)[:3, :3]
+def _turned(T: Transform, deg: float) -> Matrix:
+    """T (4, 4) of a camera that is turned about its optical axis."""
+    return se3.exp([0.0, 0.0, np.deg2rad(deg), 0.0, 0.0, 0.0]) @ T
 
 
 def simplest(best: Candidate[MixUp], tried: Sequence[Candidate[MixUp]]) -> Candidate[MixUp]:

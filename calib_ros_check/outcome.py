@@ -11,8 +11,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.errors import BadInputError
@@ -99,10 +97,6 @@ class CauseFinding:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
-def _now() -> str:
-    return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
-
-
 @dataclass(frozen=True, eq=False)
 class CheckResult:
     """Whether an extrinsic is right.
@@ -169,7 +163,7 @@ class CheckResult:
     elapsed_s: float = 0.0
     cpu_s: float = 0.0
     data_stamp: int = 0
-    stamp: str = field(default_factory=_now)
+    stamp: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="milliseconds"))
 
     @property
     def cause(self) -> Cause | None:
@@ -178,10 +172,10 @@ class CheckResult:
 
     def to_dict(self) -> dict[str, Any]:
         """The format of ``calib-ros check --json``, docs/check.md: plain values, None for what is not known."""
-        values = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+        values = {field.name: plain(getattr(self, field.name)) for field in fields(self)}
         values["frames"] = values.pop("frame_names")
         rounded = {name: round(values[name], 3) for name in ("elapsed_s", "cpu_s")}
-        first = {"verdict": self.verdict.value, "reason": self.reason, "cause": _plain(self.cause)}
+        first = {"verdict": self.verdict.value, "reason": self.reason, "cause": plain(self.cause)}
         return first | values | rounded | {"version": VERSION}
 
     def dumps(self) -> str:
@@ -193,16 +187,16 @@ class CheckResult:
         write_atomically(path, self.dumps().encode())
 
 
-def _plain(value: Any) -> Any:
-    """As JSON has it; None for NaN."""
+def plain(value: Any) -> Any:
+    """As JSON has it: numbers and arrays of numpy, enumerations and dataclasses too; None for a number that is not finite."""
     if isinstance(value, Enum):
         return value.value
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, tuple):
-        return [_plain(one) for one in value]
     if isinstance(value, Mapping):
-        return dict(value)
-    return {field.name: _plain(getattr(value, field.name)) for field in fields(value)} if is_dataclass(value) else value
+        return {str(key): plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    return {field.name: plain(getattr(value, field.name)) for field in fields(value)} if is_dataclass(value) else value

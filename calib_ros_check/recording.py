@@ -51,15 +51,10 @@ class Checked:
     source: str
 
 
-def check_recording(path: str, options: CheckOptions | None = None) -> CheckResult:
-    """Check the extrinsic of a recording; see `check_source`."""
-    return check_source(path, options).result
-
-
 def check_source(
     path: str,
     options: CheckOptions | None = None,
-    reading: Callable[[float], None] | None = None,
+    reading: Callable[[float], object] = lambda share: None,
     progress: Callback | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> Checked:
@@ -72,8 +67,10 @@ def check_source(
     options = options or CheckOptions()
     source = _opened(path, options)
     T = extrinsic_of(source, path, options.extrinsic)
-    count = len(source)
-    positions = frame_positions(options.frames, count) if options.frames else _usual_positions(source)
+    if options.frames:
+        positions = frame_positions(options.frames, len(source))
+    else:
+        positions = getattr(source, "middles", None) or spread_positions(FRAMES, len(source))
     frames, notes = _read(source, positions, options.config, reading, warn)
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
@@ -97,11 +94,6 @@ def extrinsic_of(source: Source, path: str, extrinsic: str) -> Transform:
     raise BadInputError(f"{path} has no extrinsic to check; give one by --extrinsic FILE")
 
 
-def _usual_positions(source: Source) -> list[int]:
-    """Positions of FRAMES frames, evenly spread over the recording."""
-    return getattr(source, "middles", None) or spread_positions(FRAMES, len(source))
-
-
 def _opened(path: str, options: CheckOptions) -> Source:
     """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
     names = ("image_topic", "points_topic", "camera_info_topic")
@@ -118,7 +110,7 @@ def _read(
     source: Source,
     positions: Sequence[int],
     config: Config,
-    reading: Callable[[float], None] | None,
+    reading: Callable[[float], object],
     warn: Callable[[str], None] | None,
 ) -> tuple[list[Frame], list[str]]:
     moving = WithMotion(source, config.motion, warn)
@@ -132,8 +124,7 @@ def _read(
             frames.append(frame)
         except CalibrationError as error:
             notes.append(f"frame at position {position} left out: {error}")
-        if reading is not None:
-            reading((k + 1) / len(positions))
+        reading((k + 1) / len(positions))
     if not frames:
         raise BadInputError(notes[0] if notes else "the source has no frames")
     return frames, notes

@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.config import Config
@@ -18,9 +17,8 @@ from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.overlay import render
 from calib_ros_check.outcome import CheckResult, Deviation
 from calib_ros_check.page import page_template
-from calib_ros_check.words import amount
+from calib_ros_check.tolerance import amount, signed
 
-Image = NDArray[np.uint8]
 PICTURES = 3
 MAX_WIDTH = 1100  # px of a picture on the page
 QUALITY = 85  # of JPEG
@@ -153,12 +151,12 @@ def check_report(path: str | Path) -> None:
 def _row(own: Deviation, result: CheckResult) -> dict[str, object]:
     is_angle = own.name in ("rotation", "rx", "ry", "rz")
     limit = result.tolerance.deg if is_angle else result.tolerance.m
-    known = bool(np.isfinite(own.error))
+    known, said = bool(np.isfinite(own.error)), amount if own.name in ("rotation", "translation") else signed
     return {
         "name": LONG_NAMES[own.name],
         "verdict": own.verdict.value,
-        "error": _signed(own.error, own, is_angle) if known else "-",
-        "interval": f"{_signed(own.low, own, is_angle)} to {_signed(own.high, own, is_angle)}" if known else "-",
+        "error": said(own.error, is_angle) if known else "-",
+        "interval": f"{said(own.low, is_angle)} to {said(own.high, is_angle)}" if known else "-",
         "words": own.words,
         "bar": _bar(own, limit) if known else None,
     }
@@ -178,11 +176,6 @@ def _bar(own: Deviation, limit: float) -> dict[str, object]:
         "interval": (round(low, 1), round(max(high - low, 1.0), 1)),
         "median": round(at(own.error) - 0.75, 1),
     }
-
-
-def _signed(value: float, own: Deviation, is_angle: bool) -> str:
-    sign = "" if own.name in ("rotation", "translation") else ("-" if value < 0 else "+")
-    return sign + amount(value, is_angle)
 
 
 def _shown(frames: Sequence[Frame]) -> list[Frame]:

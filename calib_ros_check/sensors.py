@@ -24,8 +24,7 @@ from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POIN
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
-from calib_ros_check.candidate import PARAMETER_PENALTY, Candidate, fit
-from calib_ros_check.evidence import shows_noise
+from calib_ros_check.evidence import PARAMETER_PENALTY, Candidate, fit, shows_noise
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.tolerance import CONFIDENCE
 
@@ -75,7 +74,7 @@ def moves_by(fitted: LensFit, camera: Camera) -> float:
 
 def without_change(fitted: LensFit, T: Transform, score: PointScore) -> LensFit:
     """The camera as it is given instead, with its optimum T (4, 4) of a score."""
-    return Candidate(LensChange(), T, score, score.at(-1).value(T), tried=fitted.tried)
+    return Candidate(score, T, LensChange(), score.at(-1).value(T), tried=fitted.tried)
 
 
 def lenses(camera: Camera, wide: bool) -> Iterator[LensChange]:
@@ -171,7 +170,7 @@ class _Fitting:
         self._progress, self._planned, self._done = progress, planned, 0
         self._distorted = 0.0, self._score  # the last distortion that was asked for
         # Coarse levels may have their optimum elsewhere.
-        here = Candidate(LensChange(), T, self._score, self._score.at(-1).value(T), tried=planned)
+        here = Candidate(self._score, T, LensChange(), self._score.at(-1).value(T), tried=planned)
         self.given = max(self._end(LensChange(), T, LEVELS), here, key=lambda end: end.value)
         self._noise = noise_of(self._score, self.given.T, Limits(self.given.T, REACH))
 

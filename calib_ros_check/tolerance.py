@@ -19,7 +19,6 @@ from scipy.stats import chi2
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros_check.outcome import CauseFinding, CheckVerdict, Deviation, Tolerance
-from calib_ros_check.words import axis_words, size_words
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Scales of the prior, as multiples of the tolerance.
@@ -29,6 +28,16 @@ QUANTILES = (np.arange(8) + 0.5) / 8  # of the variances that make up Student's 
 CONFIDENCE = 0.9  # probability from which a verdict is one
 INTERVAL = 0.95
 MORE_FRAMES = "use more frames of other scenes, with objects in view of both sensors"
+# By axis: what a positive and what a negative error means. A positive rotation about y, which points down, moves all points to
+# the right in the image: the camera is taken to look further left than it does.
+DIRECTIONS = {
+    "rx": ("camera looks {} too far down", "camera looks {} too far up"),
+    "ry": ("camera looks {} too far left", "camera looks {} too far right"),
+    "rz": ("camera is rolled {} too far anticlockwise", "camera is rolled {} too far clockwise"),
+    "tx": ("camera is {} too far left of the LiDAR", "camera is {} too far right of the LiDAR"),
+    "ty": ("camera is {} too far above the LiDAR", "camera is {} too far below the LiDAR"),
+    "tz": ("camera is {} too far behind the LiDAR", "camera is {} too far in front of the LiDAR"),
+}
 DEGREES = np.array([np.rad2deg(1.0)] * 3 + [1.0] * 3)
 
 
@@ -46,13 +55,8 @@ class Judgement:
 def unknown() -> Judgement:
     """Where the scenes show no extrinsic at all."""
     nothing = CheckVerdict.INCONCLUSIVE
-    return Judgement(
-        nothing,
-        math.nan,
-        Deviation("rotation", nothing, words="not known"),
-        Deviation("translation", nothing, words="not known"),
-        tuple(Deviation(axis, nothing, words="not known") for axis in AXES),
-    )
+    rotation, translation, *axes = (Deviation(name, nothing, words="not known") for name in ("rotation", "translation", *AXES))
+    return Judgement(nothing, math.nan, rotation, translation, tuple(axes))
 
 
 def judge(
@@ -72,17 +76,13 @@ def judge(
     samples = posterior_samples(error, C, tolerance, freedom)
     limits = np.array([np.deg2rad(tolerance.deg)] * 3 + [tolerance.m] * 3)
     sizes = np.stack([np.linalg.norm(samples[:, :3], axis=1), np.linalg.norm(samples[:, 3:], axis=1)], axis=1)
-    in_tolerance = sizes <= limits[[0, 3]]
-    p_within = float(in_tolerance.all(axis=1).mean())
+    p_within = float((sizes <= limits[[0, 3]]).all(axis=1).mean())
     # Axes share the scale of the prior; what is known of one must not stand for another that the scenes do not show.
     own = C if shared is None else deviation(T_checked, T_estimated, covariance - shared)[1]
     shown = np.sqrt(np.maximum(np.diag(own), 0)) <= limits
-    axes = tuple(
-        _deviation(name, samples[:, k], float((np.abs(samples[:, k]) <= limits[k]).mean()), DEGREES[k], bool(shown[k]))
-        for k, name in enumerate(AXES)
-    )
-    rotation = _deviation("rotation", sizes[:, 0], float(in_tolerance[:, 0].mean()), DEGREES[0], bool(shown[:3].all()))
-    translation = _deviation("translation", sizes[:, 1], float(in_tolerance[:, 1].mean()), 1.0, bool(shown[3:].all()))
+    axes = tuple(_deviation(name, samples[:, k], limits[k], DEGREES[k], bool(shown[k])) for k, name in enumerate(AXES))
+    rotation = _deviation("rotation", sizes[:, 0], limits[0], DEGREES[0], bool(shown[:3].all()))
+    translation = _deviation("translation", sizes[:, 1], limits[3], 1.0, bool(shown[3:].all()))
     return Judgement(verdict_of(p_within, bool(shown.all())), p_within, rotation, translation, axes)
 
 
@@ -138,19 +138,17 @@ def posterior_samples(error: Matrix, C: Matrix, tolerance: Tolerance, freedom: f
     return np.asarray(means[component] + np.einsum("nij,nj->ni", roots[component], normal))
 
 
-def _deviation(name: str, samples: Matrix, p_within: float, unit: float, shown: bool) -> Deviation:
+def _deviation(name: str, samples: Matrix, limit: float, unit: float, shown: bool) -> Deviation:
     tail = (1 - INTERVAL) / 2
     low, error, high = (float(x) for x in unit * np.quantile(samples, [tail, 0.5, 1 - tail]))
-    found = Deviation(name, verdict_of(p_within, shown), error, low, high)
-    words = axis_words(found) if name in AXES else size_words(found)
-    return Deviation(name, found.verdict, error, low, high, words)
+    found = Deviation(name, verdict_of(float((np.abs(samples) <= limit).mean()), shown), error, low, high)
+    return replace(found, words=axis_words(found) if name in AXES else size_words(found))
 
 
-def worst(judgement: Judgement) -> Sequence[Deviation]:
+def _worst(judgement: Judgement) -> list[Deviation]:
     """The axes that fail, or else those that are inconclusive; the largest first."""
     for verdict in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE):
-        found = [axis for axis in judgement.axes if axis.verdict is verdict]
-        if found:
+        if found := [axis for axis in judgement.axes if axis.verdict is verdict]:
             return sorted(found, key=lambda axis: -abs(axis.error) * (1.0 if axis.name[0] == "r" else 5.0))
     return []
 
@@ -166,8 +164,37 @@ def reason_of(
         return f"{cause.message}; with that mended, the extrinsic is {rest}: {sizes}"
     if judgement.verdict is CheckVerdict.PASS:
         return f"right to within {limits}: {sizes}"
-    axes = [axis.words for axis in worst(judgement)]
+    axes = [axis.words for axis in _worst(judgement)]
     if judgement.verdict is CheckVerdict.FAIL:
         return "; ".join([f"{'; '.join(axes) or sizes}: more than {limits}", *(f"or else {own.message}" for own in possible)])
-    names = ", ".join(f"{axis.name} {axis.words}" for axis in worst(judgement)) or sizes
+    names = ", ".join(f"{axis.name} {axis.words}" for axis in _worst(judgement)) or sizes
     return f"the scenes do not tell it to within {limits}: {names}; {MORE_FRAMES}"
+
+
+def amount(value: float, is_angle: bool) -> str:
+    """An error with its unit."""
+    if is_angle:
+        return f"{abs(value):.2f} deg" if abs(value) < 10 else f"{abs(value):.0f} deg"
+    return f"{100 * abs(value):.1f} cm" if abs(value) < 1 else f"{abs(value):.2f} m"
+
+
+def signed(value: float, is_angle: bool) -> str:
+    """The same with its sign."""
+    return f"{'-' if value < 0 else '+'}{amount(value, is_angle)}"
+
+
+def axis_words(axis: Deviation) -> str:
+    """Direction and size of the error along an axis; what is claimed is described, not what is true."""
+    is_angle = axis.name[0] == "r"
+    spread = amount(max(axis.high - axis.error, axis.error - axis.low), is_angle)
+    if axis.low <= 0 <= axis.high and axis.verdict is CheckVerdict.PASS:
+        return f"right within {amount(max(abs(axis.low), abs(axis.high)), is_angle)}"
+    if axis.low <= 0 <= axis.high:
+        return f"between {signed(axis.low, is_angle)} and {signed(axis.high, is_angle)}"
+    return f"{DIRECTIONS[axis.name][int(axis.error < 0)].format(amount(axis.error, is_angle))} (+- {spread})"
+
+
+def size_words(size: Deviation) -> str:
+    """The size of the error in all."""
+    is_angle = size.name == "rotation"
+    return f"off by {amount(size.error, is_angle)} ({amount(size.low, is_angle)} to {amount(size.high, is_angle)})"

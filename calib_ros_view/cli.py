@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import webbrowser
+from functools import partial
 from pathlib import Path
 
 from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_source
@@ -15,7 +16,7 @@ from calib_ros.io import check_output
 from calib_ros.registration.progress import Progress
 from calib_ros.runtime import return_freed_memory
 from calib_ros_view.session.session import Session
-from calib_ros_view.web.server import Address, listening, require_nicegui, serve
+from calib_ros_view.web.server import Address, Pictures, listening, require_nicegui, serve
 
 FRAMES = 10  # of a source, unless said otherwise
 OUT = "extrinsic.json"
@@ -39,12 +40,11 @@ def view(args: argparse.Namespace) -> None:
         return
     session = _session(args)
     from calib_ros_view.session.jobs import SessionJobs
-    from calib_ros_view.web.pictures import Pictures
-    from calib_ros_view.web.source_page import page_of
+    from calib_ros_view.web.source_page import SourcePage
 
     jobs, pictures = SessionJobs(session), Pictures()
-    page = page_of(session, jobs, pictures)
-    serve(page, TITLE, address, pictures.routes, lambda url: _ready(url, args.open), jobs.close)
+    ready = partial(_ready, opened=args.open)
+    serve(lambda: SourcePage(session, jobs, pictures).build(), TITLE, address, pictures.routes, ready, jobs.close)
 
 
 def _view_node(args: argparse.Namespace, address: Address) -> None:
@@ -57,7 +57,7 @@ def _view_node(args: argparse.Namespace, address: Address) -> None:
 
     with Watch(args.node) as watch:
         live = LivePage(watch)
-        serve(live.page, f"{watch.name} · {TITLE}", address, live.routes, lambda url: _ready(url, args.open))
+        serve(live.page, f"{watch.name} · {TITLE}", address, live.routes, partial(_ready, opened=args.open))
 
 
 def _session(args: argparse.Namespace) -> Session:

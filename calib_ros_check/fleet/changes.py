@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from calib_ros.arrays import Covariance, Matrix
-from calib_ros.errors import BadInputError
 from calib_ros_check.fleet.sequence import Extrinsics
 
 FALSE_ALARMS = 0.001  # per recording
@@ -59,22 +58,9 @@ class Segments:
 def segments(sequence: Extrinsics, false_alarms: float = FALSE_ALARMS, seed: int = 0) -> Segments:
     """Divide a sequence into segments of constant extrinsic.
 
-    Parameters
-    ----------
-    sequence : Extrinsics
-        In the order of time, with the scatter between recordings in its covariances.
-    false_alarms : float
-        Expected number of changes found per recording where there is none.
-    seed : int
-        Of the simulation that finds the penalty.
-
-    Raises
-    ------
-    BadInputError
-        A rate that is not between 0 and 0.5.
+    sequence: in the order of time, with the scatter between recordings in its covariances. false_alarms: expected number of
+    changes found per recording where there is none, in (0, 0.5). seed: of the simulation that finds the penalty.
     """
-    if not 0 < false_alarms < 0.5:
-        raise BadInputError(f"a rate of {false_alarms:g} false alarms per recording is out of range (0, 0.5)")
     n = len(sequence)
     if not n:
         return Segments(np.zeros(0, np.intp), (), np.zeros((0, 6)), np.zeros((0, 6, 6)), (), 0.0)

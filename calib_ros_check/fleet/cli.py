@@ -27,8 +27,6 @@ def check_many(args: argparse.Namespace, options: CheckOptions) -> int:
         check_positions(args.frames)
     if not args.out:
         raise BadInputError("--out is given without a name; name a folder, or leave --out out")
-    if args.workers is not None and args.workers < 1:
-        raise BadInputError(f"--workers {args.workers}: give at least 1")
     facts = {
         "Command": shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode(),
         "Version": f"calib-ros {VERSION}",
@@ -39,7 +37,7 @@ def check_many(args: argparse.Namespace, options: CheckOptions) -> int:
         options,
         args.vehicle_pattern,
         args.false_alarms,
-        args.workers or 0,
+        args.workers,
         args.scheduler or "",
         args.fresh,
     )

@@ -17,10 +17,9 @@ from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros_check.fleet.changes import FALSE_ALARMS
 from calib_ros_check.fleet.history import Vehicle, VehicleChange, vehicles
 from calib_ros_check.fleet.jobs import OTHER, CheckJob, lost, options_key, run_checks
-from calib_ros_check.fleet.page import check_page, write_page
+from calib_ros_check.fleet.page import page_of_fleet, write_page
 from calib_ros_check.fleet.recordings import find_recordings
-from calib_ros_check.fleet.rows import ERROR, VERDICTS, Row, row_of
-from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
+from calib_ros_check.fleet.rows import ERROR, VERDICTS, Row, row_of, write_changes, write_csv, write_parquet
 from calib_ros_check.jobs.cluster import ClusterPool
 from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.local import LocalPool
@@ -39,7 +38,7 @@ class FleetOptions:
 
     sources: recordings, and folders of them. out: folder for tables, page and journal. options: of each check.
     vehicle_pattern: see `find_recordings`. false_alarms: changes reported per recording where there is none. workers:
-    processes; 0 = one per core. scheduler: address of a Dask cluster instead. fresh: forget earlier answers.
+    processes; None = one per core. scheduler: address of a Dask cluster instead. fresh: forget earlier answers.
 
     BadInputError for a number out of range.
     """
@@ -49,12 +48,12 @@ class FleetOptions:
     options: CheckOptions = field(default_factory=CheckOptions)
     vehicle_pattern: str | None = None
     false_alarms: float = FALSE_ALARMS
-    workers: int = 0
+    workers: int | None = None
     scheduler: str = ""
     fresh: bool = False
 
     def __post_init__(self) -> None:
-        if self.workers < 0:
+        if self.workers is not None and self.workers < 1:
             raise BadInputError(f"--workers {self.workers}: give at least 1")
         if not 0 < self.false_alarms < 0.5:
             raise BadInputError(f"--false-alarms {self.false_alarms:g} is out of range (0, 0.5) per recording")
@@ -93,7 +92,9 @@ class Fleet:
         return 0 if counts[CheckVerdict.PASS.value] == len(self.rows) else 3
 
 
-def check_fleet(options: FleetOptions, facts: Mapping[str, str] | None = None, progress: Progress | None = None) -> Fleet:
+def check_fleet(
+    options: FleetOptions, facts: Mapping[str, str] | None = None, progress: Progress = lambda done, total: None
+) -> Fleet:
     """Check all recordings that have not been, and write tables and page.
 
     Interrupted or killed at any moment, the same options go on where it stopped. A recording that cannot be read, or ends its
@@ -103,7 +104,7 @@ def check_fleet(options: FleetOptions, facts: Mapping[str, str] | None = None, p
     Raises BadInputError for sources without recordings or a folder that cannot be written, MissingDependencyError, and what a
     pool raises that has no workers.
     """
-    check_page()
+    page_of_fleet()  # says what is missing before the work
     found = find_recordings(options.sources, options.vehicle_pattern)
     settings = options_key(options.options)
     jobs = [CheckJob(one.path, one.fingerprint, settings) for one in found]
@@ -111,8 +112,9 @@ def check_fleet(options: FleetOptions, facts: Mapping[str, str] | None = None, p
         # What failed for another reason than the recording may succeed now.
         for key in [key for key, answer in journal.done.items() if answer.get("from") == OTHER]:
             del journal.done[key]
+        pool: Pool = ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers or os.cpu_count() or 1)
         work = partial(run_checks, _portable(options.options))
-        run([[job] for job in jobs], work, journal, _pool(options), progress or _silent, lost)
+        run([[job] for job in jobs], work, journal, pool, progress, lost)
         answers: list[Answer] = [journal.done[job.key] for job in jobs]
         notes = list(journal.notes)
     rows = [row_of(recording, answer) for recording, answer in zip(found, answers, strict=True)]
@@ -132,8 +134,8 @@ def _written(fleet: Fleet, options: FleetOptions, facts: Mapping[str, str], note
         files.append(out / PARQUET)
     except MissingDependencyError as error:
         notes.append(str(error))
-    write_page(out / PAGE, fleet.rows, fleet.vehicles, fleet.scatter, options.options, facts, options.false_alarms)
-    return Fleet(fleet.rows, fleet.vehicles, fleet.scatter, files, notes)
+    write_page(out / PAGE, fleet, options, facts)
+    return replace(fleet, files=files, notes=notes)
 
 
 def _portable(options: CheckOptions) -> CheckOptions:
@@ -141,13 +143,3 @@ def _portable(options: CheckOptions) -> CheckOptions:
     if options.extrinsic in (REFERENCE, TF):
         return options
     return replace(options, extrinsic=str(Path(options.extrinsic).expanduser().resolve()))
-
-
-def _pool(options: FleetOptions) -> Pool:
-    if options.scheduler:
-        return ClusterPool(options.scheduler)
-    return LocalPool(options.workers or os.cpu_count() or 1)
-
-
-def _silent(done: int, total: int) -> None:
-    """No progress wanted."""

@@ -74,8 +74,12 @@ def vehicles(
     """
     names = sorted({row.vehicle for row in rows})
     ordered = {name: sorted((r for r in rows if r.vehicle == name), key=lambda r: (r.time_ns, r.path)) for name in names}
-    known = {name: [row for row in own if _has_estimate(results.get(row.path))] for name, own in ordered.items()}
-    sequences = {name: _sequence([results[row.path] for row in own]) for name, own in known.items()}
+    estimated = {path for path, own in results.items() if own and own["T_estimated"] and own["covariance"]}
+    known = {name: [row for row in own if row.path in estimated] for name, own in ordered.items()}
+    sequences = {
+        name: extrinsics(*([results[row.path][part] for row in own] for part in ("T_estimated", "covariance")))
+        for name, own in known.items()
+    }
     variances = scatter(list(sequences.values()))
     out = []
     for name in names:
@@ -86,27 +90,12 @@ def vehicles(
     return out, variances
 
 
-def _has_estimate(result: Mapping[str, Any] | None) -> bool:
-    return bool(result and result["T_estimated"] and result["covariance"])
-
-
-def _sequence(results: Sequence[Mapping[str, Any]]) -> Extrinsics:
-    return extrinsics([own["T_estimated"] for own in results], [own["covariance"] for own in results])
-
-
 def _changes(name: str, known: Sequence[Row], found: Segments) -> list[VehicleChange]:
-    ends = np.bincount(found.labels) if len(found.labels) else np.zeros(0, int)
-    last = len(known) - 1
+    newest_is_alone = np.count_nonzero(found.labels == len(found.means) - 1) == 1
     return [
-        VehicleChange(
-            name,
-            known[change.before],
-            known[change.after],
-            change.value,
-            change.covariance,
-            not (change.after == last and ends[-1] == 1),
-        )
-        for change in found.changes
+        VehicleChange(name, known[own.before], known[own.after], own.value, own.covariance, not (at_end and newest_is_alone))
+        for own in found.changes
+        for at_end in [own.after == len(known) - 1]
     ]
 
 

@@ -17,7 +17,7 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_check.recording import REFERENCE, TF, CheckOptions, check_recording
+from calib_ros_check.recording import REFERENCE, TF, CheckOptions, check_source
 
 # What an error comes from: the recording, which stays as it is until its files change, or anything else, which is tried again.
 INPUT, OTHER = "input", "other"
@@ -82,7 +82,7 @@ def _checked(job: CheckJob, options: CheckOptions) -> Answer:
     usage = Usage()
     answer: Answer
     try:
-        answer = {"result": check_recording(job.path, options).to_dict()}
+        answer = {"result": check_source(job.path, options).result.to_dict()}
     except (MissingDependencyError, ImportError):
         raise
     except CalibrationError as error:
@@ -99,7 +99,8 @@ class Usage:
     """What the process has used since this object was made."""
 
     def __init__(self) -> None:
-        _reset_peak()
+        with contextlib.suppress(OSError):  # no Linux, or forbidden: the peak is then that of all jobs until now
+            Path("/proc/self/clear_refs").write_text("5")
         self._cpu, self._bytes = time.process_time(), _bytes_read()
 
     def since(self) -> dict[str, float | int]:
@@ -115,11 +116,6 @@ def _bytes_read() -> int:
         return int(fields["rchar"])
     except (OSError, KeyError, ValueError):  # no Linux, or hidden in a container
         return 0
-
-
-def _reset_peak() -> None:
-    with contextlib.suppress(OSError):  # no Linux, or forbidden: the peak is then that of all jobs until now
-        Path("/proc/self/clear_refs").write_text("5")
 
 
 def _peak() -> int:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Matrix
 from calib_ros_check.fleet.history import Vehicle
 from calib_ros_check.tolerance import AXES
 
-Matrix = NDArray[np.float64]
 WIDTH, HEIGHT = 380, 150  # px, where a phone shows it
 LEFT, RIGHT, TOP, BOTTOM = 44, 8, 18, 18
 SCALES = np.r_[np.rad2deg([1.0] * 3), [100.0] * 3]  # to deg and cm
@@ -60,7 +60,7 @@ def plots(vehicle: Vehicle, variances: Matrix) -> list[AxisPlot]:
         # A recording that tells little must not flatten all others.
         reach = np.abs(values[inside, axis]) + np.minimum(bars[inside, axis], 2 * np.median(bars[inside, axis]))
         half = max(float(np.quantile(reach, 0.95)), float(np.abs(means[:, axis]).max()) * 1.2, SMALLEST[axis // 3]) * 1.1
-        at = _Scale(half)
+        at = partial(_height, half)
         points = [
             Point(
                 *(float(x[k]), at(values[k, axis])),
@@ -79,15 +79,10 @@ def plots(vehicle: Vehicle, variances: Matrix) -> list[AxisPlot]:
     return out
 
 
-class _Scale:
-    """Values to px from the top, cut off at the edges."""
-
-    def __init__(self, half: float) -> None:
-        self._half = half
-
-    def __call__(self, value: float) -> float:
-        share = float(np.clip(value / self._half, -1, 1))
-        return round(TOP + (HEIGHT - TOP - BOTTOM) * (1 - share) / 2, 1)
+def _height(half: float, value: float) -> float:
+    """px from the top, cut off at the edges."""
+    share = float(np.clip(value / half, -1, 1))
+    return round(TOP + (HEIGHT - TOP - BOTTOM) * (1 - share) / 2, 1)
 
 
 def _places(times: Matrix) -> Matrix:

@@ -39,28 +39,18 @@ class Recording:
 def find_recordings(sources: Sequence[str], vehicle_pattern: str | None = None) -> list[Recording]:
     """All recordings that `sources` name or hold, each once, by path.
 
-    Parameters
-    ----------
-    sources : sequence of str
-        Recordings, as `open_dataset` takes them, or folders with recordings in them or below. What is named and cannot be read,
-        and empty folders among recordings, are recordings, too: they are reported as what they are.
-    vehicle_pattern : str, optional
-        Regular expression with a group named "vehicle", searched for in each path. Without, recordings in several folders belong
-        to a vehicle per folder, and those in one to one vehicle.
-
-    Raises
-    ------
-    BadInputError
-        No recordings, or a pattern that is none, has no such group, or matches none of the paths.
+    sources: recordings, as `open_dataset` takes them, or folders with recordings in them or below. What is named and cannot be
+    read, and empty folders among recordings, are recordings, too: they are reported as what they are. vehicle_pattern: regular
+    expression with a group named "vehicle", searched for in each path; without, recordings in several folders belong to a vehicle
+    per folder. Raises BadInputError for no recordings, or a pattern that is none, has no such group, or matches no path.
     """
-    expression = _expression(vehicle_pattern)
     paths: dict[str, None] = {}
     for source in sources:
         found = _found_in(source)
         if not found:
             raise BadInputError(f"{source} holds no recordings; give a folder of ROS 2 bags, KITTI drives or plain folders")
         paths |= dict.fromkeys(found)
-    vehicles = _by_folder(list(paths)) if expression is None else _by_pattern(list(paths), expression)
+    vehicles = _by_folder(list(paths)) if vehicle_pattern is None else _by_pattern(list(paths), vehicle_pattern)
     return [replace(_with_files(path), vehicle=vehicle) for path, vehicle in zip(paths, vehicles, strict=True)]
 
 
@@ -130,22 +120,16 @@ def _with_files(path: str) -> Recording:
     return Recording(path, modified_ns=newest, fingerprint=digest.hexdigest()[:16] if files else "")
 
 
-def _expression(pattern: str | None) -> re.Pattern[str] | None:
-    if pattern is None:
-        return None
+def _by_pattern(paths: list[str], pattern: str) -> list[str]:
     try:
         expression = re.compile(pattern)
     except re.error as error:
         raise BadInputError(f"--vehicle-pattern {pattern!r} is no regular expression ({error})") from None
     if VEHICLE not in expression.groupindex:
         raise BadInputError(f"--vehicle-pattern {pattern!r} has no group (?P<{VEHICLE}>...); put it around the vehicle's name")
-    return expression
-
-
-def _by_pattern(paths: list[str], expression: re.Pattern[str]) -> list[str]:
     matches = [expression.search(path) for path in paths]
     if not any(matches):
-        raise BadInputError(f"--vehicle-pattern {expression.pattern!r} matches none of the recordings, such as {paths[0]}")
+        raise BadInputError(f"--vehicle-pattern {pattern!r} matches none of the recordings, such as {paths[0]}")
     return [(match and match.group(VEHICLE)) or UNKNOWN for match in matches]
 
 

@@ -1,17 +1,27 @@
-"""The table of a fleet: one row per recording."""
+"""The table of a fleet: one row per recording; as CSV, and as Parquet where pyarrow is installed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime, timezone
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_type_hints
 
+import numpy as np
+
+from calib_ros.errors import MissingDependencyError
 from calib_ros.frame import NANOSECONDS
+from calib_ros.io import write_atomically
 from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_check.tolerance import AXES
+
+if TYPE_CHECKING:
+    from calib_ros_check.fleet.history import VehicleChange
 
 ERROR = "error"  # the verdict where a recording could not be checked
 # What wants attention first.
@@ -87,13 +97,9 @@ def row_of(recording: Recording, answer: Answer) -> Row:
         return row
     row.cause, row.frames = result["cause"], result["frames_used"]
     row.time_offset_s, row.time_offset_sigma_s = result["time_offset_s"], result["time_offset_sigma_s"]
-    deviations = [own for axis in (result["rotation"], result["translation"], *result["axes"]) for own in _ends(axis)]
-    row.errors = dict(zip(ERRORS, deviations, strict=True))
+    deviations = (result["rotation"], result["translation"], *result["axes"])
+    row.errors = dict(zip(ERRORS, (own[end] for own in deviations for end in ("error", "low", "high")), strict=True))
     return row
-
-
-def _ends(deviation: Mapping[str, float | None]) -> tuple[float | None, ...]:
-    return deviation["error"], deviation["low"], deviation["high"]
 
 
 def utc(time_ns: int) -> str:
@@ -101,3 +107,57 @@ def utc(time_ns: int) -> str:
     if not time_ns:
         return ""
     return datetime.fromtimestamp(time_ns // NANOSECONDS, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """One line per recording, with a header; empty where nothing is known."""
+    _write(path, list(COLUMNS), [row.values().values() for row in rows])
+
+
+def write_changes(path: Path, changes: Sequence[VehicleChange]) -> None:
+    """One line per change of a vehicle: between which recordings, how large, and its standard deviations, deg and m."""
+    names = [f"{axis}_{unit}" for axis, unit in UNITS.items()]
+    header = ["vehicle", "before", "time_before", "after", "time_after", "confirmed", "rotation_deg", "translation_m"]
+    lines = []
+    for own in changes:
+        places = [own.vehicle, own.before.recording, own.before.time, own.after.recording, own.after.time, own.confirmed]
+        value = np.r_[np.rad2deg(own.value[:3]), own.value[3:]]
+        lines.append([*places, own.rotation_deg, own.translation_m, *value.tolist(), *own.sigma.tolist()])
+    _write(path, [*header, *names, *(f"{name}_sigma" for name in names)], lines)
+
+
+def write_parquet(path: Path, rows: Sequence[Row]) -> None:
+    """The same as `write_csv`, with types. MissingDependencyError without pyarrow."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise MissingDependencyError("no fleet.parquet: it needs pyarrow: pip install pyarrow, or calib_ros[fleet]") from None
+    kinds = {"str": pa.string(), "float": pa.float64(), "int": pa.int64(), "bool": pa.bool_()}
+    hints = get_type_hints(Row)
+    schema = pa.schema([(name, kinds[_plain(hints.get(name, float))]) for name in COLUMNS])
+    table = pa.Table.from_pylist([row.values() for row in rows], schema=schema)
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd")
+    write_atomically(path, buffer.getvalue())
+
+
+def _plain(hint: Any) -> str:
+    """Name of a type, without None."""
+    return next(str(one.__name__) for one in getattr(hint, "__args__", (hint,)) if one is not type(None))
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _write(path: Path, header: list[str], lines: Iterable[Iterable[Any]]) -> None:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(map(_text, line) for line in lines)
+    write_atomically(path, buffer.getvalue().encode("utf-8", "backslashreplace"))

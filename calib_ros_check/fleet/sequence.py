@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 
-Matrix = NDArray[np.float64]
 FLOOR = 1e-12  # rad^2, m^2; keeps a covariance of zeros invertible
 # Differences of an axis from which its own scatter is estimated; of fewer, the median is less certain than the assumption that
 # the three axes of rotation, and those of translation, scatter alike.

@@ -9,12 +9,13 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_check.jobs.pool import GOES_ON, J, Lost, Results, RunJobs, names, one_thread
+from calib_ros_check.jobs.pool import GOES_ON, Ended, J, Lost, Results, RunJobs, all_answers, one_thread
 
 ADDRESS = re.compile(r"(inproc://.+)|([a-z]+://)?[^/\s]+:\d{1,5}")
 CONNECT_S = 8.0
@@ -41,14 +42,7 @@ class ClusterPool:
         client = self._client()
         try:
             self._check(client)
-            again: list[Sequence[J]] = []
-            yield from self._spread(client, run_jobs, groups, None if lost is None else again)
-            # Dask blames all that a lost worker held, not only what ended it: each once more, alone on the cluster.
-            for group in again:
-                twice: list[Sequence[J]] = []
-                yield from self._spread(client, run_jobs, [group], twice)
-                if twice and lost is not None:
-                    yield group, lost(group, "its worker ended several times")
+            yield from all_answers(partial(self._spread, client, run_jobs), groups, lost)
         finally:
             client.close(timeout=CONNECT_S)  # the scheduler forgets what it has not done yet
 
@@ -88,10 +82,9 @@ class ClusterPool:
                     f"`dask worker {self.address} --nworkers {threads} --nthreads 1`"
                 )
 
-    def _spread(
-        self, client: Any, run_jobs: RunJobs[J], groups: Sequence[Sequence[J]], lost: list[Sequence[J]] | None
-    ) -> Results[J]:
-        """Answers of all groups but those whose workers end, which are added to `lost`; None: such a group is an error."""
+    def _spread(self, client: Any, run_jobs: RunJobs[J], groups: Sequence[Sequence[J]], ended: Ended[J]) -> Results[J]:
+        """Answers of all groups but those whose workers end, which are added to `ended`; Dask blames all that a lost worker held,
+        not only what ended it."""
         waiting, finished = deque(groups), _library().as_completed(loop=client.loop)
         running: dict[Any, Sequence[J]] = {}
         while waiting or running:
@@ -107,13 +100,13 @@ class ClusterPool:
             future = next(finished)
             group = running.pop(future)
             try:
-                answers = self._answers(future)
+                answers: list[Answer] = future.result()
             except _library().KilledWorker:
-                if lost is None:
-                    raise CalibrationError(
-                        f"several workers ended with these jobs: {names(group)}; out of memory? give them more; {GOES_ON}"
-                    ) from None
-                lost.append(group)
+                ended.append((group, "workers ended several times"))
+            except CancelledError:
+                raise self._lost() from None
+            except ImportError as error:
+                raise CalibrationError(f"{SAME_VERSION}, with what it needs: {error}") from None
             else:
                 yield group, answers
 
@@ -127,15 +120,6 @@ class ClusterPool:
 
     def _lost(self) -> CalibrationError:
         return CalibrationError(f"the Dask scheduler at {self.address} is lost; {GOES_ON}")
-
-    def _answers(self, future: Any) -> list[Answer]:
-        try:
-            answers: list[Answer] = future.result()
-        except CancelledError:
-            raise self._lost() from None
-        except ImportError as error:
-            raise CalibrationError(f"{SAME_VERSION}, with what it needs: {error}") from None
-        return answers
 
 
 def version() -> str:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
-import math
 import os
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol
 
 from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros_check.outcome import plain
 
 Answer = dict[str, Any]  # what a job found, as JSON has it: numbers, texts, lists and dictionaries; None for NaN
 
@@ -58,7 +56,7 @@ class Journal:
             raise BadInputError(f"cannot write {self.path}: {error.strerror}; choose another folder with --out") from None
         try:
             self._lock()
-            self._open(_plain(about), fresh)
+            self._open(plain(about), fresh)
         except BaseException:
             os.close(self._file)
             raise
@@ -109,15 +107,14 @@ class Journal:
 
     def add(self, job: Job, answer: Answer) -> None:
         """Write one finished job. Numbers that are NaN or infinite become None. CalibrationError if the disk is full."""
-        about: Any = job  # a dataclass, which no protocol can ask for
-        self._append({"key": job.key, "job": asdict(about), "answer": answer})
+        self._append({"key": job.key, "job": job, "answer": answer})
         if time.monotonic() - self._flushed > FLUSH_S:
             os.fsync(self._file)
             self._flushed = time.monotonic()
 
     def _append(self, entry: dict[str, Any]) -> None:
         """One write for the whole line, so that a kill leaves it whole or absent."""
-        line = json.dumps(_plain(entry), allow_nan=False, ensure_ascii=False, separators=(",", ":")).encode() + b"\n"
+        line = json.dumps(plain(entry), allow_nan=False, ensure_ascii=False, separators=(",", ":")).encode() + b"\n"
         end = os.fstat(self._file).st_size
         try:
             written = os.write(self._file, line)
@@ -139,21 +136,8 @@ class Journal:
     def __enter__(self) -> Journal:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _plain(value: Any) -> Any:
-    """As JSON has it: numbers and arrays of numpy too; None for a number that is not finite."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return value
 
 
 def _object(line: bytes) -> dict[str, Any]:

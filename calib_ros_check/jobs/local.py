@@ -8,10 +8,11 @@ import pickle
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack
+from functools import partial
 from multiprocessing import connection, resource_tracker
 from typing import Any
 
@@ -19,19 +20,18 @@ import cv2
 
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_check.jobs.pool import GOES_ON, J, Lost, Results, RunJobs, names, one_thread
+from calib_ros_check.jobs.pool import GOES_ON, Ended, J, Lost, Results, RunJobs, all_answers, one_thread
 
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-OUT_OF_MEMORY = f"out of memory? use fewer --workers; {GOES_ON}"
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class LocalPool:
     """`workers` processes of this machine by concurrent.futures; one means this process itself, unless it is told what to do
     when it ends.
 
-    When a worker dies (out of memory, a crash in a library), a new pool takes the groups that had not begun. Those in progress
-    run again at the end, each alone on the machine, since the pool cannot say which of them it was; the one whose worker dies
-    again is lost. All workers end when the generator is closed, on Ctrl-C, and when this process is killed.
+    When a worker dies (out of memory, a crash in a library), another takes its place, and its group runs again at the end, alone
+    on the machine; one whose worker dies again is lost. All workers end when the generator is closed, on Ctrl-C, and when this
+    process is killed.
     """
 
     def __init__(self, workers: int):
@@ -41,88 +41,73 @@ class LocalPool:
 
     def results(self, run_jobs: RunJobs[J], groups: Sequence[Sequence[J]], lost: Lost[J] | None = None) -> Results[J]:
         """See Pool."""
-        if self.workers == 1 and lost is None:
-            with one_thread():
-                for group in groups:
-                    yield group, run_jobs(group)
+        if self.workers > 1 or lost is not None:
+            yield from all_answers(partial(self._spread, run_jobs), groups, lost)
             return
-        waiting, again, twice = deque(groups), list[Sequence[J]](), list[tuple[Sequence[J], str]]()
-        while waiting:
-            in_progress, _ = yield from _until_crash(run_jobs, waiting, self.workers)
-            again += in_progress
-        for group in again:
-            in_progress, how = yield from _until_crash(run_jobs, deque([group]), 1)
-            twice += [(one, how) for one in in_progress]
-        for group, how in twice:
-            if lost is None:
-                raise CalibrationError(f"the worker of these jobs ended twice, {how}: {names(group)}; {OUT_OF_MEMORY}")
-            yield group, lost(group, f"its worker ended twice, {how}")
+        with one_thread():
+            for group in groups:
+                yield group, run_jobs(group)
 
+    def _spread(self, run_jobs: RunJobs[J], groups: Sequence[Sequence[J]], ended: Ended[J]) -> Results[J]:
+        """Answers of all groups but those whose workers die, which are added to `ended`."""
+        waiting = deque(groups)
+        running: dict[Future[Any], tuple[_Worker, Sequence[J] | None]] = {}  # None: it starts
+        with ExitStack() as workers:
 
-def _until_crash(
-    run_jobs: RunJobs[J], waiting: deque[Sequence[J]], workers: int
-) -> Generator[tuple[Sequence[J], list[Answer]], None, tuple[list[Sequence[J]], str]]:
-    """Takes groups from `waiting` and yields their answers, until none is left or a worker dies.
+            def start() -> None:
+                worker = workers.enter_context(_Worker())
+                running[worker.started] = worker, None
 
-    Returns the groups that were in progress then, and how the worker ended.
-    """
-    running: dict[Future[list[Answer]], Sequence[J]] = {}
-    lost: list[Sequence[J]] = []
-    with _Processes(min(workers, len(waiting))) as processes:
-        try:
-            processes.submit(int).result()
-        except BrokenProcessPool:
-            raise CalibrationError(f"a worker process ended at its start, {processes.how_ended()}; {OUT_OF_MEMORY}") from None
-        while running or (waiting and not lost):
-            while waiting and len(running) < workers and not lost:
-                group = waiting.popleft()
-                try:
-                    running[processes.submit(_run_portably, run_jobs, group)] = group
-                except BrokenProcessPool:
-                    lost.append(group)
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                group = running.pop(future)
-                try:
+            for _ in groups[: self.workers]:
+                start()
+            while running:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    worker, group = running.pop(future)
+                    if isinstance(future.exception(), BrokenProcessPool):
+                        if group is None:
+                            raise CalibrationError(f"at its start, a {worker.how_ended()}; out of memory? {GOES_ON}")
+                        ended.append((group, worker.how_ended()))
+                        if waiting:
+                            start()
+                        continue
                     answers = future.result()
-                except BrokenProcessPool:
-                    lost.append(group)
-                else:
-                    yield group, answers
-        return lost, processes.how_ended() if lost else ""
+                    if waiting:
+                        following = waiting.popleft()
+                        running[worker.submit(_run_portably, run_jobs, following)] = worker, following
+                    if group is not None:
+                        yield group, answers
 
 
-class _Processes:
-    """A ProcessPoolExecutor whose processes end at once with the context, whatever they are doing."""
+class _Worker:
+    """A process, which ends at once with the context, whatever it is doing. started: done when it waits for work."""
 
-    def __init__(self, workers: int):
-        self._executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _prepare_process)
-        self._processes: list[multiprocessing.process.BaseProcess] = []
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Processes start here, when they are needed: with one thread each, and with Ctrl-C blocked until they ignore it."""
-        before = multiprocessing.active_children()
+    def __init__(self) -> None:
+        self._executor = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _prepare_process)
+        self.submit = self._executor.submit
+        known, before = multiprocessing.active_children(), {name: os.environ.get(name) for name in ONE_THREAD}
         resource_tracker.ensure_running()  # or the first start does it, and lets Ctrl-C through
+        # It starts here: with one thread, and with Ctrl-C blocked until it ignores it.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        os.environ.update(ONE_THREAD)
         try:
-            with _environment(ONE_THREAD):
-                return self._executor.submit(function, *arguments)
+            self.started: Future[Any] = self.submit(int)
+            (self._process,) = (process for process in multiprocessing.active_children() if process not in known)
         finally:
-            self._processes += [process for process in multiprocessing.active_children() if process not in before]
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
     def how_ended(self) -> str:
-        """For people, once a worker has died: the executor terminates all others."""
+        """For people, once it has died."""
         self._executor.shutdown()
-        codes = [process.exitcode or 0 for process in self._processes]
-        code = min(codes, key=lambda code: (code == 0, code == -signal.SIGTERM))
-        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+        code = self._process.exitcode or 0
+        return f"worker was killed by {signal.Signals(-code).name}" if code < 0 else f"worker ended with exit status {code}"
 
-    def __enter__(self) -> _Processes:
+    def __enter__(self) -> _Worker:
         return self
 
     def __exit__(self, *error: object) -> None:
-        for process in self._processes:
-            process.kill()  # it holds nothing that would be lost
+        self._process.kill()  # it holds nothing that would be lost
         self._executor.shutdown(cancel_futures=True)
 
 
@@ -150,17 +135,3 @@ def _run_portably(run_jobs: RunJobs[J], group: Sequence[J]) -> list[Answer]:
         except Exception:
             raise RuntimeError(f"{type(error).__name__}: {error}").with_traceback(error.__traceback__) from None
         raise
-
-
-@contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -10,6 +10,7 @@ from typing import Protocol, TypeAlias, TypeVar
 
 import cv2
 
+from calib_ros.errors import CalibrationError
 from calib_ros_check.jobs.journal import Answer, Job, Journal
 
 J = TypeVar("J", bound=Job)
@@ -17,8 +18,10 @@ RunJobs: TypeAlias = Callable[[Sequence[J]], list[Answer]]  # the answers of a g
 # What becomes of a group whose worker ended again and again, and how it ended: its answers, or an exception.
 Lost: TypeAlias = Callable[[Sequence[J], str], list[Answer]]
 Results: TypeAlias = Generator[tuple[Sequence[J], list[Answer]], None, None]
+Ended: TypeAlias = list[tuple[Sequence[J], str]]  # groups whose workers ended, and how
 
 GOES_ON = "the same command goes on where it stopped"
+NAMED = 3  # jobs of a group in an error
 
 
 class Pool(Protocol):
@@ -74,8 +77,7 @@ def _missing(groups: Sequence[Sequence[J]], journal: Journal) -> list[list[J]]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """OpenCV with one thread, BLAS too where threadpoolctl is installed: CPU time is then that of the
-    algorithm, and sums come out the same however many workers there are."""
+    """OpenCV with one thread, BLAS too where threadpoolctl is installed: so CPU time and sums do not depend on the workers."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -89,7 +91,21 @@ def one_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def names(group: Sequence[Job], most: int = 3) -> str:
-    """Keys of the first jobs of a group, for people."""
-    more = f" and {len(group) - most} more" if len(group) > most else ""
-    return ", ".join(job.key for job in group[:most]) + more
+def all_answers(
+    spread: Callable[[Sequence[Sequence[J]], Ended[J]], Results[J]], groups: Sequence[Sequence[J]], lost: Lost[J] | None
+) -> Results[J]:
+    """The answers of all groups by `spread`, which yields those of groups that are finished, and adds the others to a list.
+
+    They run once more, each alone: memory may have been short, or another group have ended the worker. See Pool.
+    """
+    ended: Ended[J] = []
+    again: Ended[J] = []
+    yield from spread(groups, ended)
+    for group, _ in ended:
+        yield from spread([group], again)
+    for group, how in again:
+        if lost is None:
+            names = ", ".join(job.key for job in group[:NAMED]) + (f" and {len(group) - NAMED} more" * (len(group) > NAMED))
+            advice = f"out of memory? use fewer --workers, or give them more; {GOES_ON}"
+            raise CalibrationError(f"jobs whose {how}, also alone: {names}; {advice}")
+        yield group, lost(group, f"its {how}, also alone")

@@ -21,6 +21,7 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.parallel import cpu_time
+from calib_ros_check.alternatives import CheckInputs
 from calib_ros_check.causes import distorts
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance
@@ -79,19 +80,13 @@ def request_check(pipeline: Pipeline, request: CheckRequest) -> Future[CheckOutc
     """
 
     def work(progress: Callback) -> CheckOutcome:
-        recalibrator = pipeline.recalibrator
-        if recalibrator is None:  # dropped since it was asked for
+        if pipeline.recalibrator is None:  # dropped since it was asked for
             raise CalibrationError(NO_PAIR)
-        return check_keyframes(recalibrator, request, progress, pipeline.vehicle_frames())
+        return check_keyframes(pipeline.recalibrator, request, progress, pipeline.vehicle_frames())
 
-    return pipeline.defer(DeferredJob("check", request.key, work), obstacle_to_check(pipeline.recalibrator))
-
-
-def obstacle_to_check(recalibrator: Recalibrator | None) -> str:
-    """Why nothing can be checked now, for a person; "" if it can."""
-    if recalibrator is None:
-        return NO_PAIR
-    return "" if len(recalibrator.buffer) else NO_KEYFRAME
+    recalibrator = pipeline.recalibrator
+    obstacle = NO_PAIR if recalibrator is None else "" if len(recalibrator.buffer) else NO_KEYFRAME
+    return pipeline.defer(DeferredJob("check", request.key, work), obstacle)
 
 
 def check_keyframes(
@@ -114,14 +109,9 @@ def check_keyframes(
     T = current.T_camera_lidar if request.T_camera_lidar is None else request.T_camera_lidar
     has_classes = any(features.plain is not None for features in chosen)
     checker = Checker(recalibrator.camera, config, recalibrator.segmentation)
-    result = checker.check_features(
-        [features.plain or features for features in chosen],
-        T,
-        request.tolerance,
-        (lambda numbers: [chosen[k] for k in numbers]) if has_classes else None,
-        progress,
-        vehicle_frames,
-    )
+    classified = (lambda numbers: [chosen[k] for k in numbers]) if has_classes else None
+    inputs = CheckInputs(T, request.tolerance, classified, None, vehicle_frames or {}, progress)
+    result = checker.check_features([features.plain or features for features in chosen], inputs)
     untried = [] if vehicle_frames else [NO_VEHICLE_FRAMES]
     untried += [NO_PICTURES] if distorts(recalibrator.camera) else []
     untried += [NO_FISHEYE] if recalibrator.camera.is_pinhole and result.cause is None else []

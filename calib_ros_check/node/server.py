@@ -24,17 +24,8 @@ from calib_ros_check.node.requests import CheckOutcome, CheckRequest, request_ch
 from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Deviation, Tolerance
 from calib_ros_check.tolerance import unknown
 
-VERDICTS = {
-    CheckVerdict.PASS: Check.Response.PASS,
-    CheckVerdict.FAIL: Check.Response.FAIL,
-    CheckVerdict.INCONCLUSIVE: Check.Response.INCONCLUSIVE,
-}
-STATES = {
-    CauseState.FOUND: CauseFindingMsg.FOUND,
-    CauseState.POSSIBLE: CauseFindingMsg.POSSIBLE,
-    CauseState.EXCLUDED: CauseFindingMsg.EXCLUDED,
-    CauseState.NOT_JUDGED: CauseFindingMsg.NOT_JUDGED,
-}
+VERDICTS = {verdict: getattr(Check.Response, verdict.name) for verdict in CheckVerdict}
+STATES = {state: getattr(CauseFindingMsg, state.name) for state in CauseState}
 LEVELS = {CheckVerdict.PASS: OK, CheckVerdict.INCONCLUSIVE: WARN, CheckVerdict.FAIL: ERROR}
 
 

@@ -38,7 +38,7 @@ FRAMES, FEATURES = 12, 24  # kept by a worker: 4 MB for a KITTI frame, and up to
 # Code on which no answer depends: it shows answers, or runs elsewhere.
 NOT_OF_ANSWERS = {
     calib_ros: ("ros/", "cli/", "overlay.py", "export.py"),
-    calib_ros_check: ("fleet/", "jobs/", "node/", "cli.py", "page.py", "report.py", "words.py"),
+    calib_ros_check: ("fleet/", "jobs/", "node/", "cli.py", "page.py", "report.py"),
     calib_ros_semantics: ("class_pictures.py", "cli.py"),
     calib_ros_synthetic: ("demo.py", "commands.py"),
     calib_ros_thesis: (),

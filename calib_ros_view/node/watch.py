@@ -5,15 +5,15 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import suppress
-from dataclasses import dataclass
-from types import TracebackType
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import rclpy
+from action_msgs.msg import GoalStatus
 from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from calib_ros_msgs.srv import Check, GetExtrinsic, GetKeyframes
@@ -29,7 +29,6 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.messages import decode_image
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.dds import use_large_message_profile
-from calib_ros_view.node.goal import Goal
 from calib_ros_view.session.live import BAD, GOOD, NEUTRAL, Diagnosis, LiveHistory, NodeState, Presence
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -48,6 +47,9 @@ SERVICES: dict[str, tuple[Any, float]] = {
     KEYFRAMES: (GetKeyframes, 15.0),
 }
 QUIET = (GET_EXTRINSIC, KEYFRAMES)  # what pages ask by themselves is no event
+NOT_TAKEN = "the node takes no requests now: it is not active, or about to end"
+STOPPED = "stopped before the estimate was done"
+TOO_LATE = "~/calibrate could not be stopped any more: its estimate is done"
 OVERLAY_WIDTH, OVERLAY_QUALITY = 1600, 82  # px at most; of the JPEG
 
 
@@ -72,16 +74,18 @@ class Overlay:
 
 @dataclass(eq=False)
 class _Call:
-    """future: of the client, once the request is sent; goal: instead, of an action. stage, share: how far it is, 0..1."""
+    """future: of the client, once request or goal is sent. handle: of a goal that was taken. stage, share: how far it is, 0..1.
+    to_stop: as soon as it is taken."""
 
     name: str
     answer: Future[Answer]
     began: float
     deadline: float
     future: Any = None
-    goal: Goal | None = None
+    handle: Any = None
     stage: str = ""
     share: float = 0.0
+    to_stop: bool = False
 
 
 class Watch:
@@ -92,7 +96,7 @@ class Watch:
     it only for subscribers. Answers that a page does not wait for any more become events of the history all the same.
     """
 
-    def __init__(self, node_name: str = "/calib_ros", domain_id: int | None = None) -> None:
+    def __init__(self, node_name: str) -> None:
         self.name = "/" + node_name.strip("/")
         if self.name == "/" or not all(part.isidentifier() for part in self.name.strip("/").split("/")):
             raise BadInputError(f"--node {node_name} is no name of a ROS node; write it as /calib_ros or /left/calib_ros")
@@ -102,7 +106,7 @@ class Watch:
         self.overlay = Overlay()
         self.answers: dict[str, tuple[float, Answer]] = {}  # the newest of each service, and when it came
         self._context = Context()
-        rclpy.init(context=self._context, domain_id=domain_id)
+        rclpy.init(context=self._context)
         self.domain_id: int = self._context.get_domain_id()
         self._node = rclpy.create_node(f"calib_ros_view_{time.time_ns() % 10**6}", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -127,7 +131,7 @@ class Watch:
     def __enter__(self) -> Watch:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -193,16 +197,16 @@ class Watch:
         """Call a service of SERVICES. The answer always comes, and is never an exception: a node that is gone, or says nothing in
         time, is one too. A service that is being called already is not called again."""
         answer: Future[Answer] = Future()
-        timeout = SERVICES[name][1]
         with self.lock:
-            if self._closed:
-                answer.set_result(Answer(False, "the viewer ends"))
-                return answer
             running = [call for call in self._calls if call.name == name]
-            if running:
-                return running[0].answer if name in QUIET else _answered(answer, f"~/{name} is being called already; wait for it")
+            if running and name in QUIET and not self._closed:
+                return running[0].answer
+            if running or self._closed:
+                why = "the viewer ends" if self._closed else f"~/{name} is being called already; wait for it"
+                answer.set_result(Answer(False, why))
+                return answer
             now = time.monotonic()
-            call = _Call(name, answer, now, now + timeout)
+            call = _Call(name, answer, now, now + SERVICES[name][1])
             self._calls.append(call)
             self._jobs.append(lambda: self._begin(call, request))
         if name not in QUIET:
@@ -240,57 +244,76 @@ class Watch:
             self._node.destroy_subscription(self._overlay_subscription)
             self._overlay_subscription = None
 
-    def _begin(self, call: _Call, request: Any) -> None:
+    @contextmanager
+    def _answering(self, call: _Call) -> Iterator[None]:
+        """Whatever is raised is the answer."""
         try:
-            self._send(call, request)
+            yield
         except Exception as error:
-            self._finish(call, Answer(False, f"~/{call.name} cannot be called: {error}"))
+            self._finish(call, Answer(False, f"{self.name}/{call.name} failed: {error}"))
 
-    def _send(self, call: _Call, request: Any) -> None:
-        if not self._is_there(call.name):
-            where = f"{self.name}/{call.name}"
-            self._finish(call, Answer(False, f"{where} is not there: the node is gone, not started or not configured"))
-            return
-        if call.name == CALIBRATE:
-            self._send_goal(call)
-            return
-        client = self._clients_of[call.name]
-        call.future = client.call_async(SERVICES[call.name][0].Request() if request is None else request)
+    def _begin(self, call: _Call, request: Any) -> None:
+        with self._answering(call):
+            if not self._is_there(call.name):
+                where = f"{self.name}/{call.name}"
+                self._finish(call, Answer(False, f"{where} is not there: the node is gone, not started or not configured"))
+            elif call.name == CALIBRATE:
+                call.future = self._calibrate.send_goal_async(
+                    Calibrate.Goal(), feedback_callback=lambda fed: self._feed(call, fed)
+                )
+                call.future.add_done_callback(lambda sent: self._taken(call, sent))
+            else:
+                client = self._clients_of[call.name]
+                call.future = client.call_async(SERVICES[call.name][0].Request() if request is None else request)
+                call.future.add_done_callback(lambda done: self._answered(call, done))
 
-        def on_answer(future: Any) -> None:
-            try:
-                response = future.result()
-                self._finish(call, Answer(bool(response.success), str(response.message), response))
-            except Exception as error:
-                self._finish(call, Answer(False, f"{client.srv_name} failed: {error}"))
-
-        call.future.add_done_callback(on_answer)
+    def _answered(self, call: _Call, future: Any) -> None:
+        with self._answering(call):
+            response = future.result()
+            self._finish(call, Answer(bool(response.success), str(response.message), response))
 
     def _is_there(self, name: str) -> bool:
-        client = self._calibrate if name == CALIBRATE else None
-        return bool(client.server_is_ready() if client is not None else self._clients_of[name].service_is_ready())
+        return bool(self._calibrate.server_is_ready() if name == CALIBRATE else self._clients_of[name].service_is_ready())
 
-    def _send_goal(self, call: _Call) -> None:
-        def on_progress(stage: str, share: float) -> None:
-            with self.lock:
-                call.stage, call.share, call.deadline = stage, share, time.monotonic() + SERVICES[CALIBRATE][1]
+    def _feed(self, call: _Call, message: Any) -> None:
+        with self.lock:
+            call.stage, call.share = str(message.feedback.stage), float(message.feedback.progress)
+            call.deadline = time.monotonic() + SERVICES[CALIBRATE][1]
 
-        def on_outcome(success: bool, message: str, stopped: bool) -> None:
-            self._finish(call, Answer(success, message), NEUTRAL if stopped else None)
+    def _taken(self, call: _Call, future: Any) -> None:
+        with self._answering(call):
+            handle = future.result()
+            if not handle.accepted:
+                self._finish(call, Answer(False, NOT_TAKEN))
+                return
+            call.handle = handle
+            handle.get_result_async().add_done_callback(lambda done: self._ended(call, done))
+            if call.to_stop:
+                self._stop(call)
 
-        call.goal = Goal(self._calibrate, on_progress, on_outcome, lambda line: self._note(line, NEUTRAL))
+    def _ended(self, call: _Call, future: Any) -> None:
+        with self._answering(call):
+            answer = future.result()
+            stopped = answer.status == GoalStatus.STATUS_CANCELED
+            message = STOPPED if stopped else str(answer.result.message)
+            self._finish(call, Answer(bool(answer.result.success), message), NEUTRAL if stopped else None)
 
     def _stop(self, call: _Call) -> None:
-        if call.goal is not None:
-            call.goal.stop()
+        def asked(future: Any) -> None:
+            # It may have ended meanwhile: then its outcome says so.
+            if future.exception() is None and not future.result().goals_canceling:
+                self._note(TOO_LATE, NEUTRAL)
+
+        call.to_stop = True
+        if call.handle is not None:
+            call.handle.cancel_goal_async().add_done_callback(asked)
 
     def _finish(self, call: _Call, answer: Answer, level: str | None = None) -> None:
         with self.lock:
             if call not in self._calls:
                 return  # late, or the viewer ends
             self._calls.remove(call)
-        seconds = time.monotonic() - call.began
-        answer = Answer(answer.success, answer.message, answer.response, seconds)
+        answer = replace(answer, seconds=time.monotonic() - call.began)
         if call.name not in QUIET:
             with self.lock:
                 self.answers.pop(call.name, None)
@@ -310,11 +333,11 @@ class Watch:
                 self._drop(call, f"{where} did not answer within {waited:.0f} s; its answer is not waited for any more")
             elif call.began < restarted:
                 self._drop(call, f"the node was started anew while {where} was under way; call it again")
-            elif (call.future or call.goal) is not None and gone and not self._is_there(call.name):
+            elif call.future is not None and gone and not self._is_there(call.name):
                 self._drop(call, f"the node went away while {where} was under way; call it again once it is back")
 
     def _drop(self, call: _Call, message: str) -> None:
-        if call.future is not None:
+        if call.future is not None and call.name != CALIBRATE:
             self._clients_of[call.name].remove_pending_request(call.future)
         self._finish(call, Answer(False, message))
 
@@ -358,8 +381,3 @@ class Watch:
         jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, OVERLAY_QUALITY])[1].tobytes()
         with self.lock:
             self.overlay = Overlay(jpeg, time.time(), self.overlay.number + 1)
-
-
-def _answered(answer: Future[Answer], message: str) -> Future[Answer]:
-    answer.set_result(Answer(False, message))
-    return answer

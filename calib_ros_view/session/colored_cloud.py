@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.frame import Frame
 
-Matrix = NDArray[np.float64]
 CELLS_ACROSS = 320  # of the depth buffer over the image's width; wider than the gaps between rings would let points shine through
 BEHIND = 1.05  # times the least depth of a cell, and BEHIND_M more, from which a point is hidden
 BEHIND_M = 0.5
@@ -27,7 +27,7 @@ class ColoredCloud:
     seen: NDArray[np.bool_]
 
 
-def colored_cloud(frame: Frame, T: Matrix, most: int = MOST_POINTS, seed: int = 0) -> ColoredCloud:
+def colored_cloud(frame: Frame, T: Matrix, most: int = MOST_POINTS) -> ColoredCloud:
     """The points of a frame in the colours of its image at T_camera_lidar (4, 4); those outside of it, or hidden from the camera
     behind other points, are grey.
 
@@ -44,7 +44,7 @@ def colored_cloud(frame: Frame, T: Matrix, most: int = MOST_POINTS, seed: int = 
     rgb[visible] = image[v, u, ::-1]
     seen = np.zeros(len(xyz), bool)
     seen[visible] = True
-    kept = _drawn(seen, most, np.random.default_rng(seed))
+    kept = _drawn(seen, most, np.random.default_rng(0))
     return ColoredCloud(np.ascontiguousarray(xyz[kept]), rgb[kept], seen[kept])
 
 

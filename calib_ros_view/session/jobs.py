@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
+from calib_ros_check.alternatives import CheckInputs
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, Tolerance
 from calib_ros_view.session.session import Session, SessionState
@@ -39,20 +40,16 @@ class SessionJob:
     started: float = field(default_factory=time.monotonic)
     check: CheckResult | None = None
     state: SessionState | None = None
-    _stop: threading.Event = field(default_factory=threading.Event)
+    stopped: threading.Event = field(default_factory=threading.Event)  # set: it ends at its next step
 
     def title(self, now: SessionState) -> str:
         """Its name, and whether what it says is of another state than the present one."""
         return self.name if self.state is None or self.state is now else f"earlier {self.name}"
 
-    def stop(self) -> None:
-        """End it at its next step."""
-        self._stop.set()
-
     def watch(self, stage: str, share: float) -> None:
         """Progress of the work; raises StoppedError when it is to end."""
         self.stage, self.share = stage, share
-        if self._stop.is_set():
+        if self.stopped.is_set():
             raise StoppedError
 
 
@@ -90,7 +87,7 @@ class SessionJobs:
     def stop(self) -> None:
         """Stop what runs."""
         if self.current is not None:
-            self.current.stop()
+            self.current.stopped.set()
 
     def close(self, timeout_s: float = 10.0) -> None:
         """Stop what runs and wait for its end."""
@@ -123,10 +120,8 @@ class SessionJobs:
             job.failed = True
 
     def _check(self, job: SessionJob, state: SessionState) -> None:
-        features = self._session.features(state)
-        found = Checker(self._session.camera, self._session.config).check_features(
-            features, state.T, Tolerance(), progress=job.watch
-        )
+        inputs = CheckInputs(state.T, Tolerance(), progress=job.watch)
+        found = Checker(self._session.camera, self._session.config).check_features(self._session.features(state), inputs)
         job.check, job.state, job.message = found, state, f"{found.verdict.value}: {found.reason}"
 
 

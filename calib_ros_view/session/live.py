@@ -9,23 +9,23 @@ import math
 import re
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Result
-from calib_ros_view.session.ring import Ring
 
 HOUR = 3600.0
 MAX_EVENTS = 400
 NUMBER = re.compile(r"\d[\d.]*(e[-+]?\d+)?")
 SILENT_S = 4.0  # the node publishes once a second, and one message may be late
-AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 WORDS = {
     INITIAL: "Nothing estimated yet: this is the extrinsic it started from. It collects keyframes.",
     TENTATIVE: "A first estimate was accepted. Further keyframes have to confirm it; do not use it yet.",
@@ -39,8 +39,6 @@ WORDS = {
 UNCHECKED = "The extrinsic was known when data last came; nothing checks it now."
 GOOD, DOUBTFUL, BAD, NEUTRAL = "good", "doubtful", "bad", "neutral"
 LEVELS = {CONVERGED: GOOD, TENTATIVE: NEUTRAL, INITIAL: NEUTRAL, REFUSED: DOUBTFUL, INSUFFICIENT: DOUBTFUL, SUSPECT: DOUBTFUL}
-
-Matrix = NDArray[np.float64]
 
 
 class Presence(Enum):
@@ -98,6 +96,47 @@ class Diagnosis:
             return float(self.values.get(name, "").split(" ")[0])
         except ValueError:
             return math.nan
+
+
+class Ring:
+    """The newest `span_s` of rows of numbers, at most one row in span_s / capacity seconds: the last one of each such step.
+
+    The newest row is always there. A row from before it begins the series anew.
+    """
+
+    def __init__(self, width: int, span_s: float = 3600.0, capacity: int = 1800) -> None:
+        self.step_s, self._span_s = span_s / capacity, span_s
+        self._rows: deque[Matrix] = deque(maxlen=capacity)  # time first
+        self._empty = np.empty((0, width + 1))
+
+    def add(self, time_s: float, values: ArrayLike) -> None:
+        """A row (width,); it takes the place of the row before in the same step."""
+        if self._rows and time_s < self._rows[-1][0]:
+            self._rows.clear()
+        if len(self._rows) > 1 and time_s // self.step_s == self._rows[-1][0] // self.step_s:
+            self._rows.pop()
+        row = np.empty(self._empty.shape[1])
+        row[0], row[1:] = time_s, values
+        self._rows.append(row)
+
+    def add_gap(self, time_s: float) -> None:
+        """Nothing was known at this time: lines are broken here."""
+        self.add(time_s, np.nan)
+
+    def rows(self, since_s: float = -np.inf, most: int = 0) -> Matrix:
+        """(n, 1 + width): times and values not older than since_s nor than the span, oldest first.
+
+        most: at most so many (0 = all), evenly, with the newest one; every gap stays.
+        """
+        if not self._rows:
+            return self._empty
+        rows = np.array(self._rows)
+        rows = rows[rows[:, 0] >= max(since_s, rows[-1, 0] - self._span_s)]
+        if most and len(rows) > most:
+            chosen = np.linspace(0, len(rows) - 1, most).round().astype(int)
+            gaps = np.flatnonzero(np.isnan(rows[:, 1:]).all(axis=1))
+            rows = rows[np.union1d(chosen, gaps)]
+        return np.asarray(rows)
 
 
 class LiveHistory:
@@ -180,7 +219,8 @@ class LiveHistory:
 
     def _hear(self, at: float) -> None:
         if self._gone and self.heard is not None:
-            self.note(at, f"the node is back after {_span(at - self.heard)}", GOOD)
+            away = at - self.heard
+            self.note(at, f"the node is back after {f'{away:.0f} s' if away < 90 else f'{away / 60:.0f} min'}", GOOD)
             self._gone, self.state, self._back = False, None, at
         elif self.heard is None:
             self.note(at, "the node is heard", NEUTRAL)
@@ -198,11 +238,6 @@ class LiveHistory:
         if self.heard is None:
             return Presence.WAITING
         return Presence.GONE if self._gone else Presence.LIVE
-
-    @property
-    def first(self) -> Matrix | None:
-        """T_camera_lidar (4, 4) that was heard first."""
-        return self._first
 
     def pose_at(self, at: float) -> Matrix | None:
         """T_camera_lidar (4, 4) that held at a time, the first one heard for times before it; None if nothing was heard yet."""
@@ -233,14 +268,12 @@ class LiveHistory:
 
     def strip(self, since: float, now: float) -> list[tuple[float, float, str]]:
         """The statuses from `since` to `now`: begin, end, status; without holes, but for before the first."""
-        spans: Sequence[tuple[float, str]] = list(self.spans)
-        ends = [*(begin for begin, _ in spans[1:]), now]
-        # Before anything is heard there is no span to go with the last end.
-        return [(max(begin, since), end, status) for (begin, status), end in zip(spans, ends, strict=False) if end > since]
+        bounds = pairwise([*self.spans, (now, "")])
+        return [(max(begin, since), end, status) for (begin, status), (end, _) in bounds if end > since]
 
-    def newest_events(self, count: int = 100, since: float = -math.inf) -> list[Event]:
+    def newest_events(self, count: int = 100) -> list[Event]:
         """Newest first."""
-        return [event for event in reversed(self.events) if event.at >= since][:count]
+        return list(self.events)[: -count - 1 : -1]
 
 
 def moment_of(clock: str, now: float) -> float | None:
@@ -255,7 +288,3 @@ def moment_of(clock: str, now: float) -> float | None:
     day = time.localtime(now)
     moment = time.mktime((day.tm_year, day.tm_mon, day.tm_mday, hour, minute, second, 0, 0, -1))
     return moment if moment <= now else moment - 24 * HOUR
-
-
-def _span(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

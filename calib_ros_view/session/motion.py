@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 
-Matrix = NDArray[np.float64]
 STEP_DEG, STEP_CM, LARGE = 0.05, 1.0, 10  # of a key, and with shift so many times as far
 
 

@@ -11,10 +11,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
@@ -30,7 +30,6 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros_view.session.motion import AXES
 
-Matrix = NDArray[np.float64]
 CURVE_DEG, CURVE_M, SAMPLES = 2.0, 0.3, 41  # half widths of the curves, and scores along each
 POINTS = 40_000  # edge points that tell a curve; more take longer and change nothing
 REACH = np.array([np.deg2rad(2.0)] * 3 + [0.3] * 3)  # rad, m; how far the optimum is sought: what a hand has left
@@ -54,11 +53,6 @@ class Numbers:
     curves: Matrix
     frame_scores: Matrix
 
-    @property
-    def peaks(self) -> Matrix:
-        """Offset (6,) at which each curve is highest, deg and cm."""
-        return np.asarray(np.take_along_axis(self.offsets, np.argmax(self.curves, axis=1)[:, None], axis=1)[:, 0])
-
 
 @dataclass(frozen=True, eq=False)
 class Known:
@@ -73,15 +67,10 @@ class Known:
     covariance: Matrix
     unobservable: tuple[Direction, ...]
 
-    @property
-    def sigma(self) -> Matrix:
-        """Standard deviations (6,) of the axes, rad and m."""
-        return np.sqrt(np.diag(self.covariance))
-
     def words(self) -> list[str]:
         """A line per axis: where the optimum lies from here, and within what (two standard deviations)."""
         lines = []
-        for axis, value, sigma in zip(AXES, self.offset, self.sigma, strict=True):
+        for axis, value, sigma in zip(AXES, self.offset, np.sqrt(np.diag(self.covariance)), strict=True):
             scale = 180 / np.pi if axis.unit == "deg" else 100.0
             lines.append(f"{axis.title} {scale * value:+.2f} {axis.unit} (±{2 * scale * sigma:.2f} {axis.unit})")
         return lines
@@ -90,21 +79,8 @@ class Known:
 class FrameScores:
     """Scores of the frames of one source, with the edges that they are made of.
 
-    Parameters
-    ----------
-    frames : sequence of Frame
-        Of one camera. One that cannot be used keeps its place, without a score.
-    camera : Camera
-        Their intrinsics.
-    config : Config, optional
-        All settings.
-    progress : Progress, optional
-        Of the features; it may raise, which ends the work.
-
-    Raises
-    ------
-    BadInputError
-        There are no frames, or none of them can be used.
+    frames: of one camera. One that cannot be used keeps its place, without a score. progress: of the features; it may raise.
+    Raises BadInputError if there are no frames, or none of them can be used.
     """
 
     def __init__(
@@ -128,17 +104,17 @@ class FrameScores:
         found = np.flatnonzero(self._place == frame)
         return self.features[int(found[0])] if len(found) else None
 
-    def at(self, T: Matrix, left_out: Collection[int] = (), time_offset_s: float = 0.0, samples: int = SAMPLES) -> Numbers:
+    def at(self, T: Matrix, left_out: Collection[int] = (), time_offset_s: float = 0.0) -> Numbers:
         """The scores at T (4, 4), all points taken as measured `time_offset_s` later. left_out: positions of frames that do not
         count. TooFewFeaturesError if too few points are in view."""
         with self._lock:
             score = self._score(T, left_out, time_offset_s)
             part = score.subset(POINTS, np.random.default_rng(0))
             finest = score.n_levels - 1
-            unit = np.linspace(-1, 1, samples)
+            unit = np.linspace(-1, 1, SAMPLES)
             half = np.repeat([np.deg2rad(CURVE_DEG), CURVE_M], 3)
             twists = (unit[None, :, None] * (half[:, None] * np.eye(6))[:, None, :]).reshape(-1, 6)
-            values = part.values(se3.exp_many(twists) @ T, finest).reshape(6, samples)
+            values = part.values(se3.exp_many(twists) @ T, finest).reshape(6, SAMPLES)
             offsets = np.repeat([CURVE_DEG, 100 * CURVE_M], 3)[:, None] * unit
             frame_scores = np.full(self._count, np.nan)
             frame_scores[self._place] = score.frame_scores(T)
@@ -163,14 +139,11 @@ class FrameScores:
         return score if kept.all() else score.select(kept)
 
 
-def ellipse(covariance: Matrix, pair: tuple[int, int], probability: float = PROBABILITY) -> Matrix:
-    """The ellipse in which two axes of a twist lie with a probability, (n, 2), deg and cm, about the origin.
-
-    covariance: (6, 6), rad and m.
-    """
+def ellipse(covariance: Matrix, pair: tuple[int, int]) -> Matrix:
+    """The ellipse in which two axes of a twist lie with PROBABILITY, (n, 2), deg and cm, about the origin. covariance: (6, 6)."""
     scale = np.where(np.array(pair) < 3, 180 / np.pi, 100.0)
     C = covariance[np.ix_(pair, pair)] * np.outer(scale, scale)
     values, vectors = np.linalg.eigh(C)
     turn = np.linspace(0, 2 * np.pi, ELLIPSE_POINTS)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return np.asarray(circle * np.sqrt(chi2.ppf(probability, 2) * np.maximum(values, 0)) @ vectors.T)
+    return np.asarray(circle * np.sqrt(chi2.ppf(PROBABILITY, 2) * np.maximum(values, 0)) @ vectors.T)

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.arrays import Matrix
 from calib_ros.camera import MIN_DEPTH, Camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import to_gray
-from calib_ros.lidar.edges import EdgeKind
+from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.overlay import PALETTE, depth_levels
 
 Image = NDArray[np.uint8]
-Matrix = NDArray[np.float64]
 EDGE_KIND = "edge kind"
 COLORINGS = ("depth", "reflectivity", "ring", "class", EDGE_KIND)
 BACKGROUNDS = ("colour", "grey", "edges")
@@ -67,15 +67,13 @@ class Look:
     width: int = 1242
 
     def __post_init__(self) -> None:
-        choices = (("coloring", COLORINGS), ("background", BACKGROUNDS), ("comparison", COMPARISONS))
-        for name, allowed in choices:
+        for name, allowed in (("coloring", COLORINGS), ("background", BACKGROUNDS), ("comparison", COMPARISONS)):
             if getattr(self, name) not in allowed:
                 raise BadInputError(f"{name} '{getattr(self, name)}' is not known; choose one of {', '.join(allowed)}")
         left, top, right, bottom = self.window
         if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
             raise BadInputError(f"the window {self.window} is no part of the image")
-        ranges = (("size", 1, MOST_SIZE), ("opacity", 0, 1), ("near", 0, np.inf), ("width", NARROWEST, WIDEST))
-        for name, low, high in ranges:
+        for name, low, high in (("size", 1, MOST_SIZE), ("opacity", 0, 1), ("near", 0, np.inf), ("width", NARROWEST, WIDEST)):
             if not low <= getattr(self, name) <= high:
                 raise BadInputError(f"{name} {getattr(self, name)} is out of range [{low}, {high}]")
         if not self.far > self.near:
@@ -85,26 +83,21 @@ class Look:
 class FramePicture:
     """Draws one frame; what does not depend on the extrinsic is prepared once.
 
-    edge_xyz: (m, 3) points of LiDAR edges, and edge_kind: (m,) their EdgeKind, where they are known. labels: (n,) SemanticClass
-    of the points of the cloud, in place of the cloud's own.
+    edges: points of the LiDAR edges, where they are known. labels: (n,) SemanticClass of the points of the cloud, in place of the
+    cloud's own.
     """
 
-    def __init__(
-        self,
-        frame: Frame,
-        edge_xyz: NDArray[np.float32] | None = None,
-        edge_kind: NDArray[np.integer] | None = None,
-        labels: NDArray[np.uint8] | None = None,
-    ) -> None:
+    def __init__(self, frame: Frame, edges: EdgePoints | None = None, labels: NDArray[np.uint8] | None = None) -> None:
         self.frame = frame
         keep = frame.cloud.finite_mask()
         cloud = frame.cloud.finite()
         self._xyz = np.ascontiguousarray(cloud.xyz.T)  # (3, n): column by column, projecting takes a fifth of the time
         self._intensity, self._ring = cloud.intensity, cloud.ring
         self._labels = cloud.label if labels is None else labels[keep]
-        edges = np.zeros((0, 3), np.float32) if edge_xyz is None else edge_xyz
-        self._edge_xyz = np.ascontiguousarray(edges.T, np.float32)
-        self._edge_colors = _kind_colors(np.zeros(0, int) if edge_kind is None else np.asarray(edge_kind))
+        self._edge_xyz = np.ascontiguousarray(edges.xyz.T if edges is not None else np.zeros((3, 0)), np.float32)
+        table = np.full((max(EdgeKind) + 1, 3), 255, np.uint8)
+        table[list(KIND_COLORS)] = list(KIND_COLORS.values())
+        self._edge_colors: Image = table[edges.kind if edges is not None else []]
         self._backgrounds: dict[str, Image] = {}
 
     def missing(self, coloring: str) -> str:
@@ -124,9 +117,8 @@ class FramePicture:
         height = look.width * camera.height * (bottom - top) / (camera.width * (right - left))
         return look.width, max(round(height), 1)
 
-    def draw(self, T: Matrix, before: Matrix | None = None, look: Look | None = None) -> Image:
+    def draw(self, T: Matrix, before: Matrix | None, look: Look) -> Image:
         """The picture (h, w, 3), BGR, at T_camera_lidar (4, 4). before: to compare with."""
-        look = look or Look()
         now = self._drawn(T, look)
         if before is None or look.comparison == "now":
             return now
@@ -138,22 +130,15 @@ class FramePicture:
             return np.hstack([earlier, np.zeros((height, GAP, 3), np.uint8), now])
         return np.vstack([earlier, np.zeros((GAP, width, 3), np.uint8), now])
 
-    def jpeg(self, T: Matrix, before: Matrix | None = None, look: Look | None = None) -> bytes:
-        """The same as a file."""
-        return encoded(self.draw(T, before, look))
-
     def _drawn(self, T: Matrix, look: Look) -> Image:
         picture = self._background(look)
         if look.cloud:
-            self._points(picture, T, look)
+            uv, index, depth = self._placed(self._xyz, T, look)
+            _draw(picture, uv, self._colors(index, depth, look), look.size, look.opacity)
         if look.edges or (look.cloud and look.coloring == EDGE_KIND):
             uv, index, _ = self._placed(self._edge_xyz, T, look)
             _draw(picture, uv, self._edge_colors[index], look.size + 1, 1.0)
         return picture
-
-    def _points(self, picture: Image, T: Matrix, look: Look) -> None:
-        uv, index, depth = self._placed(self._xyz, T, look)
-        _draw(picture, uv, self._colors(index, depth, look), look.size, look.opacity)
 
     def _placed(
         self, xyz: NDArray[np.float32], T: Matrix, look: Look
@@ -242,13 +227,6 @@ def _background(image: Image, kind: str) -> Image:
         return np.asarray(cv2.cvtColor(np.maximum(lines, (0.25 * gray).astype(np.uint8)), cv2.COLOR_GRAY2BGR), np.uint8)
     shown = image if kind == "colour" and image.ndim == 3 else cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
     return np.asarray(cv2.convertScaleAbs(shown, alpha=DIM), np.uint8)
-
-
-def _kind_colors(kind: NDArray[np.integer]) -> Image:
-    table = np.full((max(EdgeKind) + 1, 3), 255, np.uint8)
-    for own, color in KIND_COLORS.items():
-        table[own] = color
-    return np.asarray(table[kind], np.uint8)
 
 
 def _draw(picture: Image, uv: NDArray[np.int32], colors: Image, size: int, opacity: float) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Matrix
 from calib_ros_view.session.motion import AXES
 from calib_ros_view.session.numbers import PAIRS, Known, Numbers, ellipse
 
-Matrix = NDArray[np.float64]
 WIDTH, HEIGHT, MARGIN = 200, 96, 16  # px of one plot
 BAR_WIDTH, BARS = 300, 46  # px of the bars of all frames
 SIDE = 140  # px of an ellipse's plot

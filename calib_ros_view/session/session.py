@@ -7,6 +7,7 @@ changes, so that a page knows when to draw anew.
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.datasets.source import Source
@@ -28,7 +30,6 @@ from calib_ros_view.session.motion import moved, offsets
 from calib_ros_view.session.numbers import FrameScores
 from calib_ros_view.session.picture import FramePicture
 
-Matrix = NDArray[np.float64]
 MOST_FRAMES = 40  # whose clouds and pictures are held
 MOST_UNDO = 200
 MOST_TIME_OFFSET_S = 0.2
@@ -51,24 +52,9 @@ class SessionState:
 class Session:
     """Frames and the extrinsic that is looked at.
 
-    Parameters
-    ----------
-    frames : sequence of Frame
-        Of one camera, in order; at most MOST_FRAMES.
-    source : Source
-        That they are of, for its names.
-    start : array, shape (4, 4)
-        T_camera_lidar at first, and what pictures are compared with.
-    config : Config, optional
-    out : Path, optional
-        Where `save` writes.
-    progress : Progress, optional
-        Of the edges of all frames.
-
-    Raises
-    ------
-    BadInputError
-        No frames, too many, or none that can be used.
+    frames: of one camera, in order; at most MOST_FRAMES. source: that they are of, for its names. start: T_camera_lidar (4, 4) at
+    first, and what pictures are compared with. out: where `save` writes. progress: of the edges of all frames. Raises
+    BadInputError for no frames, too many, or none that can be used.
     """
 
     def __init__(
@@ -91,8 +77,8 @@ class Session:
         self.out = out
         self._lock = threading.RLock()
         self._models = threading.Lock()
-        self._undo: list[SessionState] = []
-        self._redo: list[SessionState] = []
+        self._undo: deque[SessionState] = deque(maxlen=MOST_UNDO)
+        self._redo: deque[SessionState] = deque()
         self._state = SessionState(self.start)
         self._pictures: dict[int, FramePicture] = {}
         self._drag: str | None = None
@@ -158,24 +144,23 @@ class Session:
 
     def undo(self) -> None:
         """One step back, if there is one."""
-        with self._lock:
-            if self._undo:
-                self._redo.append(self._state)
-                self._state, self._drag = self._undo.pop(), None
-                self.version += 1
+        self._step(self._undo, self._redo)
 
     def redo(self) -> None:
         """One undone step forward, if there is one."""
+        self._step(self._redo, self._undo)
+
+    def _step(self, here: deque[SessionState], back: deque[SessionState]) -> None:
         with self._lock:
-            if self._redo:
-                self._undo.append(self._state)
-                self._state, self._drag = self._redo.pop(), None
+            if here:
+                back.append(self._state)
+                self._state, self._drag = here.pop(), None
                 self.version += 1
 
     def _set(self, state: SessionState, drag: str | None = None) -> SessionState:
         with self._lock:
             if drag is None or drag != self._drag:
-                self._undo = [*self._undo[1 - MOST_UNDO :], self._state]
+                self._undo.append(self._state)
             self._drag = drag
             self._redo.clear()
             self._state = state
@@ -216,13 +201,10 @@ class Session:
 
     def _drawer(self, frame: int, labels: NDArray[np.uint8] | None = None) -> FramePicture:
         own = self.scores.features_of(frame)
-        if own is None:
-            return FramePicture(self.frames[frame], labels=labels)
-        return FramePicture(self.frames[frame], own.points.xyz, own.points.kind, labels)
+        return FramePicture(self.frames[frame], None if own is None else own.points, labels)
 
-    def shown_at(self, frame: int, state: SessionState | None = None) -> Matrix:
+    def shown_at(self, frame: int, state: SessionState) -> Matrix:
         """T (4, 4) at which the points of a frame are drawn: the extrinsic, and the vehicle's motion during the time offset."""
-        state = state or self._state
         twist = self.frames[frame].twist
         if twist is None or not state.time_offset_s:
             return state.T
@@ -236,9 +218,8 @@ class Session:
     def result(self) -> Result:
         """The present extrinsic as a result: that of the estimate, or one that says that it was set by hand."""
         state = self._state
-        if state.result is not None:
-            made = state.result
-        else:
+        made = state.result
+        if made is None:
             status, reason = (INITIAL, "as it was given") if state.what == "start" else (TENTATIVE, BY_HAND)
             made = Result(state.T, status, reason, frames_used=len(self.frames) - len(state.left_out))
         offset = made.time_offset_s if made.time_offset_s is not None else state.time_offset_s or None

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from calib_ros_view.session.live import Matrix
+from calib_ros.arrays import Matrix
 
 Options = dict[str, Any]
 X, Y, Z = "#e5534b", "#2ea043", "#4a90e2"
@@ -18,15 +18,6 @@ COLOURS = {
 }  # fmt: skip
 SMALLEST_P = 1e-6
 CLOCK = {"hour": "{HH}:{mm}", "minute": "{HH}:{mm}", "second": "{HH}:{mm}:{ss}"}
-
-
-def clock_axis(since: float, now: float) -> Options:
-    """The time axis of all charts: the same window, so that what is above each other belongs together."""
-    return {
-        "type": "time", "min": round(1000 * since), "max": round(1000 * now),
-        "axisLabel": {"color": GREY, "hideOverlap": True, "formatter": CLOCK},
-        "axisLine": {"lineStyle": {"color": RULE}}, "splitLine": {"show": False},
-    }  # fmt: skip
 
 
 def poses_chart(rows: Matrix, translation: bool, since: float, now: float) -> Options:
@@ -52,11 +43,8 @@ def drift_chart(poses: Matrix, measures: Matrix, since: float, now: float) -> Op
         {**line("drift", AMBER, points(poses[:, 0], poses[:, 13])), "areaStyle": {"opacity": 0.08}},
         {**line("p-value", VIOLET, p), "yAxisIndex": 1, "step": "end"},
     ]
-    options = chart(series, since, now, "", ["drift", "p-value"])
-    right = {**value_axis(""), "type": "log", "min": SMALLEST_P, "max": 1, "splitLine": {"show": False}}
-    options["yAxis"] = [{**options["yAxis"], "scale": False, "min": 0}, right]
-    options["grid"]["right"] = 52
-    return options
+    right = {**value_axis(""), "type": "log", "min": SMALLEST_P, "max": 1}
+    return _with_right_axis(chart(series, since, now, "", ["drift", "p-value"]), right)
 
 
 def rates_chart(measures: Matrix, since: float, now: float) -> Options:
@@ -67,10 +55,12 @@ def rates_chart(measures: Matrix, since: float, now: float) -> Options:
     load = line("CPU", AMBER, points(times, 100 * measures[:, 5], 1))
     series.append({**load, "yAxisIndex": 1, "areaStyle": {"opacity": 0.08}})
     options = chart(series, since, now, "", ["images/s", "clouds/s", "pairs/s", "CPU"])
-    options["yAxis"] = [
-        {**options["yAxis"], "scale": False, "min": 0},
-        {**value_axis(" %"), "min": 0, "splitLine": {"show": False}},
-    ]
+    return _with_right_axis(options, {**value_axis(" %"), "min": 0})
+
+
+def _with_right_axis(options: Options, right: Options) -> Options:
+    """The left axis begins at 0."""
+    options["yAxis"] = [{**options["yAxis"], "scale": False, "min": 0}, {**right, "splitLine": {"show": False}}]
     options["grid"]["right"] = 52
     return options
 
@@ -82,7 +72,12 @@ def chart(series: Sequence[Options], since: float, now: float, unit: str, legend
         "grid": {"left": 52, "right": 14, "top": 34, "bottom": 26},
         "legend": {"data": legend, "top": 0, "textStyle": {"color": GREY}, "icon": "roundRect", "itemWidth": 12, "itemHeight": 4},
         "tooltip": {"trigger": "axis", "confine": True},
-        "xAxis": clock_axis(since, now), "yAxis": value_axis(unit), "series": list(series),
+        "xAxis": {  # the same window for all charts, so that what is above each other belongs together
+            "type": "time", "min": round(1000 * since), "max": round(1000 * now),
+            "axisLabel": {"color": GREY, "hideOverlap": True, "formatter": CLOCK},
+            "axisLine": {"lineStyle": {"color": RULE}}, "splitLine": {"show": False},
+        },
+        "yAxis": value_axis(unit), "series": list(series),
     }  # fmt: skip
 
 

@@ -17,9 +17,10 @@ from fastapi import FastAPI, Response
 from nicegui import ui
 from nicegui.events import GenericEventArguments, KeyEventArguments
 
+from calib_ros.arrays import Matrix
 from calib_ros.messages import stamp_ns
 from calib_ros_view.node.watch import CHECK, Watch
-from calib_ros_view.session.live import HOUR, Event, Matrix, Presence, moment_of
+from calib_ros_view.session.live import HOUR, Event, Presence, moment_of
 from calib_ros_view.web import live_charts, theme
 from calib_ros_view.web.live_words import (
     ACTIONS,
@@ -158,7 +159,7 @@ class _ClientPage:
             with ui.row().classes("w-full items-center no-wrap gap-3") as self.progress:
                 self.stage = ui.label().classes("muted").style("min-width: 7em")
                 self.bar = ui.linear_progress(0.0, show_value=False, size="6px").classes("grow")
-                ui.button("Stop", on_click=self.stop).props("dense no-caps color=negative unelevated").tooltip("key Esc")
+                ui.button("Stop", on_click=self.watch.stop).props("dense no-caps color=negative unelevated").tooltip("key Esc")
             self.answer = ui.label("Answers of the node appear here.").classes("muted wrap").props("aria-live=polite")
             self.details = ui.label().classes("muted wrap").style("white-space: pre-line")
         with ui.dialog() as self.dialog, ui.card():
@@ -227,7 +228,7 @@ class _ClientPage:
         keys: dict[str, Callable[[], object]] = {action.key: lambda a=action: self.ask(a) for action in ACTIONS}  # type: ignore[misc]
         keys |= {
             "?": self.help.open,
-            "Escape": self.stop,
+            "Escape": self.watch.stop,
             "d": partial(theme.switch, self.dark),
             "o": lambda: self.switch.set_value(not self.switch.value),
         }
@@ -256,10 +257,6 @@ class _ClientPage:
         self.references.value = "moment"
         self.moment_input.value = clock(at)
 
-    def stop(self) -> None:
-        """Stop a calibration that was asked for from these pages."""
-        self.watch.stop()
-
     def ask(self, action: Action) -> None:
         """Call a service; one that changes something only after a yes."""
         if action.service in self.watch.busy:
@@ -282,10 +279,7 @@ class _ClientPage:
 
     def switch_overlay(self) -> None:
         """The switch was moved."""
-        if self.switch.value:
-            self.look()
-        else:
-            self.leave()
+        (self.look if self.switch.value else self.leave)()
 
     def look(self) -> None:
         """The client is there, and wants the overlay."""

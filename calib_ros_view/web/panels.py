@@ -6,13 +6,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from nicegui import run, ui
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.errors import CalibrationError
 from calib_ros_view.session.colored_cloud import colored_cloud
 from calib_ros_view.session.jobs import SessionJob
@@ -21,7 +21,7 @@ from calib_ros_view.session.picture import COLORINGS, Look, encoded
 from calib_ros_view.session.plots import curve_plots, ellipse_plots, frame_bars
 from calib_ros_view.session.session import Session, SessionState
 from calib_ros_view.web import theme
-from calib_ros_view.web.pictures import Pictures
+from calib_ros_view.web.server import Pictures
 
 THUMB_WIDTH = 360  # px
 FRUSTUM = ((-0.5, -0.3), (0.5, -0.3), (0.5, 0.3), (-0.5, 0.3))  # of the camera in the scene, m at a distance of 1 m
@@ -40,15 +40,6 @@ STEPS = (
     ("zoom_in", "come near", (0.0, 0.0), 0.0, 0.75),
     ("zoom_out", "go away", (0.0, 0.0), 0.0, 1.33),
 )
-Matrix = NDArray[np.float64]
-
-
-class Panel(Protocol):
-    """A part of the page that is brought up to date when it is looked at."""
-
-    async def show(self, state: SessionState, frame: int, look: Look) -> None:
-        """Show a state and a frame. CalibrationError if it cannot be shown."""
-        ...
 
 
 class NumberPanel:

@@ -1,29 +1,28 @@
 """The web server of the pages: one address, who may use it, and a clean end.
 
-A page is a function that is called for every browser that opens it, and lays it out with NiceGUI:
-
-    def page() -> None:
-        theme.apply()
-        ui.label("hello")
-
-    serve(page, "calib-ros view", Address("127.0.0.1", 8765))
-
-Pictures come from routes of their own, which `routes` adds to the application. Everything, the socket too, passes `Guard` first.
+A page is a function that is called for every browser that opens it, and lays it out with NiceGUI. Pictures come from routes of
+their own. Everything, the socket too, passes `Guard` first.
 """
 
 from __future__ import annotations
 
 import hmac
 import ipaddress
+import itertools
 import re
 import secrets
 import socket
+import threading
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 from calib_ros.errors import BadInputError, MissingDependencyError
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -37,6 +36,7 @@ TOKEN_BYTES = 16
 TOKEN = re.compile(r"[A-Za-z0-9._-]+")
 REFUSED_ORIGIN = b"refused: this request comes from another page; open the address that calib-ros printed"
 REFUSED_TOKEN = b"refused: open the whole address that calib-ros printed, with its token"
+PICTURES_HELD = 128  # of all browsers together
 FINISH_S = 2  # seconds that open connections get at the end
 
 
@@ -161,6 +161,39 @@ def listening(address: Address) -> socket.socket:
     return made
 
 
+class Pictures:
+    """The last picture of each name, in memory: no request names a file."""
+
+    def __init__(self) -> None:
+        self._held: OrderedDict[str, bytes] = OrderedDict()
+        self._count = itertools.count()
+        self._lock = threading.Lock()
+
+    def put(self, name: str, data: bytes) -> str:
+        """Hold a JPEG under a name in place of the one before; returns its address, another one every time."""
+        with self._lock:
+            self._held[name] = data
+            self._held.move_to_end(name)
+            while len(self._held) > PICTURES_HELD:
+                self._held.popitem(last=False)
+        return f"/picture/{name}?v={next(self._count)}"
+
+    def drop(self, owner: str) -> None:
+        """Forget the pictures of a browser that has left, whose names begin with its own."""
+        with self._lock:
+            for name in [name for name in self._held if name.startswith(owner)]:
+                del self._held[name]
+
+    def routes(self, app: FastAPI) -> None:
+        """Add the address of the pictures."""
+        from fastapi import Response
+
+        @app.get("/picture/{name}", response_class=Response)
+        def picture(name: str):  # type: ignore[no-untyped-def]  # FastAPI resolves annotations, which are imported late here
+            data = self._held.get(name)
+            return Response(data or b"", 200 if data else 404, {"Cache-Control": "no-store"}, "image/jpeg")
+
+
 def require_nicegui() -> None:
     """MissingDependencyError, before any work is done in vain."""
     try:
@@ -173,16 +206,15 @@ def serve(
     page: Callable[[], None],
     title: str,
     address: Address,
-    routes: Callable[[Any], None] | None = None,
-    ready: Callable[[str], None] = lambda url: None,
+    routes: Callable[[FastAPI], None],
+    ready: Callable[[str], None],
     ended: Callable[[], None] = lambda: None,
 ) -> None:
     """Serve a page until Ctrl-C or SIGTERM.
 
     routes: adds routes to the FastAPI application. ready: called with the address to open, once it can be. ended: called when no
-    more requests come. Raises BadInputError if the address cannot be used, and MissingDependencyError without NiceGUI.
+    more requests come. Raises BadInputError if the address cannot be used.
     """
-    require_nicegui()
     import uvicorn
     from fastapi import FastAPI
     from nicegui import ui
@@ -191,8 +223,7 @@ def serve(
     token = address.token or (None if address.is_local else secrets.token_urlsafe(TOKEN_BYTES))
     port = taken.getsockname()[1]
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-    if routes is not None:
-        routes(app)
+    routes(app)
     ui.page("/", title=title)(page)
     # Undelivered messages hold pictures of the past: few are kept.
     ui.run_with(app, title=title, dark=None, message_history_length=50, show_welcome_message=False)

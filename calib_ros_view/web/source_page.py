@@ -15,11 +15,11 @@ from nicegui import background_tasks, events, run, ui
 from calib_ros.errors import CalibrationError
 from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, SessionJobs
 from calib_ros_view.session.motion import AXES, step_of
-from calib_ros_view.session.picture import COLORINGS, Look
+from calib_ros_view.session.picture import COLORINGS, Look, encoded
 from calib_ros_view.session.session import MOST_TIME_OFFSET_S, Session
 from calib_ros_view.web import theme
-from calib_ros_view.web.panels import NumberPanel, Panel, ScenePanel, Sheet
-from calib_ros_view.web.pictures import Pictures
+from calib_ros_view.web.panels import NumberPanel, ScenePanel, Sheet
+from calib_ros_view.web.server import Pictures
 from calib_ros_view.web.viewer import ZOOM, Viewer
 
 SLIDER_DEG, SLIDER_CM = 5.0, 60.0  # half widths; numbers beside them reach farther
@@ -73,7 +73,8 @@ class SourcePage:
         self._dark = theme.apply()
         self._keys = theme.keys_dialog({_shown(key): what for key, what in KEYS.items()})
         self._copied = ui.dialog()
-        with theme.bar(self._session.name):
+        with ui.header(elevated=False).classes("bar items-center gap-1 px-2 py-1 wrap"):  # it wraps on a narrow screen
+            ui.label(self._session.name).classes("text-base font-semibold ellipsis").style("max-width: 45vw")
             self._actions()
         with ui.element("div").classes("w-full flex flex-col lg:flex-row flex-nowrap gap-2 p-2"):
             with ui.element("div").classes("grow min-w-0 flex flex-col flex-nowrap gap-2").style("flex-basis: 0"):
@@ -88,11 +89,8 @@ class SourcePage:
     # --- parts of the page
 
     def _actions(self) -> None:
-        for icon, hint, do, key in (
-            ("chevron_left", "previous frame", lambda: self._go(-1), "p"),
-            ("chevron_right", "next frame", lambda: self._go(1), "n"),
-        ):
-            theme.icon_button(icon, hint, do, key)
+        theme.icon_button("chevron_left", "previous frame", lambda: self._go(-1), "p")
+        theme.icon_button("chevron_right", "next frame", lambda: self._go(1), "n")
         self._frame_label = ui.label().classes("figures text-sm")
         ui.space()
         self._undo = theme.icon_button("undo", "undo", self._session.undo, "z")
@@ -103,11 +101,11 @@ class SourcePage:
                 far = f" within {SEARCH_DEG:g} deg and {100 * SEARCH_M:g} cm" if name == SEARCH else ""
                 ui.tooltip(f"{name} from here{far} ({hint})")
         self._stop = ui.button("Stop", on_click=self._jobs.stop).props("dense no-caps color=negative unelevated")
-        with ui.button("Save", on_click=self._save).props("dense no-caps flat"):
+        with ui.button("Save", on_click=lambda: self._tell(self._save)).props("dense no-caps flat"):
             ui.tooltip(f"write {self._session.out}" if self._session.out else "no file: start with --out FILE")
         with ui.button("Copy", icon="content_copy").props("dense no-caps flat"), ui.menu():
             for form, title in FORMATS.items():
-                ui.menu_item(title, on_click=lambda form=form: self._copy(form))
+                ui.menu_item(title, on_click=lambda form=form: self._tell(partial(self._copy, form)))
         theme.icon_button("contrast", "light or dark", partial(theme.switch, self._dark))
         theme.icon_button("help_outline", "keys", self._keys.open, "?")
 
@@ -158,7 +156,7 @@ class SourcePage:
             number = ui.number(value=0, step=step, suffix=unit, format="%.2f").props("dense borderless input-class=text-right")
             number.classes("figures plain").style("flex: 0 0 6.2rem").props(f'aria-label="{title}, {unit}"')
         slider.on("update:model-value", lambda e: self._slid(k, e.args), throttle=THROTTLE_S)
-        slider.on("change", lambda: self._let_go())
+        slider.on("change", self._let_go)
         number.on("change", lambda: self._slid(k, number.value), [])
         self._rows.append((slider, number))
 
@@ -192,7 +190,7 @@ class SourcePage:
         return by_color | {
             "n": lambda: self._go(1),
             "p": lambda: self._go(-1),
-            "x": self._leave_out,
+            "x": lambda: self._leave(self._frame, self._frame not in self._session.state.left_out),
             "z": self._session.undo,
             "y": self._session.redo,
             "Enter": lambda: self._begin(REFINE),
@@ -212,10 +210,6 @@ class SourcePage:
             "t": partial(theme.switch, self._dark),
             "?": self._keys.open,
         }
-
-    def _leave_out(self) -> None:
-        """This frame, or take it back in."""
-        self._leave(self._frame, self._frame not in self._session.state.left_out)
 
     def _leave(self, frame: int, left: bool) -> None:
         self._tell(lambda: self._session.leave_out(frame, left))
@@ -248,23 +242,17 @@ class SourcePage:
         self._tell(lambda: self._jobs.start(name))
 
     def _save(self) -> None:
-        def write() -> None:
-            ui.notify(f"saved to {self._session.save()}", type="positive")
-
-        self._tell(write)
+        ui.notify(f"saved to {self._session.save()}", type="positive")
 
     def _copy(self, form: str) -> None:
-        def copy() -> None:
-            text = self._session.export(form)
-            ui.clipboard.write(text)
-            self._copied.clear()
-            with self._copied, ui.card().classes("card"):
-                ui.label(f"{FORMATS[form]}: copied").classes("font-semibold")
-                ui.code(text).classes("w-full").style("max-width: 85vw")
-                ui.button("Close", on_click=self._copied.close).props("flat dense no-caps")
-            self._copied.open()
-
-        self._tell(copy)
+        text = self._session.export(form)
+        ui.clipboard.write(text)
+        self._copied.clear()
+        with self._copied, ui.card().classes("card"):
+            ui.label(f"{FORMATS[form]}: copied").classes("font-semibold")
+            ui.code(text).classes("w-full").style("max-width: 85vw")
+            ui.button("Close", on_click=self._copied.close).props("flat dense no-caps")
+        self._copied.open()
 
     def _chosen(self, tab: str) -> None:
         self._tab = tab
@@ -298,7 +286,7 @@ class SourcePage:
 
     def _rendered(self, frame: int, state: Any, look: Look) -> bytes:
         picture = self._session.picture_by(frame, look.coloring)
-        return picture.jpeg(self._session.shown_at(frame, state), self._session.start, look)
+        return encoded(picture.draw(self._session.shown_at(frame, state), self._session.start, look))
 
     async def _tick(self) -> None:
         loop = asyncio.get_running_loop()
@@ -318,12 +306,12 @@ class SourcePage:
 
     async def _catch_up(self) -> None:
         """Show the part that is looked at anew, if it is not up to date."""
-        parts: dict[str, Panel] = {"numbers": self._numbers, "frames": self._sheet, "scene": self._scene}
         if not self._stale.get(self._tab, False):
             return
         self._stale[self._tab] = False
+        parts = {"numbers": self._numbers.show, "frames": self._sheet.show, "scene": self._scene.show}
         try:
-            await parts[self._tab].show(self._session.state, self._frame, self._view.look)
+            await parts[self._tab](self._session.state, self._frame, self._view.look)
         except CalibrationError as error:
             ui.notify(str(error), type="warning")
 
@@ -358,12 +346,3 @@ def _shown(key: str) -> str:
     for name, hint in HINTS.items():
         key = key.replace(name, hint)
     return key
-
-
-def page_of(session: Session, jobs: SessionJobs, pictures: Pictures) -> Callable[[], None]:
-    """The page, to be served."""
-
-    def page() -> None:
-        SourcePage(session, jobs, pictures).build()
-
-    return page

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 
 from nicegui import events, ui
 
@@ -59,14 +58,6 @@ def apply() -> ui.dark_mode:
     ui.add_css(STYLE)
     ui.add_head_html(KEYS_AFTER_CLICK + HEIGHT_OF_BAR)
     return ui.dark_mode(None)
-
-
-@contextmanager
-def bar(title: str) -> Iterator[None]:
-    """The bar at the top, which wraps on a narrow screen."""
-    with ui.header(elevated=False).classes("bar items-center gap-1 px-2 py-1 wrap"):
-        ui.label(title).classes("text-base font-semibold ellipsis").style("max-width: 45vw")
-        yield
 
 
 def icon_button(icon: str, hint: str, on_click: object, key: str = "") -> ui.button:

@@ -14,10 +14,10 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig
 from calib_ros.datasets import open_dataset
 from calib_ros_check.cameras import camera_guesses, turned_over
-from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
+from calib_ros_check.evidence import Candidate
 from calib_ros_check.outcome import Cause, CauseState, CheckVerdict
-from calib_ros_check.sensors import LensChange, moved_deg, moves_by, scaled
+from calib_ros_check.sensors import LensChange, moved_deg, moves_by
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 
@@ -38,15 +38,13 @@ def checked(frames, camera, truth, config=None):
     return Checker(camera, config).check([replace(frame, camera=camera) for frame in frames], truth)
 
 
+def halved(camera):
+    """With the intrinsics of an image of half the size."""
+    return replace(camera, K=camera.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]]))
+
+
 def fitted(lens, deviations, tried=1):
-    return Candidate(lens, np.eye(4), None, 0.0, 0.5 * deviations**2, 0.2, tried)
-
-
-def test_a_camera_of_another_size_sees_what_scaled_intrinsics_see():
-    camera = Camera(np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]]), 640, 240)
-    lens = scaled(camera, 2.0)
-    assert lens.focal == 1.0
-    np.testing.assert_allclose([lens.u * camera.width, lens.v * camera.width], [330, 120])
+    return Candidate(None, np.eye(4), lens, 0.0, 0.5 * deviations**2, 0.2, tried)
 
 
 @pytest.mark.parametrize(("gain", "tried", "found"), [(3.0, 1, True), (3.0, 32, False), (3.6, 32, True), (2.2, 1, False)])
@@ -92,9 +90,7 @@ def test_guesses_about_cameras_with_and_without_a_distortion():
 
 def test_intrinsics_of_half_the_image_size_are_named_with_the_factor(drive):
     frames, truth = drive
-    camera = frames[0].camera
-    half = replace(camera, K=camera.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]]))
-    result = checked(frames, half, truth, Config(search=SearchConfig(rounds=1, starts=64)))
+    result = checked(frames, halved(frames[0].camera), truth, Config(search=SearchConfig(rounds=1, starts=64)))
     assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 
@@ -113,7 +109,7 @@ def test_a_distorted_camera_of_another_size_is_named(drive):
     at = cv2.undistortPoints(grid, lens.K, lens.D, P=lens.K).reshape(lens.height, lens.width, 2).astype(np.float32)
     pictures = [replace(frame, image=cv2.remap(frame.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)) for frame in frames]
     assert checked(pictures, lens, truth).verdict is CheckVerdict.PASS
-    result = checked(pictures, replace(lens, K=lens.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]])), truth)
+    result = checked(pictures, halved(lens), truth)
     assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 

@@ -10,7 +10,7 @@ from calib_ros import se3
 from calib_ros_check.checker import Checker
 from calib_ros_check.evidence import (
     EVEN,
-    GivenMatch,
+    Match,
     _nearest_within,
     convinces,
     freedom,
@@ -48,7 +48,7 @@ def test_the_rarer_an_explanation_the_more_it_has_to_say():
 def test_a_match_convinces_against_a_decoy_and_not_against_itself(drive, score_of):
     T = drive.reference
     score = score_of((0, 2), T)
-    right, mirrored = GivenMatch(score, T), GivenMatch(score.mirrored(), T)
+    right, mirrored = Match(score, T), Match(score.mirrored(), T)
     assert convinces(log_odds(right, mirrored), rare_odds(35))
     assert log_odds(mirrored, right) < 0
     assert log_odds(right, right) == 0.0
@@ -67,7 +67,7 @@ def test_one_scene_seen_four_times_tells_its_noise_as_badly_as_once(drive, score
 def test_an_extrinsic_is_off_where_nothing_within_the_tolerance_matches_as_well(drive, score_of, deg, off):
     T = drive.reference
     checked = se3.perturb(T, [0, deg, 0], [0, 0, 0])
-    assert is_off(GivenMatch(score_of((0, 2), T), T), SHARP, checked, Tolerance()) is off
+    assert is_off(Match(score_of((0, 2), T), T), SHARP, checked, Tolerance()) is off
 
 
 def test_the_nearest_within_a_tolerance_follows_what_the_scenes_do_not_tell():

@@ -19,22 +19,20 @@ from calib_ros.frame import PointCloud
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
-from calib_ros_check.alternatives import FEW_FRAMES, NEAR, CheckInputs
+from calib_ros_check.alternatives import FEW_FRAMES, NEAR, CheckInputs, Looks
 from calib_ros_check.cameras import camera_guesses
-from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
+from calib_ros_check.evidence import Candidate
 from calib_ros_check.hypotheses import axis_rotations, distinct_poses, hypotheses, says_more_than
-from calib_ros_check.looks import Looks
 from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
-from calib_ros_check.recording import CheckOptions, check_source
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 
 
-def camera(width, height, cx, cy):
-    return Camera(np.array([[500.0, 0, cx], [0, 500.0, cy], [0, 0, 1]]), width, height)
+def camera(width, height, cx, cy, focal=500.0):
+    return Camera(np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), width, height)
 
 
 @pytest.fixture(scope="module")
@@ -137,31 +135,27 @@ def test_what_edges_find_far_away_needs_no_classes(drive, quick, monkeypatch):
     features = [quick._calibrator.extract(frame) for frame in frames]
     asked: list[str] = []
     checked = se3.perturb(truth, [0, 16.0, 6.0], [0, 0, 0])
-    result = quick.check_features(features, checked, classified=lambda numbers: asked.append("classes") or features)
+    asked_for = CheckInputs(checked, Tolerance(), lambda numbers: asked.append("classes") or features)
+    result = quick.check_features(features, asked_for)
     assert result.verdict is CheckVerdict.FAIL, result.reason
     assert result.rotation.error == pytest.approx(np.hypot(16, 6), abs=0.3)
     assert not asked
 
 
 @pytest.mark.parametrize(
-    ("wrong", "cause"),
+    ("wrong", "flip", "cause"),
     [
-        (lambda T: se3.inverse(T), Cause.INVERSE_TRANSFORM),
-        (lambda T: se3.inverse(BODY) @ T, Cause.BODY_FRAME),
-        (lambda T: T @ se3.from_parts(axis_rotations()[0], np.zeros(3)), Cause.CLOUD_FRAME),
+        (lambda T: se3.inverse(T), (), Cause.INVERSE_TRANSFORM),
+        (lambda T: se3.inverse(BODY) @ T, (), Cause.BODY_FRAME),
+        (lambda T: T @ se3.from_parts(axis_rotations()[0], np.zeros(3)), (), Cause.CLOUD_FRAME),
+        (lambda T: T, (1,), Cause.MIRRORED_IMAGE),
+        (lambda T: T, (0, 1), Cause.ROTATED_IMAGE),
     ],
 )
-def test_transforms_that_were_mixed_up_are_named(drive, checker, wrong, cause):
+def test_transforms_and_pictures_that_were_mixed_up_are_named(drive, checker, quick, wrong, flip, cause):
     frames, truth = drive
-    result = checker.check(frames, wrong(truth))
-    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, cause), result.reason
-
-
-@pytest.mark.parametrize(("flip", "cause"), [((1,), Cause.MIRRORED_IMAGE), ((0, 1), Cause.ROTATED_IMAGE)])
-def test_pictures_that_are_mirrored_or_turned_are_named(drive, quick, flip, cause):
-    frames, truth = drive
-    wrong = [replace(frame, image=np.ascontiguousarray(np.flip(frame.image, flip))) for frame in frames]
-    result = quick.check(wrong, truth)
+    pictures = [replace(frame, image=np.ascontiguousarray(np.flip(frame.image, flip))) for frame in frames]
+    result = (quick if flip else checker).check(pictures, wrong(truth))
     assert (result.verdict, result.cause) == (CheckVerdict.FAIL, cause), result.reason
 
 
@@ -193,8 +187,10 @@ def test_a_mount_that_is_far_off_is_no_cloud_in_the_body_frame(drive, quick):
     assert quick.check(moved, checked).cause is Cause.CLOUD_FRAME
 
 
-def test_pictures_of_elsewhere_are_inconclusive(drive, quick):
+def test_pictures_of_elsewhere_are_inconclusive_and_none_are_bad_input(drive, quick):
     frames, truth = drive
+    with pytest.raises(BadInputError, match="no frames"):
+        quick.check([], truth)
     noise = np.random.default_rng(0).integers(0, 255, frames[0].image.shape, dtype=np.uint8)
     result = quick.check([replace(frames[0], image=noise)], truth)
     assert result.verdict is CheckVerdict.INCONCLUSIVE
@@ -224,7 +220,7 @@ def test_where_nothing_matches_the_effort_is_bounded(made, quick, monkeypatch):
         monkeypatch.setattr(
             calibrator, "estimate", lambda *given, estimate=estimate: searches.append(given[2]) or estimate(*given)
         )
-    result = checker.check_features(features, made.reference, as_taken=as_taken)
+    result = checker.check_features(features, CheckInputs(made.reference, Tolerance(), as_taken=as_taken))
     assert result.verdict is CheckVerdict.INCONCLUSIVE, result.reason
     assert len(searches) == 3
     assert sum(count > FEW_FRAMES for count in taken) <= 2
@@ -253,7 +249,7 @@ def test_a_mix_up_under_which_the_scene_is_symmetric_is_not_named(symmetric, qui
 def test_a_camera_model_that_a_guess_makes_impossible_is_left_out():
     """The lens of an image four times the size cannot be rectified: its focal length would be negative."""
     D = np.array([-0.37013, 0.164153, -0.000204, -0.000744, -0.038527])
-    barrel = Camera(np.array([[332.77, 0, 303.2], [0, 333.6, 175.3], [0, 0, 1]]), 640, 360, D=D)
+    barrel = replace(camera(640, 360, 303.2, 175.3, 333.0), D=D)
     checker = Checker(barrel)
     asked: list[str] = []
 
@@ -296,28 +292,18 @@ def test_a_mix_up_that_leads_back_to_the_extrinsic_says_nothing_that_an_error_of
     twice = next(own for own in made if "applied twice; leave one out, and invert" in own.message)
     assert se3.rotation_error_deg(T, twice.T) < 10, "a camera that looks ahead"
     for optimum, says in ((T, False), (se3.perturb(T, [0.3, 0, 0], [0, 0, 0.5]), False), (twice.T, True)):
-        assert says_more_than(Candidate(twice, optimum, None, 12.0), T) is says  # type: ignore[arg-type]
+        assert says_more_than(Candidate(None, optimum, twice, 12.0), T) is says  # type: ignore[arg-type]
     mirrored = next(own for own in made if own.mirrored)
-    assert says_more_than(Candidate(mirrored, T, None, 12.0), T)  # type: ignore[arg-type]
+    assert says_more_than(Candidate(None, T, mirrored, 12.0), T)  # type: ignore[arg-type]
 
 
 def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
     """Maps of its own for each of them would take gigabytes."""
     frames, truth = drive
     features = [checker._calibrator.extract(frame) for frame in frames]
-    tried = checker._alternatives._tried(features, hypotheses(truth, camera(640, 240, 320.0, 120.0)), None)
+    tried = checker._alternatives.hypotheses(features, CheckInputs(truth, Tolerance()))
     assert len({own.hypothesis.cause for own in tried}) > 2
     assert len({id(own.score.atlas.levels[-1].image) for own in tried}) == 1
-
-
-def test_no_frames_are_bad_input(checker):
-    with pytest.raises(BadInputError, match="no frames"):
-        checker.check([], np.eye(4))
-
-
-def test_a_source_without_the_extrinsic_says_how_to_give_one():
-    with pytest.raises(BadInputError, match="is no bag"):
-        check_source(SOURCE, CheckOptions(extrinsic="tf"))
 
 
 def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
@@ -333,6 +319,7 @@ def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--extrinsic", "tf"], "is no bag"),
         (["--tolerance-deg", "0"], "the tolerance of the rotation, 0 deg, is out of range"),
         (["--frames", "9"], "outside 0..3"),
         (["--extrinsic", "missing.json"], "missing.json"),

@@ -14,10 +14,7 @@ from calib_ros_check.jobs.journal import Journal
 from calib_ros_evaluation.experiments.job import job
 
 ABOUT = {"version": "1"}
-
-
-def lines(folder: Path) -> int:
-    return (folder / "results.jsonl").read_bytes().count(b"\n")
+FOREIGN = (b"someone else's\n", b'{"my": "data"}', b'{"my": 1}\n{"half a li', b'{"about":{},"by":"fleet check"}\n')
 
 
 def test_journal_round_trip(tmp_path: Path) -> None:
@@ -33,13 +30,8 @@ def test_journal_round_trip(tmp_path: Path) -> None:
         assert journal.notes == []
     entries = [json.loads(line) for line in (tmp_path / "new/folder/results.jsonl").read_text().splitlines()]
     assert entries[0] == {"about": ABOUT, "by": "evaluation"}
-    assert entries[1]["job"] == {
-        "experiment": "pair",
-        "method": "edges",
-        "scene": "street",
-        "frames": [0],
-        "options": [["seed", 1]],
-    }
+    named = {"experiment": "pair", "method": "edges", "scene": "street", "frames": [0], "options": [["seed", 1]]}
+    assert entries[1]["job"] == named
 
 
 def filled(folder: Path) -> list[bytes]:
@@ -73,7 +65,7 @@ def test_a_damaged_line_costs_its_job_only(tmp_path: Path, damage: bytes) -> Non
         assert "line 3 is damaged" in journal.notes[0]
 
 
-@pytest.mark.parametrize("start", [b"", b'{"about": {"ver'])
+@pytest.mark.parametrize("start", [b"", b'{"abou', b'{"about": {"ver'])
 def test_a_journal_killed_at_its_first_line_begins_anew(tmp_path: Path, start: bytes) -> None:
     (tmp_path / "results.jsonl").write_bytes(start)
     filled(tmp_path)
@@ -101,45 +93,26 @@ def test_other_evaluation_names_the_difference(tmp_path: Path, before: dict, now
     Journal(tmp_path, now).close()
 
 
-@pytest.mark.parametrize("fresh", [False, True])
-@pytest.mark.parametrize("theirs", [b"someone else's\n", b'{"my": "data"}', b'{"my": 1}\n{"half a li', b'{"abou'])
-def test_foreign_file_is_not_overwritten(tmp_path: Path, theirs: bytes, fresh: bool) -> None:
+@pytest.mark.parametrize(
+    ("theirs", "fresh", "words"),
+    [
+        *((theirs, fresh, "was not written by an evaluation") for fresh in (False, True) for theirs in FOREIGN),
+        (b'{"about":{"a"\n', False, "line 1 is damaged"),
+    ],
+)
+def test_a_file_that_is_no_journal_of_this_command_is_refused_and_kept(
+    tmp_path: Path, theirs: bytes, fresh: bool, words: str
+) -> None:
     (tmp_path / "results.jsonl").write_bytes(theirs)
-    if theirs == b'{"abou':  # a journal that was killed at its first word
-        Journal(tmp_path, ABOUT, fresh).close()
-        assert lines(tmp_path) == 1
-        return
-    with pytest.raises(BadInputError, match="was not written by an evaluation"):
+    with pytest.raises(BadInputError, match=f"{words}; choose another --out"):
         Journal(tmp_path, ABOUT, fresh)
     assert (tmp_path / "results.jsonl").read_bytes() == theirs
 
 
-@pytest.mark.parametrize("fresh", [False, True])
-def test_the_journal_of_another_command_is_not_emptied(tmp_path: Path, fresh: bool) -> None:
-    Journal(tmp_path, ABOUT, what="fleet check").close()
-    before = (tmp_path / "results.jsonl").read_bytes()
-    with pytest.raises(BadInputError, match="was not written by an evaluation; choose another --out"):
-        Journal(tmp_path, ABOUT, fresh)
-    assert (tmp_path / "results.jsonl").read_bytes() == before
-
-
-def test_a_damaged_first_line_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "results.jsonl").write_bytes(b'{"about":{"a"\n')
-    with pytest.raises(BadInputError, match="line 1 is damaged"):
-        Journal(tmp_path, ABOUT)
-    assert (tmp_path / "results.jsonl").read_bytes() == b'{"about":{"a"\n'
-
-
-def test_two_evaluations_cannot_share_a_folder(tmp_path: Path) -> None:
-    with Journal(tmp_path, ABOUT), pytest.raises(BadInputError, match="another evaluation is writing"):
+def test_two_evaluations_cannot_share_a_folder_and_some_are_impossible(tmp_path: Path) -> None:
+    with Journal(tmp_path, ABOUT) as journal, pytest.raises(BadInputError, match="another evaluation is writing"):
         Journal(tmp_path, ABOUT, fresh=True)
-    with Journal(tmp_path, ABOUT):
-        assert lines(tmp_path) == 1
-
-
-def test_impossible_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(BadInputError, match="cannot write"):
-        Journal(tmp_path / "file", ABOUT)
-    with pytest.raises(BadInputError, match="cannot write"):
-        Journal(Path("/proc/none"), ABOUT)
+    assert journal.path.read_bytes().count(b"\n") == 1
+    for impossible in (journal.path, Path("/proc/none")):
+        with pytest.raises(BadInputError, match="cannot write"):
+            Journal(impossible, ABOUT)

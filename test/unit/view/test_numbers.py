@@ -24,14 +24,19 @@ def truth(street):
     return street[0].reference
 
 
+def peaks(numbers):
+    """Offset (6,) at which each curve is highest, deg and cm."""
+    return numbers.offsets[np.arange(6), np.argmax(numbers.curves, axis=1)]
+
+
 def test_curves_are_highest_at_the_right_extrinsic(scores, truth):
     numbers = scores.at(truth)
-    assert np.abs(numbers.peaks[:3]).max() <= 0.1
-    assert np.abs(numbers.peaks[3:]).max() <= 6.0
+    assert np.abs(peaks(numbers)[:3]).max() <= 0.1
+    assert np.abs(peaks(numbers)[3:]).max() <= 6.0
     assert numbers.curves[:, 20] == pytest.approx(numbers.score)
     assert np.isfinite(numbers.frame_scores).all()
     turned = scores.at(se3.exp(np.r_[0, np.deg2rad(1.0), 0, 0, 0, 0]) @ truth)  # its curve tells which way to go
-    assert turned.peaks[1] == pytest.approx(-1.0, abs=0.15)
+    assert peaks(turned)[1] == pytest.approx(-1.0, abs=0.15)
     assert turned.score < numbers.score
 
 

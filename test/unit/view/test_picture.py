@@ -9,9 +9,9 @@ import pytest
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.lidar.edges import EdgeKind
+from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.initial_guess import nominal
-from calib_ros_view.session.picture import COLORINGS, GAP, KIND_COLORS, FramePicture, Look
+from calib_ros_view.session.picture import COLORINGS, GAP, KIND_COLORS, FramePicture, Look, encoded
 
 CAMERA = Camera(np.array([[100.0, 0, 100], [0, 100.0, 50], [0, 0, 1]]), 200, 100)
 GRAY = np.full((100, 200, 3), 100, np.uint8)
@@ -33,7 +33,7 @@ def test_points_lie_where_the_camera_sees_them():
     assert drawn(FramePicture(frame((10, 0, 0))).draw(nominal(), None, OPAQUE)) == {(50, 100)}
     assert drawn(FramePicture(frame((10, 2, 1))).draw(nominal(), None, OPAQUE)) == {(40, 80)}
     assert not drawn(FramePicture(frame((-10, 0, 0), (10, 50, 0), (np.nan, 0, 0))).draw(nominal(), None, OPAQUE))
-    jpeg = FramePicture(frame((10, 0, 0))).jpeg(nominal(), None, OPAQUE)
+    jpeg = encoded(FramePicture(frame((10, 0, 0))).draw(nominal(), None, OPAQUE))
     assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (100, 200, 3)
 
 
@@ -63,8 +63,7 @@ def test_colours_follow_what_is_chosen():
     points = [(10, 3, 0), (10, -3, 0)]
     own = FramePicture(
         frame(*points, intensity=np.float32([0, 1]), ring=np.int32([3, 4]), label=np.uint8([1, 5])),
-        np.float32([[10, 0, 0]]),
-        np.array([EdgeKind.REFLECTIVITY]),
+        EdgePoints(np.float32([[10, 0, 0]]), np.ones(1, np.float32), np.array([EdgeKind.REFLECTIVITY], np.uint8)),
     )
     seen = {}
     for name in COLORINGS:

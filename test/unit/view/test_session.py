@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from waiting import until
 
-from calib_ros import result, se3
+from calib_ros import Config, result, se3
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros_check.outcome import CheckVerdict
@@ -25,12 +25,11 @@ def session(drive, street, tmp_path):
     return Session(street[:5], drive, start, out=tmp_path / "extrinsic.json")
 
 
-def finished(jobs, seconds=60):
-    deadline = time.monotonic() + seconds
-    while jobs.busy:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    return jobs.current
+def finished(session, name):
+    """The job, at its end."""
+    job = SessionJobs(session).start(name)
+    until(lambda: not job.running, name)
+    return job
 
 
 def test_moves_are_undone_and_done_again(session):
@@ -102,8 +101,7 @@ def test_what_was_set_by_hand_is_saved_as_such(session):
 
 
 def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
-    jobs = SessionJobs(session)
-    job = jobs.start(REFINE) and finished(jobs)
+    job = finished(session, REFINE)
     assert (job.failed, session.state.what) == (False, "refined"), job.message
     deg, m = session.error()
     assert deg < 0.15
@@ -114,14 +112,9 @@ def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
     session.undo()
     assert job.title(session.state) == "earlier refine"
     assert session.error()[0] > 0.3
-
-
-def test_what_is_left_out_and_the_time_offset_count_in_an_estimate(session, drive):
     session.leave_out(0, True)
     session.leave_out(1, True)
-    jobs = SessionJobs(session)
-    jobs.start(REFINE)
-    finished(jobs)
+    finished(session, REFINE)
     assert session.result().frames_used == 3
 
 
@@ -134,7 +127,7 @@ def test_work_is_stopped_and_one_at_a_time(session):
     with pytest.raises(BadInputError, match="already"):
         jobs.start(REFINE)
     jobs.stop()
-    finished(jobs)
+    until(lambda: not jobs.busy, "the end")
     assert (job.failed, job.message) == (False, "stopped; nothing has changed")
     assert session.state is before
     jobs.start(REFINE)
@@ -143,22 +136,17 @@ def test_work_is_stopped_and_one_at_a_time(session):
 
 
 def test_check_tells_a_verdict(session):
-    jobs = SessionJobs(session)
     session.move_to([0, 2.0, 0, 0, 0, 0])
-    jobs.start(CHECK)
-    job = finished(jobs)
-    assert job.check.verdict is CheckVerdict.FAIL
-    assert job.title(session.state) == "check"
+    job = finished(session, CHECK)
+    assert (job.check.verdict, job.title(session.state)) == (CheckVerdict.FAIL, "check")
     session.move_to([0, 1.0, 0, 0, 0, 0])
     assert job.title(session.state) == "earlier check"
 
 
 def test_a_refused_estimate_changes_nothing_and_says_why(session):
     session.move_to([20.0, 25.0, 0, 0, 0, 0])
-    jobs = SessionJobs(session)
     before = session.state
-    jobs.start(REFINE)
-    job = finished(jobs)
+    job = finished(session, REFINE)
     assert job.failed
     assert job.message
     assert session.state is before
@@ -166,22 +154,10 @@ def test_a_refused_estimate_changes_nothing_and_says_why(session):
 
 def test_plots_are_made_of_numbers_only(session):
     state = session.state
-    numbers, known = session.scores.at(state.T), session.scores.known(state.T)
-    assert curve_plots(numbers).count("<svg") == 6
-    assert ellipse_plots(known).count("<polygon") == 3
+    curves, ellipses = curve_plots(session.scores.at(state.T)), ellipse_plots(session.scores.known(state.T))
     bars = frame_bars(np.array([0.2, np.nan, -0.1]), 1)
-    assert bars.count("<rect") == 3
-    assert "nan" not in curve_plots(numbers) + ellipse_plots(known) + bars
-
-
-def test_points_without_classes_say_what_is_missing(drive, street):
-    from calib_ros import Config
-
-    plain = Config.from_dict({"semantics": {"segmentation": "none", "image_classes": "", "cloud_classes": ""}})
-    own = Session(street[:1], drive, drive.reference, plain)
-    if own.picture(0).missing("class"):
-        with pytest.raises(BadInputError, match="no classes"):
-            own.classified(0)
+    assert (curves.count("<svg"), ellipses.count("<polygon"), bars.count("<rect")) == (6, 3, 3)
+    assert "nan" not in curves + ellipses + bars
 
 
 def test_points_that_lack_a_field_are_not_coloured_by_it(drive, street):
@@ -192,3 +168,6 @@ def test_points_that_lack_a_field_are_not_coloured_by_it(drive, street):
             own.picture_by(0, coloring)
     assert own.picture_by(0, "depth") is own.picture_by(0, "edge kind") is own.picture(0)
     assert Session(street[:1], drive, drive.reference).picture_by(0, "reflectivity").missing("reflectivity") == ""
+    plain = Config.from_dict({"semantics": {"segmentation": "none", "image_classes": "", "cloud_classes": ""}})
+    with pytest.raises(BadInputError, match="no classes"):
+        Session(bare, drive, drive.reference, plain).classified(0)

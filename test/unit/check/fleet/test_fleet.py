@@ -14,8 +14,8 @@ from calib_ros.config import Config, update
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros_check.fleet import fleet as module
-from calib_ros_check.fleet.fleet import Fleet, FleetOptions, check_fleet
-from calib_ros_check.fleet.jobs import CheckJob, Usage, options_key, run_checks
+from calib_ros_check.fleet.fleet import FleetOptions, check_fleet
+from calib_ros_check.fleet.jobs import CheckJob, options_key, run_checks
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.recording import CheckOptions
 from calib_ros_semantics.models.weight_sets import of_package
@@ -53,7 +53,6 @@ def test_bad_recordings_are_rows(bad: Path) -> None:
     assert all(path.stat().st_size for path in fleet.files)
     (page,) = (path for path in fleet.files if path.name == "fleet.html")
     assert "3 recordings of 0 vehicles" in page.read_text()
-    assert Fleet([], [], []).exit_code == 2  # nothing passes
 
 
 def test_a_recording_that_changed_and_other_options_are_checked_again(bad: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +100,7 @@ def test_a_recording_that_ends_its_workers_is_a_row_and_is_tried_again(bad: Path
     with monkeypatch.context() as patch:
         patch.setattr(module, "run_checks", deadly)
         messages = {row.recording: row.message for row in check_fleet(options(bad, workers=2)).rows}
-    assert "did not end: its worker ended twice, exit status 9" in messages["garbage.mcap"]
+    assert "did not end: its worker ended with exit status 9, also alone" in messages["garbage.mcap"]
     assert "found nothing" in messages["empty"]
     monkeypatch.setattr(module, "lost", None)  # so that the one worker is this process
     assert "cannot be read" in {row.recording: row.message for row in check_fleet(options(bad)).rows}["garbage.mcap"]
@@ -113,16 +112,6 @@ def test_a_recording_that_is_gone_is_blamed_on_the_machine(tmp_path: Path) -> No
     assert answer["from"] == "other"
     (answer,) = run_checks(CheckOptions(), [CheckJob(str(tmp_path / "gone"), "", "o")])
     assert "does not exist" in answer["error"]
-
-
-def test_usage_counts_bytes_processor_and_memory(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(bytes(3_000_000))
-    usage = Usage()
-    data = (tmp_path / "file").read_bytes() + bytes(50_000_000)
-    used = usage.since()
-    assert 3_000_000 <= used["bytes_read"] < 3_200_000
-    assert used["peak_bytes"] > len(data)
-    assert used["cpu_s"] < 5
 
 
 def test_a_folder_of_recordings_from_the_command_line(drive, street_bag: Path, bad: Path, capsys) -> None:

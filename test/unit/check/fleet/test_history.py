@@ -13,13 +13,11 @@ from fleets import broken, checked, moved
 
 from calib_ros.errors import MissingDependencyError
 from calib_ros_check.fleet.cli import summary
-from calib_ros_check.fleet.fleet import Fleet
+from calib_ros_check.fleet.fleet import Fleet, FleetOptions
 from calib_ros_check.fleet.history import vehicles
 from calib_ros_check.fleet.page import MOST_ROWS, change_size, write_page
 from calib_ros_check.fleet.plot import plots
-from calib_ros_check.fleet.rows import COLUMNS, Row, row_of, utc
-from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
-from calib_ros_check.recording import CheckOptions
+from calib_ros_check.fleet.rows import COLUMNS, Row, row_of, utc, write_changes, write_csv, write_parquet
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +66,11 @@ def test_rows_say_drift_changes_and_outliers(fleet: Fleet) -> None:
     assert fleet.counts["error"] == 2
 
 
-def test_exit_codes(fleet: Fleet) -> None:
-    def code(*verdicts: str) -> int:
-        return Fleet([Row("r", "v", "", verdict) for verdict in verdicts], [], np.zeros(6)).exit_code
-
-    assert fleet.exit_code == 1
-    assert (code("pass"), code("pass", "fail", "inconclusive", "error"), code("pass", "inconclusive")) == (0, 1, 3)
-    assert (code("error", "error"), code("pass", "error")) == (2, 3)
+def test_exit_codes() -> None:
+    codes = {"pass": 0, "pass fail inconclusive error": 1, "pass inconclusive": 3, "error error": 2, "pass error": 3, "": 2}
+    for verdicts, code in codes.items():
+        rows = [Row("r", "v", "", verdict) for verdict in verdicts.split()]
+        assert Fleet(rows, [], np.zeros(6)).exit_code == code, verdicts
 
 
 def test_what_is_printed(fleet: Fleet) -> None:
@@ -114,22 +110,17 @@ def test_tables(fleet: Fleet, tmp_path: Path) -> None:
     assert float(changes[0]["ty_m_sigma"]) < 0.02
 
 
-def test_parquet_has_types(fleet: Fleet, tmp_path: Path) -> None:
+def test_parquet_has_types_and_without_pyarrow_says_what_to_install(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     write_parquet(tmp_path / "fleet.parquet", fleet.rows)
     table = parquet.read_table(tmp_path / "fleet.parquet")
     assert tuple(table.column_names) == COLUMNS
-    assert [str(table.schema.field(name).type) for name in ("time_ns", "rx_deg", "changed", "cause")] == [
-        "int64",
-        "double",
-        "bool",
-        "string",
-    ]
-    assert table.to_pylist()[0]["rotation_deg"] == fleet.rows[0].errors["rotation_deg"]
-    assert table.to_pylist()[-1]["rotation_deg"] is None
-
-
-def test_without_pyarrow_the_note_says_what_to_install(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = {"time_ns": "int64", "rx_deg": "double", "changed": "bool", "cause": "string"}
+    assert {name: str(table.schema.field(name).type) for name in kinds} == kinds
+    read = table.to_pylist()
+    assert (read[0]["rotation_deg"], read[-1]["rotation_deg"]) == (fleet.rows[0].errors["rotation_deg"], None)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingDependencyError, match="pip install pyarrow"):
         write_parquet(tmp_path / "fleet.parquet", fleet.rows)
@@ -137,7 +128,7 @@ def test_without_pyarrow_the_note_says_what_to_install(fleet: Fleet, tmp_path: P
 
 def page_of(fleet: Fleet, folder: Path) -> str:
     path = folder / "fleet.html"
-    write_page(path, fleet.rows, fleet.vehicles, fleet.scatter, CheckOptions(), {"Command": "check x"}, 0.001)
+    write_page(path, fleet, FleetOptions(["x"], folder), {"Command": "check x"})
     return path.read_text()
 
 

@@ -82,33 +82,27 @@ def test_what_is_named_is_a_recording_whatever_it_is(tmp_path: Path) -> None:
         find_recordings([str(tmp_path / "folder")])
 
 
-def test_links_are_followed_once(tmp_path: Path) -> None:
-    bag(tmp_path / "store/a")
-    (tmp_path / "fleet").mkdir()
-    (tmp_path / "fleet/a").symlink_to(tmp_path / "store/a")
-    (tmp_path / "fleet/loop").symlink_to(tmp_path / "fleet")
-    assert list(found(tmp_path, tmp_path / "fleet")) == ["fleet/a"]
-
-
-def test_a_fingerprint_changes_with_the_files(tmp_path: Path) -> None:
+def test_a_fingerprint_changes_with_the_files_and_links_are_followed_once(tmp_path: Path) -> None:
     path = bag(tmp_path / "fleet/a")
     (first,) = find_recordings([str(tmp_path / "fleet")])
     assert find_recordings([str(tmp_path / "fleet")]) == [first]
     os.utime(path / "a_0.mcap", ns=(5, first.modified_ns + 5))
+    (tmp_path / "linked").mkdir()  # links are followed, each folder once
+    (tmp_path / "linked/a").symlink_to(path)
+    (tmp_path / "linked/loop").symlink_to(tmp_path / "linked")
+    assert list(found(tmp_path, tmp_path / "linked")) == ["linked/a"]
     (second,) = find_recordings([str(tmp_path / "fleet")])
     assert second.fingerprint != first.fingerprint
     assert second.modified_ns == first.modified_ns + 5
 
 
 def test_what_is_a_fleet(tmp_path: Path) -> None:
-    path = bag(tmp_path / "fleet/a")
-    assert not is_fleet([str(path)])
-    assert not is_fleet(["synthetic"])
-    assert not is_fleet([str(tmp_path / "gone")])
-    assert is_fleet([str(tmp_path / "fleet")])
-    assert is_fleet([str(path), "synthetic"])
+    path = str(bag(tmp_path / "fleet/a"))
     (tmp_path / "empty").mkdir()
-    assert not is_fleet([str(tmp_path / "empty")])
+    for one in (path, "synthetic", str(tmp_path / "gone"), str(tmp_path / "empty")):
+        assert not is_fleet([one]), one
+    assert is_fleet([str(tmp_path / "fleet")])
+    assert is_fleet([path, "synthetic"])
 
 
 @pytest.mark.kitti
