@@ -14,8 +14,7 @@ import pytest
 from fuzzing import MessageFuzzer
 from paths import ROOT, SUPPORT
 
-from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros.frame import NANOSECONDS
 
 RUNNER = SUPPORT / "fuzz_runner.py"
 pytestmark = pytest.mark.usefixtures("ros_in_this_process")
@@ -85,7 +84,7 @@ def test_mutated_files_through_the_command_line(count):
 
 @pytest.mark.ros
 @pytest.mark.slow
-def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, capfd: pytest.CaptureFixture[str]) -> None:
+def test_mutated_messages_over_dds(street, drive, capfd):
     """A node with an extrinsic gets some hundred broken messages, keeps it, and then works as before."""
     pytest.importorskip("rclpy", reason="rclpy is not installed")
     from ros_peer import Peer, camera_info_message, cloud_message, start_parameters

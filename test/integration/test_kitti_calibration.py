@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.kitti
 
 
 @pytest.mark.slow
-def test_drive_0005_from_random_starts(kitti_root: Path) -> None:
+def test_drive_0005_from_random_starts(kitti_root):
     """15 frames, starts uniform in 1.5 deg / 0.15 m per axis: at least 9 of 10 within 0.3 deg and 8 cm."""
     source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
     reference = source.reference
@@ -38,7 +37,7 @@ def test_drive_0005_from_random_starts(kitti_root: Path) -> None:
 
 
 @pytest.mark.slow
-def test_odometry_scenes_without_any_initial_extrinsic(kitti_root: Path) -> None:
+def test_odometry_scenes_without_any_initial_extrinsic(kitti_root):
     """From nominal, camera looking ahead and no translation, to KITTI's own calibration."""
     source = open_dataset(kitti_root / "odometry/sequences/00")
     result = Calibrator(source.camera).calibrate([source[i] for i in range(len(source))], nominal(), SearchBox(10.0, 0.5))
@@ -51,7 +50,7 @@ def test_odometry_scenes_without_any_initial_extrinsic(kitti_root: Path) -> None
 
 
 @pytest.mark.slow
-def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root: Path) -> None:
+def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root):
     """Scans paired with images of other scenes must not pass for a calibration."""
     source = open_dataset(kitti_root / "odometry/sequences/00")
     frames = [source[i] for i in range(6)]
@@ -62,7 +61,7 @@ def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root: Path) -> No
     assert not wrong.converged or wrong.score < 0.6 * right.score
 
 
-def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
+def test_density_completion_against_left_out_points(kitti_root):
     """Every fifth projected point held out: half of them are met within 6 cm, nine tenths within 3 m."""
     source = open_dataset(kitti_root / "odometry/sequences/00")
     off = []
@@ -88,7 +87,7 @@ def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dense_edges", ["every_evaluation", "once_per_level"])
-def test_the_thesis_objective_on_three_scenes(kitti_root: Path, dense_edges: str) -> None:
+def test_the_thesis_objective_on_three_scenes(kitti_root, dense_edges):
     source = open_dataset(kitti_root / "odometry/sequences/00")
     config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"dense_edges": dense_edges}})
     start = se3.perturb(source.reference, [0.6, -0.7, 0.5], [0.05, -0.06, 0.08])

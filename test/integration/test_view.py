@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +26,14 @@ PAGES = [
 
 
 @pytest.fixture(scope="module", params=PAGES)
-def page(request: pytest.FixtureRequest) -> Iterator[Page]:
+def page(request):
     """Each kind of page; its process ends well on SIGINT."""
     with Page(*request.param) as made:
         yield made
         made.end()
 
 
-def test_hostile_requests_are_refused_and_no_file_is_read(page: Page) -> None:
+def test_hostile_requests_are_refused_and_no_file_is_read(page):
     """Requests of other pages, under other names, and for files."""
     assert page.get()[0] == 200
     assert page.opened() == page.opened(Origin=f"http://127.0.0.1:{page.port}") == 101
@@ -57,7 +57,7 @@ def test_hostile_requests_are_refused_and_no_file_is_read(page: Page) -> None:
     [pytest.param([SOURCE, "--frames", "0"]), pytest.param(["--node", "/calib_ros"], marks=[pytest.mark.ros, pytest.mark.slow])],
     ids=["source", "node"],
 )
-def test_with_a_token_nothing_is_told_without_it(options: list[str]) -> None:
+def test_with_a_token_nothing_is_told_without_it(options):
     with Page(*options, "--token", "sesame") as page:
         cookie = f"calib_ros_token_{page.port}"
         assert page.url.endswith("?token=sesame")
@@ -72,7 +72,7 @@ def test_with_a_token_nothing_is_told_without_it(options: list[str]) -> None:
         page.end(signal.SIGTERM)
 
 
-def test_bad_requests_get_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_requests_get_one_line(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         for options, named in (
             ([SOURCE, "--port", str(taken.getsockname()[1])], "--port"),
@@ -108,7 +108,7 @@ class Walk:
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory, open_page: Callable[..., Any]) -> Iterator[Walk]:  # noqa: F811
+def walk(tmp_path_factory, open_page):  # noqa: F811
     made = Walk(tmp_path_factory.mktemp("view"), open_page)
     with made.page:
         yield made
@@ -122,7 +122,7 @@ def picture(browser: Any) -> str:
 
 
 @pytest.mark.slow
-def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(walk: Walk) -> None:
+def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(walk):
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
@@ -155,7 +155,7 @@ def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(walk: Walk) ->
 
 
 @pytest.mark.slow
-def test_every_part_of_the_page_on_a_phone_and_all_browsers_see_the_same(walk: Walk) -> None:
+def test_every_part_of_the_page_on_a_phone_and_all_browsers_see_the_same(walk):
     phone, other = walk.open(420, 900), walk.open()
 
     def shows(*words: str) -> None:

@@ -9,9 +9,7 @@ import subprocess
 import sys
 import venv
 import xml.etree.ElementTree as ET
-from email.message import Message
 from email.parser import Parser
-from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
@@ -36,7 +34,7 @@ def run(*command: object, **more: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(tmp_path_factory):
     """Built from a copy, since a build leaves folders behind."""
     folder = tmp_path_factory.mktemp("wheel")
     copy = folder / "calib_ros"
@@ -50,13 +48,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def metadata(wheel: Path) -> Message:
+def metadata(wheel):
     with ZipFile(wheel) as file:
         (name,) = (name for name in file.namelist() if name.endswith("METADATA"))
         return Parser().parsestr(file.read(name).decode())
 
 
-def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel: Path) -> None:
+def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel):
     with ZipFile(wheel) as file:
         names = file.namelist()
     sources = {
@@ -78,7 +76,7 @@ def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel: Path) 
     assert {name for name in names if ".dist-info/" not in name and not name.endswith((".so", ".pyd"))} == sources | shared
 
 
-def test_its_metadata_name_version_requirements_and_extras(metadata: Message) -> None:
+def test_its_metadata_name_version_requirements_and_extras(metadata):
     package = ET.parse(ROOT / "package.xml").getroot()
     assert metadata["Name"] == package.findtext("name") == "calib_ros"
     assert metadata["Version"] == package.findtext("version") == calib_ros.__version__
@@ -91,7 +89,7 @@ def test_its_metadata_name_version_requirements_and_extras(metadata: Message) ->
 
 
 @pytest.mark.timeout(900)  # pip, a calibration and mypy in a fresh environment
-def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel: Path, tmp_path: Path) -> None:
+def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel, tmp_path):
     """Without ROS, onnxruntime and rosbags: what install_requires names is enough."""
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"

@@ -15,7 +15,6 @@ from std_srvs.srv import Trigger
 from vehicle import QUICK, is_right, off
 from waiting import LIMIT_S
 
-from calib_ros.frame import Frame
 from calib_ros.ros.client import result_from_message
 from calib_ros_synthetic.drive import SyntheticDrive
 
@@ -57,7 +56,7 @@ class Calibrated:
 
 
 @pytest.fixture(scope="module")
-def calibrated(ros_in_this_process: None, drive: SyntheticDrive, street: list[Frame]) -> Iterator[Calibrated]:
+def calibrated(ros_in_this_process, drive, street):
     with Peer(**start_parameters(off(drive.reference)), **{**QUICK, "online__mode": "manual"}, initial_from_tf=False) as peer:
         peer.drive(street[:4])
         yield Calibrated(peer)
@@ -71,9 +70,7 @@ def assert_answers(calibrated: Calibrated, drive: SyntheticDrive) -> None:
     assert is_right(drive.reference, result.extrinsic)
 
 
-def test_goals_and_calls_of_the_service_share_one_estimate_with_progress(
-    calibrated: Calibrated, drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_goals_and_calls_of_the_service_share_one_estimate_with_progress(calibrated, drive, monkeypatch):
     peer = calibrated.peer
     service = peer.peer.create_client(Trigger, "/calib_ros/calibrate")
     with calibrated.one_run(monkeypatch) as go_on:
@@ -98,7 +95,7 @@ def test_goals_and_calls_of_the_service_share_one_estimate_with_progress(
     assert_answers(calibrated, drive)
 
 
-def test_cancel_ends_goal_and_search_and_the_node_answers_afterwards(calibrated: Calibrated, drive: SyntheticDrive) -> None:
+def test_cancel_ends_goal_and_search_and_the_node_answers_afterwards(calibrated, drive):
     peer = calibrated.peer
     assert_answers(calibrated, drive)
     before = peer.recalibrator.current
@@ -116,7 +113,7 @@ def test_cancel_ends_goal_and_search_and_the_node_answers_afterwards(calibrated:
     assert_answers(calibrated, drive)
 
 
-def test_a_cancelled_goal_leaves_the_estimate_to_the_others(calibrated: Calibrated, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cancelled_goal_leaves_the_estimate_to_the_others(calibrated, monkeypatch):
     with calibrated.one_run(monkeypatch) as go_on:
         cancelled, other = calibrated.goal(), calibrated.goal()
         calibrated.await_requests(2)
@@ -127,7 +124,7 @@ def test_a_cancelled_goal_leaves_the_estimate_to_the_others(calibrated: Calibrat
         assert status == GoalStatus.STATUS_SUCCEEDED, result.message
 
 
-def test_the_node_answers_others_while_a_goal_is_under_way(calibrated: Calibrated, drive: SyntheticDrive) -> None:
+def test_the_node_answers_others_while_a_goal_is_under_way(calibrated, drive):
     peer = calibrated.peer
     goal = calibrated.goal(starts=MINUTES)
     goal.await_feedback()
@@ -145,7 +142,7 @@ def test_the_node_answers_others_while_a_goal_is_under_way(calibrated: Calibrate
     assert nothing.extrinsic.status == "insufficient"
 
 
-def test_a_goal_before_any_message_says_what_is_missing(ros_in_this_process: None) -> None:
+def test_a_goal_before_any_message_says_what_is_missing(ros_in_this_process):
     with Peer(initial_from_tf=False) as peer:
         status, result = peer.goal().result()
         assert status == GoalStatus.STATUS_ABORTED

@@ -20,10 +20,8 @@ from calib_ros import se3
 from calib_ros.cli.main import main
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
-from calib_ros.frame import Frame
 from calib_ros.result import load
 from calib_ros.ros.conversions import image_message
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 
@@ -36,9 +34,7 @@ def folders(path: Path) -> list[Path]:
     return sorted(path.iterdir())
 
 
-def test_capture_contains_the_received_frames(
-    street: list[Frame], drive: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_capture_contains_the_received_frames(street, drive, tmp_path, capsys):
     off = se3.perturb(drive.reference, [0.4, -0.3, 0.3], [0.02, -0.02, 0.02])
     captures = tmp_path / "made" / "on demand"
     options = {"capture_dir": str(captures), "capture_frames": 5, "search__rotation_deg": 1.5}
@@ -84,7 +80,7 @@ def test_capture_contains_the_received_frames(
     assert se3.translation_error_m(drive.reference, T) < 0.08
 
 
-def test_the_service_says_how_to_enable_it(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_the_service_says_how_to_enable_it(street, drive, tmp_path):
     with Peer(**start(drive.reference)) as peer:
         peer.publish(street[0])
         assert len(peer.calibration.capture) == 0
@@ -101,9 +97,7 @@ def test_the_service_says_how_to_enable_it(street: list[Frame], drive: Synthetic
         assert peer.refusal("capture")
 
 
-def test_a_folder_that_cannot_be_written_is_named_and_nothing_stays(
-    street: list[Frame], drive: SyntheticDrive, tmp_path: Path
-) -> None:
+def test_a_folder_that_cannot_be_written_is_named_and_nothing_stays(street, drive, tmp_path):
     (tmp_path / "file").write_text("")
     with Peer(**start(drive.reference), capture_dir=str(tmp_path / "file"), capture_frames=2) as peer:
         peer.publish(street[0])
@@ -113,7 +107,7 @@ def test_a_folder_that_cannot_be_written_is_named_and_nothing_stays(
         assert len(folders(tmp_path / "good")) == 1
 
 
-def test_compressed_and_rectified_images(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_compressed_and_rectified_images(street, drive, tmp_path):
     """The bag's topic says that the images are rectified, so that the right numbers of CameraInfo count."""
     options = {"capture_dir": str(tmp_path), "capture_frames": 2, "image_transport": "compressed", "image_is_rectified": True}
     with Peer(CompressedImage, **start(drive.reference), **options) as peer:
@@ -131,9 +125,7 @@ def test_compressed_and_rectified_images(street: list[Frame], drive: SyntheticDr
         np.testing.assert_array_equal(source[0].image, frame.image)
 
 
-def test_callbacks_go_on_during_a_capture(
-    street: list[Frame], drive: SyntheticDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_callbacks_go_on_during_a_capture(street, drive, tmp_path, monkeypatch):
     with Peer(**start(drive.reference), capture_dir=str(tmp_path), capture_frames=2) as peer:
         peer.publish(street[0])
         capture, held, threads = peer.calibration.capture, threading.Event(), []
@@ -159,7 +151,7 @@ def test_callbacks_go_on_during_a_capture(
         assert threads == ["calib_capture_0"]
 
 
-def test_node_finishes_a_capture_before_it_ends(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_node_finishes_a_capture_before_it_ends(street, drive, tmp_path):
     with Peer(**start(drive.reference), capture_dir=str(tmp_path), capture_frames=8) as peer:
         peer.drive(street)
         peer.call_async(peer._triggers["capture"], Trigger.Request())

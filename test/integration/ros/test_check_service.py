@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from calib_ros.frame import Frame
 from calib_ros.ros.conversions import matrix_from_transform, transform_message
 from calib_ros_check.node.requests import check_keyframes
 from calib_ros_check.outcome import Cause, CheckVerdict
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 INCONCLUSIVE, PASS, FAIL = Check.Response.INCONCLUSIVE, Check.Response.PASS, Check.Response.FAIL
@@ -64,12 +62,12 @@ def values_of(status: DiagnosticStatus) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def checked(ros_in_this_process: None, drive: SyntheticDrive, street: list[Frame]) -> Iterator[Checked]:
+def checked(ros_in_this_process, drive, street):
     with Peer(**start_parameters(drive.reference), **{**QUICK, "online__mode": "manual"}) as peer:
         yield Checked(peer, street, drive.reference)
 
 
-def test_a_node_without_keyframes_refuses_and_says_what_to_wait_for(checked: Checked) -> None:
+def test_a_node_without_keyframes_refuses_and_says_what_to_wait_for(checked):
     """First of all: the node has seen nothing yet."""
     assert checked.status("none").level == DiagnosticStatus.OK
     answer = checked.check()
@@ -82,7 +80,7 @@ def test_a_node_without_keyframes_refuses_and_says_what_to_wait_for(checked: Che
         checked.peer.publish(checked.vehicle.frame())
 
 
-def test_a_right_extrinsic_passes_and_nothing_changes(checked: Checked) -> None:
+def test_a_right_extrinsic_passes_and_nothing_changes(checked):
     recalibrator = checked.peer.recalibrator
     before, keyframes = recalibrator.current, recalibrator.keyframes_seen
     answer = checked.check()
@@ -109,7 +107,7 @@ def test_a_right_extrinsic_passes_and_nothing_changes(checked: Checked) -> None:
     assert values_of(status)["ry, deg"].endswith("pass")
 
 
-def test_a_wrong_one_of_the_request_fails_with_its_direction_and_size(checked: Checked) -> None:
+def test_a_wrong_one_of_the_request_fails_with_its_direction_and_size(checked):
     wrong = se3.perturb(np.eye(4), [0, 2.0, 0], [0, 0, 0])[:3, :3] @ checked.reference[:3, :3]
     answer = checked.check(se3.from_parts(wrong, checked.reference[:3, 3]), tolerance_deg=1.0, tolerance_m=0.2, max_keyframes=3)
     assert (answer.success, answer.verdict) == (True, FAIL), answer.message
@@ -127,7 +125,7 @@ def test_a_wrong_one_of_the_request_fails_with_its_direction_and_size(checked: C
     assert values_of(status)["tolerance"] == "1 deg, 0.2 m"
 
 
-def test_a_cause_is_named_while_the_node_goes_on(checked: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cause_is_named_while_the_node_goes_on(checked, monkeypatch):
     """The transform the wrong way round: pairs, heartbeat and answers go on meanwhile."""
     peer, go_on = checked.peer, threading.Event()
 
@@ -174,13 +172,13 @@ def test_a_cause_is_named_while_the_node_goes_on(checked: Checked, monkeypatch: 
         ({"extrinsic": Transform(translation=Vector3(x=1.0))}, "extrinsic_given is false"),
     ],
 )
-def test_absurd_requests_are_refused_clearly(checked: Checked, fields: dict[str, Any], text: str) -> None:
+def test_absurd_requests_are_refused_clearly(checked, fields, text):
     answer = checked.check(**fields)
     assert not answer.success
     assert text in answer.message
 
 
-def test_callers_that_ask_together_or_disappear_do_no_harm(checked: Checked) -> None:
+def test_callers_that_ask_together_or_disappear_do_no_harm(checked):
     """Two clients ask for the same, one of them is gone before the answer; a deactivated node refuses the rest."""
     peer = checked.peer
     gone = peer.peer.create_client(Check, "/calib_ros/check")
@@ -194,7 +192,7 @@ def test_callers_that_ask_together_or_disappear_do_no_harm(checked: Checked) -> 
     assert checked.check(max_keyframes=1).success
 
 
-def test_a_node_that_stops_answers_and_ends(checked: Checked) -> None:
+def test_a_node_that_stops_answers_and_ends(checked):
     """Last of all: the node is gone afterwards."""
     peer, answers = checked.peer, []
     under_way = checked.ask(se3.inverse(checked.reference))
@@ -207,6 +205,6 @@ def test_a_node_that_stops_answers_and_ends(checked: Checked) -> None:
     assert "stopping" in answers[0].message
 
 
-def test_messages_and_verdicts_have_the_same_names() -> None:
+def test_messages_and_verdicts_have_the_same_names():
     for verdict in CheckVerdict:
         assert getattr(Check.Response, verdict.name) == getattr(Deviation, verdict.name)

@@ -5,13 +5,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from ros_processes import REMAP, Observer, initial, play
 
 from calib_ros import se3
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.ros
 WITHOUT = """
@@ -25,7 +23,7 @@ sys.meta_path.insert(0, Absent())
 NODE = WITHOUT + "from calib_ros.ros.process import calib_node\nsys.exit(calib_node())"
 
 
-def test_the_node_calibrates_without_the_packages_beside_it(street_bag: Path, drive: SyntheticDrive) -> None:
+def test_the_node_calibrates_without_the_packages_beside_it(street_bag, drive):
     start = se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
     quick = ["search.rounds:=1", "search.starts:=64", "online.min_keyframes:=4", "tracker.confirmations:=0"]
     parameters = [*initial(start), *quick, "overlay_period_s:=0.0", "max_data_age_s:=300.0"]
@@ -55,7 +53,7 @@ def test_the_node_calibrates_without_the_packages_beside_it(street_bag: Path, dr
 @pytest.mark.parametrize(
     ("arguments", "code"), [(["--help"], 0), (["info", "synthetic"], 2), (["calibrate", "x", "--objective", "thesis"], 2)]
 )
-def test_the_command_line_does_without_what_the_packages_bring(arguments: list[str], code: int) -> None:
+def test_the_command_line_does_without_what_the_packages_bring(arguments, code):
     program = WITHOUT + f"from calib_ros.cli.main import main\nsys.exit(main({arguments!r}))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.returncode == code, done.stderr

@@ -60,7 +60,7 @@ def playing(bag: Path) -> Iterator[subprocess.Popen[str]]:
         player.communicate()
 
 
-def test_a_publisher_is_killed_and_comes_back(street_bag: Path, drive: SyntheticDrive) -> None:
+def test_a_publisher_is_killed_and_comes_back(street_bag, drive):
     """Twice, in the middle of its messages; between the two others publish the wrong types on the topics."""
     with node_process(*start(drive), **QUICK) as node, Watch(drive) as watch:
         with playing(street_bag):
@@ -83,7 +83,7 @@ def test_a_publisher_is_killed_and_comes_back(street_bag: Path, drive: Synthetic
         end(node)
 
 
-def test_killed_node_restarts_with_the_last_good_extrinsic(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_killed_node_restarts_with_the_last_good_extrinsic(street_bag, drive, tmp_path):
     """SIGKILL at any moment leaves a whole state file. The next node answers with it before the first image."""
     state = tmp_path / "state.json"
     settings = {**QUICK, "state_file": state}
@@ -105,7 +105,7 @@ def test_killed_node_restarts_with_the_last_good_extrinsic(street_bag: Path, dri
         np.testing.assert_allclose(result.T_camera_lidar, saved["T_camera_lidar"], atol=1e-9)
 
 
-def test_a_full_disk(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_a_full_disk(street_bag, drive, tmp_path):
     """The node may write no byte more: it says so, keeps the state saved before whole, and saves again when there is room."""
     state = tmp_path / "state.json"
     with node_process(*start(drive), **QUICK, state_file=state) as node, Watch(drive) as watch:

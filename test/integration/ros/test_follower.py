@@ -16,7 +16,7 @@ from calib_ros.ros.bags import Follower
 pytestmark = pytest.mark.ros
 
 
-def test_a_follower_keeps_one_scan_on_its_way(ros_in_this_process: None) -> None:
+def test_a_follower_keeps_one_scan_on_its_way(ros_in_this_process):
     """Topics that the node does not subscribe to, and messages that got lost, hold nothing up."""
     context = Context()
     rclpy.init(context=context)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import Any
 
@@ -14,9 +13,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from ros_peer import Peer, start_parameters
 from vehicle import QUICK, Vehicle, is_right, off
 
-from calib_ros.frame import Frame
 from calib_ros.ros.lifecycle_node import CalibLifecycleNode
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 
@@ -65,12 +62,12 @@ class Managed:
 
 
 @pytest.fixture
-def managed(drive: SyntheticDrive) -> Iterator[Managed]:
+def managed(drive):
     with Managed(**start_parameters(off(drive.reference)), **QUICK) as managed:
         yield managed
 
 
-def test_a_drive_through_all_states(managed: Managed, street: list[Frame], drive: SyntheticDrive) -> None:
+def test_a_drive_through_all_states(managed, street, drive):
     peer = managed.peer
     assert managed.state == State.PRIMARY_STATE_UNCONFIGURED
     assert peer.calibration is None
@@ -132,9 +129,7 @@ def test_a_drive_through_all_states(managed: Managed, street: list[Frame], drive
     vehicle.assert_recovers()
 
 
-def test_deactivation_ends_a_goal_and_shutdown_a_running_search(
-    managed: Managed, street: list[Frame], drive: SyntheticDrive
-) -> None:
+def test_deactivation_ends_a_goal_and_shutdown_a_running_search(managed, street, drive):
     peer = managed.peer
     assert managed.configure()
     peer.change(online__mode="manual", search__starts=1 << 20)  # minutes
@@ -163,9 +158,7 @@ def test_deactivation_ends_a_goal_and_shutdown_a_running_search(
         ({"tf_parent": "map"}, "tf_child must name its child"),
     ],
 )
-def test_bad_parameters_fail_the_configuration_in_one_line(
-    parameters: dict[str, Any], text: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_parameters_fail_the_configuration_in_one_line(parameters, text, capfd):
     with Managed(**parameters) as managed:
         for _ in range(2):
             assert not managed.configure()
@@ -177,7 +170,7 @@ def test_bad_parameters_fail_the_configuration_in_one_line(
 
 
 @pytest.mark.skipif(find_spec("nav_msgs") is not None, reason="nav_msgs is installed: nothing is missing")
-def test_a_missing_package_fails_the_configuration_and_leaves_nothing_behind() -> None:
+def test_a_missing_package_fails_the_configuration_and_leaves_nothing_behind():
     with Managed(motion_source="odom") as managed:
         before, threads = managed.topics(), threading.active_count()
         assert not managed.configure()
@@ -185,7 +178,7 @@ def test_a_missing_package_fails_the_configuration_and_leaves_nothing_behind() -
         assert threading.active_count() == threads
 
 
-def test_parameters_put_right_let_the_configuration_pass() -> None:
+def test_parameters_put_right_let_the_configuration_pass():
     with Managed(tf_parent="map") as managed:
         assert not managed.configure()
         managed.peer.change(tf_parent="lidar")

@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.result import CONVERGED, Result
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.ros
 SMALL_SEARCH = {name: value for name, value in QUICK.items() if name.startswith("search")}
@@ -40,7 +38,7 @@ def assert_broken_off(text: str) -> None:
     assert not any(said in text for said in ("extrinsic from", "estimate refused", "unexpected")), text
 
 
-def test_bag_played_into_the_node(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_bag_played_into_the_node(street_bag, drive, tmp_path):
     state, start = tmp_path / "state.json", se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
     quick = {"tracker__confirmations": 0, "online__rest_period_s": 0.0, "semantics__segmentation": "auto"}
     with node_process(*initial(start), state_file=state, **SMALL_SEARCH, **quick) as node, Observer() as client:
@@ -58,7 +56,7 @@ def test_bag_played_into_the_node(street_bag: Path, drive: SyntheticDrive, tmp_p
         end(node)
 
 
-def test_a_player_that_follows_the_node_loses_no_pair(street_bag: Path, drive: SyntheticDrive) -> None:
+def test_a_player_that_follows_the_node_loses_no_pair(street_bag, drive):
     """Played ten times as fast as recorded, which no node keeps up with, every pair is taken in nevertheless."""
     with node_process(*initial(drive.reference), search__starts=512) as node, Observer() as client:
         assert "8  /camera/image_raw" in played(street_bag, "--rate", "10")
@@ -68,7 +66,7 @@ def test_a_player_that_follows_the_node_loses_no_pair(street_bag: Path, drive: S
 
 
 @pytest.mark.slow
-def test_a_looping_bag_with_its_clock(street_bag: Path, drive: SyntheticDrive) -> None:
+def test_a_looping_bag_with_its_clock(street_bag, drive):
     """Stamps and /clock jump back at the end of every loop: keyframes, estimates and diagnostics go on, nothing is forgotten."""
     start = se3.perturb(drive.reference, [0.8, -0.6, 0.5], [0.04, 0.05, -0.05])
     quick = {"online__min_keyframes": 4, "search__starts": 512, "use_sim_time": True}
@@ -90,7 +88,7 @@ def test_a_looping_bag_with_its_clock(street_bag: Path, drive: SyntheticDrive) -
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_path: Path, number: signal.Signals) -> None:
+def test_signal_during_an_estimate(street_bag, drive, tmp_path, number):
     """The search takes minutes; the node ends without it, and the saved state stays whole."""
     state = tmp_path / "state.json"
     Result(drive.reference, CONVERGED, camera_frame="camera", lidar_frame="velodyne").save(state)
@@ -114,7 +112,7 @@ def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_
         pytest.param(False, [signal.SIGTERM, signal.SIGINT], marks=pytest.mark.slow),
     ],
 )
-def test_signals_during_a_goal(street_bag: Path, managed: bool, numbers: list[signal.Signals]) -> None:
+def test_signals_during_a_goal(street_bag, managed, numbers):
     manual = {"online__mode": "manual", "initial_from_tf": False}
     with node_process(managed=managed, **LONG_SEARCH, **manual) as node, Observer() as client:
         if managed:
@@ -128,7 +126,7 @@ def test_signals_during_a_goal(street_bag: Path, managed: bool, numbers: list[si
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("entry_point", ["calib_node", "calib_lifecycle_node"])
-def test_a_signal_while_the_libraries_are_imported(entry_point: str, number: signal.Signals) -> None:
+def test_a_signal_while_the_libraries_are_imported(entry_point, number):
     program = f"""
 import os, sys
 from calib_ros.ros.process import {entry_point}
@@ -144,7 +142,7 @@ sys.exit({entry_point}() + 3)
 
 
 @pytest.mark.slow
-def test_sigint_during_a_long_estimate_of_the_thesis_objective(street_bag: Path, drive: SyntheticDrive) -> None:
+def test_sigint_during_a_long_estimate_of_the_thesis_objective(street_bag, drive):
     """Eight smoothings of eq. 3.12 over three frames take minutes; the node ends without them."""
     long = {
         "refine__objective": "thesis",
@@ -169,7 +167,7 @@ def test_sigint_during_a_long_estimate_of_the_thesis_objective(street_bag: Path,
         (["--params-file", "/nowhere.yaml"], "nowhere.yaml"),
     ],
 )
-def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments: list[str], text: str) -> None:
+def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path, arguments, text):
     (tmp_path / "bad.yaml").write_text("/**:\n  ros__parameters:\n    search.seed: [1, 2\n")
     command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args"]
     command += [argument.format(bad=tmp_path / "bad.yaml") for argument in arguments]
@@ -180,14 +178,14 @@ def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments
     assert text in lines[0]
 
 
-def test_a_player_says_where_it_follows_nobody(street_bag: Path) -> None:
+def test_a_player_says_where_it_follows_nobody(street_bag):
     player = play(street_bag, "--follow", "/nobody", "--wait", "0.2", "--rate", "50")
     _, err = player.communicate(timeout=LIMIT_S)
     assert player.returncode == 0, err
     assert "/nobody is not heard" in err
 
 
-def test_player_refuses_paths_without_a_bag(tmp_path: Path) -> None:
+def test_player_refuses_paths_without_a_bag(tmp_path):
     for path in (tmp_path / "missing", tmp_path):
         player = play(path)
         _, err = player.communicate(timeout=LIMIT_S)
@@ -198,7 +196,7 @@ def test_player_refuses_paths_without_a_bag(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.kitti
-def test_a_kitti_drive_played_into_the_node(kitti_root: Path, tmp_path: Path) -> None:
+def test_a_kitti_drive_played_into_the_node(kitti_root, tmp_path):
     """All images and clouds arrive, the service's answer is soon within 0.35 deg and 10 cm, an overlay comes."""
     source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
     bag = write_bag(source, tmp_path / "bag", "mcap")

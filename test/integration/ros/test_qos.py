@@ -18,9 +18,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from vehicle import Vehicle
 from waiting import until
 
-from calib_ros.frame import Frame
 from calib_ros.ros.subscriptions import AdaptiveSubscription, type_name
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -76,7 +74,7 @@ class Topic:
 
 
 @pytest.fixture
-def topic() -> Iterator[Topic]:
+def topic():
     topic = Topic()
     yield topic
     topic.executor.shutdown(timeout_sec=1.0)
@@ -85,12 +83,12 @@ def topic() -> Iterator[Topic]:
     rclpy.try_shutdown(context=topic.context)
 
 
-def test_names_of_types() -> None:
+def test_names_of_types():
     assert type_name(Image) == "sensor_msgs/msg/Image"
     assert type_name(PointCloud2) == "sensor_msgs/msg/PointCloud2"
 
 
-def test_auto_follows_the_publishers_as_they_come_and_go(topic: Topic) -> None:
+def test_auto_follows_the_publishers_as_they_come_and_go(topic):
     subscription = topic.subscribe("auto")
 
     def follows(reliable: bool) -> bool:
@@ -111,7 +109,7 @@ def test_auto_follows_the_publishers_as_they_come_and_go(topic: Topic) -> None:
     assert follows(True)  # nobody there: nothing to follow
 
 
-def test_no_message_is_lost_or_doubled_in_a_change(topic: Topic) -> None:
+def test_no_message_is_lost_or_doubled_in_a_change(topic):
     subscription = topic.subscribe("auto")
     publisher = topic.publisher(RELIABLE)
     topic.until(lambda: publisher.get_subscription_count() == 1)
@@ -130,7 +128,7 @@ def test_no_message_is_lost_or_doubled_in_a_change(topic: Topic) -> None:
     topic.until(lambda: not subscription.check() and publisher.get_subscription_count() == 1)  # the old ones are gone
 
 
-def test_a_choice_that_cannot_work_is_named(topic: Topic) -> None:
+def test_a_choice_that_cannot_work_is_named(topic):
     subscription = topic.subscribe("reliable")
     topic.publisher(BEST_EFFORT)
     line = subscription.check()
@@ -153,7 +151,7 @@ def stranger(kind: type[Any], topic: str) -> Iterator[None]:
 
 
 @pytest.fixture
-def across_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+def across_processes(monkeypatch):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
@@ -167,9 +165,7 @@ def across_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 @pytest.mark.usefixtures("across_processes")
-def test_a_topic_of_another_type_is_named(
-    wanted: type[Any], published: type[Any], text: str, request: pytest.FixtureRequest
-) -> None:
+def test_a_topic_of_another_type_is_named(wanted, published, text, request):
     topic: Topic = request.getfixturevalue("topic")  # made after the environment
     subscription = topic.subscribe("auto", kind=wanted)
     with stranger(published, "info"):
@@ -180,7 +176,7 @@ def test_a_topic_of_another_type_is_named(
     assert not subscription.reliable  # a publisher of another type is not followed
 
 
-def test_latched_messages_are_received(topic: Topic) -> None:
+def test_latched_messages_are_received(topic):
     publisher = topic.publisher(LATCHED)
     topic.send(publisher)
     subscription = topic.subscribe("auto", latched=True)
@@ -188,7 +184,7 @@ def test_latched_messages_are_received(topic: Topic) -> None:
     topic.until(lambda: topic.got == [1])
 
 
-def test_the_node_becomes_reliable_and_loses_nothing(street: list[Frame], drive: SyntheticDrive) -> None:
+def test_the_node_becomes_reliable_and_loses_nothing(street, drive):
     with Peer(initial_from_tf=False, online__mode="manual") as peer:
         vehicle = Vehicle(peer, street, drive.reference)
         sent = count()
@@ -203,6 +199,6 @@ def test_the_node_becomes_reliable_and_loses_nothing(street: list[Frame], drive:
 
 
 @pytest.mark.usefixtures("across_processes")
-def test_the_node_names_a_compressed_topic() -> None:
+def test_the_node_names_a_compressed_topic():
     with Peer(initial_from_tf=False) as peer, stranger(CompressedImage, "image"):
         peer.until(lambda: "set image_transport: compressed" in peer.last_error())

@@ -13,10 +13,8 @@ from ros_peer import Peer, start_parameters
 from sam_graphs import other
 from vehicle import QUICK, Vehicle, is_right, off
 
-from calib_ros.frame import Frame
 from calib_ros.online.events import Event, Problem
 from calib_ros_semantics.models.segmentation import MAX_FAILURES
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 QUICK = {**QUICK, "online__min_keyframes": 2}
@@ -36,7 +34,7 @@ def accepted(peer: Peer) -> int:
     return recalibrator.current.accepted if recalibrator else 0
 
 
-def test_estimates_go_on_and_the_node_ends_while_a_model_runs(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_estimates_go_on_and_the_node_ends_while_a_model_runs(street, drive, tmp_path):
     path, others = endless(tmp_path / "endless.onnx"), set(threading.enumerate())  # of pipelines that other tests left behind
     with Peer(**start(drive.reference), semantics__image_classes=str(path), semantics__budget_s=600.0) as peer:
         peer.publish(street[0], settle=False)
@@ -78,7 +76,7 @@ def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:
 
 
 @pytest.mark.slow
-def test_unusable_models_are_named_and_left_out(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_unusable_models_are_named_and_left_out(street, drive, tmp_path):
     with Peer(**start(drive.reference), online__mode="periodic", online__period_s=1.5) as peer:
         lines: list[str] = []
         sink = peer.pipeline._sink
@@ -108,9 +106,7 @@ def test_unusable_models_are_named_and_left_out(street: list[Frame], drive: Synt
             assert peer.get_extrinsic().extrinsic.status == "converged", name
 
 
-def test_models_come_and_go_at_run_time(
-    street: list[Frame], drive: SyntheticDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_models_come_and_go_at_run_time(street, drive, tmp_path, monkeypatch):
     # This network sees brightness.
     monkeypatch.setattr("calib_ros_semantics.models.segmentation.judge", lambda model, answer: ("", ""))
     path = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])

@@ -9,10 +9,8 @@ from scenes import RenderedDrive
 from sensor_msgs.msg import Image
 
 from calib_ros import se3
-from calib_ros.frame import Frame
 from calib_ros.messages import decode_image
 from calib_ros.ros.client import result_from_message
-from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.features import ThesisFeatures
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -26,7 +24,7 @@ def near(T: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_drive_with_the_attached_form() -> None:
+def test_a_drive_with_the_attached_form():
     """It converges, and what it has found is found again whenever somebody asks."""
     drive = RenderedDrive(seed=3, frames=9, rings=64, width=640, height=192)
     # This objective counts pixels, and its curvature with them: it knows roll to 0.1 to 0.6 deg here, more or less with every
@@ -51,7 +49,7 @@ def test_a_drive_with_the_attached_form() -> None:
         assert peer.calibration.health.errors == 0
 
 
-def test_the_objective_changes_at_run_time(street: list[Frame], drive: SyntheticDrive) -> None:
+def test_the_objective_changes_at_run_time(street, drive):
     def kinds() -> list[type]:
         return [type(f.own) for f in peer.recalibrator.buffer]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 
 import cv2
@@ -17,9 +16,7 @@ from vehicle import QUICK, Vehicle
 from waiting import LIMIT_S, until
 
 from calib_ros.errors import BadInputError
-from calib_ros.frame import Frame
 from calib_ros.ros.conversions import image_message
-from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_view.node.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch
 from calib_ros_view.session.live import NEUTRAL, Presence
 from calib_ros_view.web.live_words import words_of_check
@@ -29,20 +26,20 @@ PARAMETERS = {**QUICK, "online__mode": "manual"}
 
 
 @pytest.fixture(scope="module")
-def watch() -> Iterator[Watch]:
+def watch():
     with Watch("/calib_ros") as watching:
         yield watching
 
 
 @pytest.fixture(scope="module")
-def first_node() -> Iterator[ExitStack]:
+def first_node():
     """Ends the first node, at the latest when all tests are done."""
     with ExitStack() as stack:
         yield stack
 
 
 @pytest.fixture(scope="module")
-def peer(watch: Watch, first_node: ExitStack, drive: SyntheticDrive) -> Peer:
+def peer(watch, first_node, drive):
     """Comes after the watch: the page is open before the node is."""
     assert watch.history.presence is Presence.WAITING
     answer = watch.call(GET_EXTRINSIC).result(LIMIT_S)
@@ -56,20 +53,20 @@ def texts(watch: Watch) -> str:
         return "\n".join(event.text for event in watch.history.events)
 
 
-def test_a_node_that_starts_later_is_found_and_heard(watch: Watch, peer: Peer) -> None:
+def test_a_node_that_starts_later_is_found_and_heard(watch, peer):
     until(lambda: watch.history.presence is Presence.LIVE, "the node is heard")
     assert "/calib_ros" in until(watch.nodes_seen, "names of nodes")
     assert until(lambda: watch.history.diagnosis.values, "diagnostics")["status"] == "none"
 
 
-def test_without_keyframes_the_gallery_says_what_to_wait_for(watch: Watch, peer: Peer) -> None:
+def test_without_keyframes_the_gallery_says_what_to_wait_for(watch, peer):
     answer = watch.keyframes().result(LIMIT_S)
     assert not answer.success
     assert "no keyframe yet" in answer.message
     assert not answer.response.keyframes
 
 
-def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive) -> None:
+def test_keyframes_are_drawn_with_score_and_age(watch, peer, street, drive):
     vehicle = Vehicle(peer, street, drive.reference)
     peer.drive(vehicle.frame() for _ in range(4))
     answer = watch.keyframes(3, 200).result(LIMIT_S)
@@ -83,13 +80,13 @@ def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street
     assert answer.response.cpu > 0
 
 
-def test_a_width_that_makes_no_sense_is_refused(watch: Watch, peer: Peer) -> None:
+def test_a_width_that_makes_no_sense_is_refused(watch, peer):
     answer = watch.keyframes(1, 5000).result(LIMIT_S)
     assert not answer.success
     assert "64 to 1280 px wide" in answer.message
 
 
-def test_the_overlay_is_only_drawn_for_lookers(watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive) -> None:
+def test_the_overlay_is_only_drawn_for_lookers(watch, peer, street, drive):
     publisher = peer.calibration.overlay._publisher
     assert publisher.get_subscription_count() == 0
     lookers = [watch.look(), watch.look()]
@@ -106,7 +103,7 @@ def test_the_overlay_is_only_drawn_for_lookers(watch: Watch, peer: Peer, street:
     until(lambda: publisher.get_subscription_count() == 0, "no subscription")
 
 
-def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: Peer) -> None:
+def test_services_answer_and_what_they_say_becomes_an_event(watch, peer):
     assert "nothing to save" in watch.call(SAVE).result(LIMIT_S).message
     answers = [watch.call(CALIBRATE), watch.call(CALIBRATE)]
     assert "is being called already" in answers[1].result(LIMIT_S).message
@@ -122,9 +119,7 @@ def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: 
         assert text in texts(watch)
 
 
-def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(
-    watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive
-) -> None:
+def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(watch, peer, street, drive):
     assert watch.progress is None
     assert not watch.stop()
     vehicle = Vehicle(peer, street, drive.reference)
@@ -150,9 +145,7 @@ def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(
     peer.change(search__starts=64)
 
 
-def test_a_node_that_ends_is_noticed_and_its_restart_too(
-    watch: Watch, peer: Peer, first_node: ExitStack, drive: SyntheticDrive
-) -> None:
+def test_a_node_that_ends_is_noticed_and_its_restart_too(watch, peer, first_node, drive):
     first_node.close()
     until(lambda: watch.history.presence is Presence.GONE, "it is gone")
     assert "nothing heard of the node" in texts(watch)
@@ -162,7 +155,7 @@ def test_a_node_that_ends_is_noticed_and_its_restart_too(
     assert "the node is back after" in texts(watch)
 
 
-def test_a_call_to_a_node_that_was_killed_ends_once_another_is_there(street: list[Frame]) -> None:
+def test_a_call_to_a_node_that_was_killed_ends_once_another_is_there(street):
     with Watch("/calib_ros") as watching:
         images = watching._node.create_publisher(Image, "/camera/image_raw", 10)
         counted = lambda: watching.history.diagnosis.number("images") >= 3  # noqa: E731
@@ -177,12 +170,12 @@ def test_a_call_to_a_node_that_was_killed_ends_once_another_is_there(street: lis
 
 
 @pytest.mark.parametrize("name", ["", "/", "/a b", "/calib_ros; rm", "/../x"])
-def test_a_name_that_no_node_can_have_is_refused(name: str) -> None:
+def test_a_name_that_no_node_can_have_is_refused(name):
     with pytest.raises(BadInputError, match="no name of a ROS node"):
         Watch(name)
 
 
-def test_calls_under_way_are_answered_when_the_viewer_ends() -> None:
+def test_calls_under_way_are_answered_when_the_viewer_ends():
     watching = Watch("/nobody")
     watching.close()
     watching.close()
