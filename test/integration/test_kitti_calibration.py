@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scenes import is_near
 
 from calib_ros import se3
 from calib_ros.config import Config
@@ -31,8 +32,7 @@ def test_drive_0005_from_random_starts(kitti_root):
     for _ in range(10):
         start = se3.perturb(reference, rng.uniform(-1.5, 1.5, 3), rng.uniform(-0.15, 0.15, 3))
         result = calibrator.estimate(features, start, SearchBox(3.0, 0.3))
-        T = result.T_camera_lidar
-        good += result.converged and se3.rotation_error_deg(reference, T) < 0.3 and se3.translation_error_m(reference, T) < 0.08
+        good += result.converged and is_near(reference, result.T_camera_lidar, 0.3, 0.08)
     assert good >= 9
 
 
@@ -42,8 +42,7 @@ def test_odometry_scenes_without_any_initial_extrinsic(kitti_root):
     source = open_dataset(kitti_root / "odometry/sequences/00")
     result = Calibrator(source.camera).calibrate([source[i] for i in range(len(source))], nominal(), SearchBox(10.0, 0.5))
     assert result.converged
-    assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.12
-    assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.04
+    assert is_near(source.reference, result.T_camera_lidar, 0.12, 0.04)
     # The errors that the covariance foretells are of the size of the errors made.
     xi = se3.log(source.reference @ se3.inverse(result.T_camera_lidar))
     assert xi @ np.linalg.solve(result.covariance, xi) < 20
@@ -94,5 +93,4 @@ def test_the_thesis_objective_on_three_scenes(kitti_root, dense_edges):
     result = Calibrator(source.camera, config).calibrate([source[i] for i in (0, 3, 7)], start)
     assert result.converged, result.reason
     assert result.score > result.initial_score
-    assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.6
-    assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.15
+    assert is_near(source.reference, result.T_camera_lidar, 0.6, 0.15)

@@ -47,13 +47,6 @@ def wheel(tmp_path_factory):
     return built
 
 
-@pytest.fixture(scope="module")
-def metadata(wheel):
-    with ZipFile(wheel) as file:
-        (name,) = (name for name in file.namelist() if name.endswith("METADATA"))
-        return Parser().parsestr(file.read(name).decode())
-
-
 def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel):
     with ZipFile(wheel) as file:
         names = file.namelist()
@@ -63,20 +56,21 @@ def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel):
         for path in package.parent.rglob("*")
         if path.suffix in (".py", ".typed", ".onnx") or path.name == "LICENSE"
     }
-    data = f"calib_ros-{calib_ros.__version__}.data/data/share/"
-    shared = {
-        f"{data}calib_ros/{name}"
-        for name in ("package.xml", *(path.relative_to(ROOT).as_posix() for path in (ROOT / "config").iterdir()))
+    files = [ROOT / "package.xml", *(ROOT / "config").iterdir(), *(ROOT / "launch").glob("*.launch.py")]
+    shared = {f"calib_ros/{path.relative_to(ROOT).as_posix()}" for path in files} | {
+        "ament_index/resource_index/packages/calib_ros"
     }
-    shared |= {f"{data}calib_ros/launch/{path.name}" for path in (ROOT / "launch").glob("*.launch.py")}
-    shared.add(f"{data}ament_index/resource_index/packages/calib_ros")
+    shared = {f"calib_ros-{calib_ros.__version__}.data/data/share/{name}" for name in shared}
     compiled = {name for name in names if name.endswith((".so", ".pyd"))}
     assert len(compiled) == 1
     assert compiled.pop().startswith("calib_ros/registration/score/kernel")
     assert {name for name in names if ".dist-info/" not in name and not name.endswith((".so", ".pyd"))} == sources | shared
 
 
-def test_its_metadata_name_version_requirements_and_extras(metadata):
+def test_its_metadata_name_version_requirements_and_extras(wheel):
+    with ZipFile(wheel) as file:
+        (name,) = (name for name in file.namelist() if name.endswith("METADATA"))
+        metadata = Parser().parsestr(file.read(name).decode())
     package = ET.parse(ROOT / "package.xml").getroot()
     assert metadata["Name"] == package.findtext("name") == "calib_ros"
     assert metadata["Version"] == package.findtext("version") == calib_ros.__version__

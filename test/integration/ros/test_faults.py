@@ -38,19 +38,13 @@ def recovery(vehicle):
 def test_camera_info_of_another_camera(vehicle):
     """Once, and then by turns, as when two drivers publish on one topic."""
     peer = vehicle.peer
-    right = camera_info_message(vehicle.frame())
-    other = camera_info_message(vehicle.frame())
+    right, other = camera_info_message(vehicle.frame()), camera_info_message(vehicle.frame())
     other.width, other.height, other.k = 800, 600, np.array([700.0, 0, 400, 0, 700, 300, 0, 0, 1])
-    peer.info_pub.publish(other)
-    peer.until(lambda: peer.pipeline.camera.width == 800)
-    for _ in range(3):
-        vehicle.send(vehicle.frame())
-        assert "CameraInfo says 800x600" in peer.last_error()
-        vehicle.assert_kept()
-    for info in [right, other] * 5:
+    for info in (other, *[right, other] * 5):
         peer.info_pub.publish(info)
         peer.until(lambda w=info.width: peer.pipeline.camera.width == w)
         vehicle.send(vehicle.frame())
+        assert info is right or "CameraInfo says 800x600" in peer.last_error()
         vehicle.assert_kept()
 
 
@@ -230,13 +224,9 @@ def test_a_state_folder_that_cannot_be_written(vehicle):
         refusal = peer.refusal("save")
         assert refusal == peer.last_error()
         assert str(state) in refusal
-        peer.change(capture_dir=str(state.parent), capture_frames=1)
-        peer.publish(vehicle.frame())
-        assert f"{state.parent} cannot be written" in peer.refusal("capture")
     finally:
         state.parent.unlink()
         aside.rename(state.parent)
-        peer.change(capture_frames=0)
     assert state.read_bytes() == before
     assert peer.trigger("save").success
     assert os.listdir(state.parent) == [state.name]

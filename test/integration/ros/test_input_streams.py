@@ -30,8 +30,8 @@ MS = NANOSECONDS // 1000
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-@pytest.mark.parametrize("stamped_s", [pytest.param(-0.05, marks=pytest.mark.slow), 0.05], ids=["start", "end"])
-def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middle(street, drive, stamped_s):
+def test_scans_stamped_at_their_end_pair_with_the_images_in_their_middle(street, drive):
+    stamped_s = 0.05
     rng, first, n_frames = np.random.default_rng(0), street[0].stamp, 30
     keep = {"capture_frames": n_frames, "online__keyframe_spacing_s": 0.0, "online__mode": "manual"}
     with Peer(**start_parameters(drive.reference), **{**QUICK, **keep}, monitor__enabled=False) as peer:
@@ -44,12 +44,11 @@ def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middl
             stamp = middle + round(stamped_s * NANOSECONDS)
             peer.send(image_message(frame.image, "camera", image_stamp), cloud_message(cloud, stamp))
         assert counts.pairs >= n_frames - 2
-        made = [
-            (stamp_ns(kept.image.header.stamp), stamp_ns(kept.cloud.header.stamp)) for kept in peer.calibration.capture._frames
-        ]
-        assert len(made) >= 3
-        for image, cloud in made:
-            assert abs(image - (cloud - round(stamped_s * NANOSECONDS))) <= 5 * MS
+        kept = peer.calibration.capture._frames
+        assert len(kept) >= 3
+        for pair in kept:
+            late = stamp_ns(pair.cloud.header.stamp) - stamp_ns(pair.image.header.stamp)
+            assert abs(late - round(stamped_s * NANOSECONDS)) <= 5 * MS
         assert peer.new_values()["from a cloud's stamp to its sweep of the view, ms"] == f"{-1000 * stamped_s:.0f}"
 
 
@@ -163,9 +162,3 @@ def test_no_keyframe_in_a_sharp_turn(street, drive, source, kind):
 def test_odometry_without_its_messages_is_named():
     with pytest.raises(MissingDependencyError, match="motion_source: odom needs nav_msgs; install it"):
         Peer(motion_source="odom")
-
-
-@pytest.mark.skipif(find_spec("nav_msgs") is None, reason="nav_msgs is not installed")
-def test_odometry_is_subscribed():
-    with Peer(motion_source="odom") as peer:
-        assert peer.peer.count_subscribers("/odom") == 1

@@ -22,17 +22,11 @@ def live():
 
 
 def test_pictures_come_from_memory(live):
-    assert live.get("/live/overlay.jpg")[0] == 404, "no picture yet"
-    assert live.get("/live/keyframe/1.jpg")[0] == 404
+    assert [live.get(f"/live/{name}.jpg")[0] for name in ("overlay", "keyframe/1")] == [404, 404], "no picture yet"
 
 
 @pytest.mark.slow
-def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(
-    live,
-    open_page,  # noqa: F811
-    street,
-    drive,
-):
+def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(live, open_page, street, drive):  # noqa: F811
     browser = open_page(live.url, 420, 900)
 
     def shows(*words: str) -> None:
