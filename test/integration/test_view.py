@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pages import POLLING, Page, open_page, press, text  # noqa: F401  # a fixture
+from pages import POLLING, Page, open_page, press, shows, text  # noqa: F401  # a fixture
 from waiting import until
 
 from calib_ros import result, se3
@@ -122,22 +122,19 @@ def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(walk):
     browser = walk.open()
     before = picture(browser)
 
-    def shows(words: str) -> None:
-        until(lambda: words in text(browser), words)
-
     tabs = {tab.text.strip(): tab for tab in browser.find_elements(By.CSS_SELECTOR, ".q-tab")}
     tabs["Numbers"].click()  # which then has the focus, but must not keep the arrow keys
-    shows("score of each frame")
+    shows(browser, "score of each frame")
     press(browser, *[Keys.SHIFT + Keys.ARROW_LEFT] * 5)
-    shows("set by hand: 2.50 deg")
+    shows(browser, "set by hand: 2.50 deg")
     until(lambda: picture(browser) not in ("", before), "another picture")
     press(browser, Keys.ENTER)
-    shows("refined:")
-    shows("refine: accepted")
+    shows(browser, "refined:")
+    shows(browser, "refine: accepted")
     press(browser, "z")
-    shows("set by hand: 2.50 deg")
+    shows(browser, "set by hand: 2.50 deg")
     press(browser, "y")
-    shows("refined:")
+    shows(browser, "refined:")
     browser.execute_script("[...document.querySelectorAll('button')].find(b => b.innerText == 'Save').click()")
     until(walk.out.exists, "the file")
     saved = result.load(walk.out)
@@ -151,17 +148,14 @@ def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(walk):
 def test_every_part_of_the_page_on_a_phone_and_all_browsers_see_the_same(walk):
     phone, other = walk.open(420, 900), walk.open()
 
-    def shows(*words: str) -> None:
-        until(lambda: all(word in text(phone) for word in words), words)
-
     widths = phone.execute_script("return [document.documentElement.scrollWidth, window.innerWidth]")
     assert widths[0] <= widths[1]
     press(other, "d")
-    shows("from the start", "set by hand")
+    shows(phone, "from the start", "set by hand")
     for tab, sign in (("Numbers", "score of each frame"), ("Frames", "4"), ("3-D", "drag to turn")):
         script = "[...document.querySelectorAll('.q-tab')].find(t => t.innerText.includes(arguments[0])).click()"
         phone.execute_script(script, tab)
-        shows(sign)
+        shows(phone, sign)
     phone.execute_script("[...document.querySelectorAll('.q-tab')][1].click()")
     lines = "return document.querySelectorAll('svg.plot polyline').length"
     until(lambda: phone.execute_script(lines) == 6, "curves of the loss")

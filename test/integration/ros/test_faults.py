@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import rclpy
 from calib_ros_msgs.srv import GetExtrinsic
+from ros_messages import Messages
 from ros_peer import camera_info_message, cloud_message
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import PointField
 from std_srvs.srv import Trigger
 from vehicle import is_right, vehicle_fixture  # noqa: F401  # a fixture
 
@@ -64,13 +64,12 @@ def scan(frame: Frame, xyz: np.ndarray | None = None, **fields: Any) -> dict[str
 
 def with_times(frame: Frame, ahead_s: float) -> dict[str, Any]:
     """Every point with a time of its own, of a clock that is ahead."""
-    message = cloud_message(frame.cloud, frame.stamp, drop=("time",))
-    raw = np.frombuffer(bytes(message.data), np.uint8).reshape(len(frame.cloud), -1)
-    times = np.linspace(0, 0.1, len(raw)) + frame.stamp / NANOSECONDS + ahead_s
-    fields = [*message.fields, PointField(name="timestamp", offset=raw.shape[1], datatype=PointField.FLOAT64, count=1)]
-    step = raw.shape[1] + 8
-    data = np.c_[raw, times.view(np.uint8).reshape(-1, 8)].tobytes()
-    return {"cloud": changed(message, fields=fields, data=data, point_step=step, row_step=step * len(raw))}
+    columns = dict(zip(("x", "y", "z", "intensity"), (*frame.cloud.xyz.T, frame.cloud.intensity), strict=True))
+    points = np.empty(len(frame.cloud), [*((name, "f4") for name in columns), ("timestamp", "f8")])
+    for name, values in columns.items():
+        points[name] = values
+    points["timestamp"] = np.linspace(0, 0.1, len(points)) + frame.stamp / NANOSECONDS + ahead_s
+    return {"cloud": Messages("rclpy").cloud(points, stamp=frame.stamp, frame="velodyne")}
 
 
 BAD: list[tuple[Callable[[Frame], dict[str, Any]], str]] = [

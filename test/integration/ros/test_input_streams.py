@@ -74,12 +74,11 @@ def test_images_of_another_clock_are_named(street, drive):
     with Peer(**start_parameters(drive.reference), **QUICK) as peer:
         counts, frame = peer.pipeline.synchronizer.counts, street[0]
         peer.publish_camera(frame)
-        numbers = count()
+        stamps = count(frame.stamp, PERIOD)
 
         def go_on() -> None:
-            stamp = frame.stamp + next(numbers) * PERIOD
-            late = cloud_message(frame.cloud, stamp + 37 * NANOSECONDS)
-            peer.send(image_message(frame.image, "camera", stamp), late)
+            stamp = next(stamps)
+            peer.send(image_message(frame.image, "camera", stamp), cloud_message(frame.cloud, stamp + 37 * NANOSECONDS))
 
         named = "find no partner", "is stamped 37 s before the newest cloud", "synchronise the clocks"
         until(lambda: peer.warns(*named), "the reason", go_on)

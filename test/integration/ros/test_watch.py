@@ -32,20 +32,16 @@ def watch():
 
 
 @pytest.fixture(scope="module")
-def first_node():
-    """Ends the first node, at the latest when all tests are done."""
-    with ExitStack() as stack:
-        yield stack
-
-
-@pytest.fixture(scope="module")
-def peer(watch, first_node, drive):
-    """Comes after the watch: the page is open before the node is."""
+def peer(watch, drive):
+    """Comes after the watch: the page is open before the node is. end(): ends it, before the tests are done."""
     assert watch.history.presence is Presence.WAITING
     answer = watch.call(GET_EXTRINSIC).result(LIMIT_S)
     assert not answer.success
     assert "is not there" in answer.message
-    return first_node.enter_context(Peer(**start_parameters(drive.reference), **PARAMETERS))
+    with ExitStack() as stack:
+        peer = stack.enter_context(Peer(**start_parameters(drive.reference), **PARAMETERS))
+        peer.end = stack.close
+        yield peer
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +117,7 @@ def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(watch, peer, vehic
     peer.drive(vehicle.frame() for _ in range(4))
     peer.change(search__starts=1 << 20)  # minutes
     answer = watch.call(CALIBRATE)
-    assert until(lambda: (watch.progress or ("", 0.0))[1] > 0, "progress")
-    assert (watch.progress or ("", 0.0))[0] == "search"
+    until(lambda: watch.progress is not None and watch.progress[0] == "search" and watch.progress[1] > 0, "progress")
     assert watch.stop()
     stopped = answer.result(LIMIT_S)
     assert (stopped.success, stopped.message) == (False, "stopped before the estimate was done")
@@ -138,8 +133,8 @@ def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(watch, peer, vehic
     peer.change(search__starts=64)
 
 
-def test_a_node_that_ends_is_noticed_and_its_restart_too(watch, peer, first_node, drive):
-    first_node.close()
+def test_a_node_that_ends_is_noticed_and_its_restart_too(watch, peer, drive):
+    peer.end()
     until(lambda: watch.history.presence is Presence.GONE, "it is gone")
     assert "nothing heard of the node" in texts(watch)
     with Peer(**start_parameters(drive.reference), **PARAMETERS):

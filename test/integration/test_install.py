@@ -1,4 +1,4 @@
-"""The wheel as `pip install calib_ros` gets it: what it holds, what it declares, and that it calibrates alone."""
+"""What users install: the wheel, which declares and holds what it needs and calibrates alone, and packages for colcon."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import sys
 import venv
 import xml.etree.ElementTree as ET
 from email.parser import Parser
+from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+from catkin_pkg.packages import find_packages
 from paths import ROOT
 
 import calib_ros
 
-pytestmark = pytest.mark.slow
+slow = pytest.mark.slow
 # What a user types first; `mypy --strict` accepts it.
 USER_SCRIPT = """\
 from calib_ros import Calibrator, Result, SearchBox, open_dataset
@@ -47,6 +49,7 @@ def wheel(tmp_path_factory):
     return built
 
 
+@slow
 def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel):
     with ZipFile(wheel) as file:
         names = file.namelist()
@@ -67,6 +70,7 @@ def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel):
     assert {name for name in names if ".dist-info/" not in name and not name.endswith((".so", ".pyd"))} == sources | shared
 
 
+@slow
 def test_its_metadata_name_version_requirements_and_extras(wheel):
     with ZipFile(wheel) as file:
         (name,) = (name for name in file.namelist() if name.endswith("METADATA"))
@@ -82,6 +86,7 @@ def test_its_metadata_name_version_requirements_and_extras(wheel):
     assert {"bags", "models", "motion", "evaluation", "all", "cluster", "training", "test"} <= extras
 
 
+@slow
 @pytest.mark.timeout(900)  # pip, a calibration and mypy in a fresh environment
 def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel, tmp_path):
     """Without ROS, onnxruntime and rosbags: what install_requires names is enough."""
@@ -105,3 +110,28 @@ def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel, tm
     assert done.stdout == "converged (4, 4)\n", done.stderr
     done = run(sys.executable, "-m", "mypy", "--strict", "--python-executable", python, script, cwd=tmp_path)
     assert done.returncode == 0, done.stdout
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    """The commands of the README, with a link in place of the clone."""
+    (link,) = re.findall(r"^ln -s (\S+) \.", (ROOT / "README.md").read_text(), re.MULTILINE)
+    source = tmp_path / "src"
+    source.mkdir()
+    (source / "calib_ros").symlink_to(ROOT)
+    (source / Path(link).name).symlink_to(link)
+    return tmp_path
+
+
+def test_rosdep_finds_both_packages(workspace):
+    found = {path: package.name for path, package in find_packages(str(workspace / "src")).items()}
+    assert found == {"calib_ros": "calib_ros", "calib_ros_msgs": "calib_ros_msgs"}
+
+
+@pytest.mark.skipif(shutil.which("colcon") is None, reason="colcon is not installed; see requirements-colcon.txt")
+def test_plain_colcon_finds_both_packages(workspace):
+    done = subprocess.run(["colcon", "list"], cwd=workspace, capture_output=True, text=True)
+    assert [line.split("\t") for line in done.stdout.splitlines()] == [
+        ["calib_ros", "src/calib_ros", "(ros.ament_python)"],
+        ["calib_ros_msgs", "src/calib_ros_msgs", "(ros.ament_cmake)"],
+    ], done.stderr
