@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import signal
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pages import POLLING, Page, open_page, press, text  # noqa: F401  # a fixture
+from pages import POLLING, Page, open_page, press, shows, text  # noqa: F401  # a fixture
 from waiting import until
 
 from calib_ros import result, se3
@@ -26,25 +26,24 @@ PAGES = [
 
 
 @pytest.fixture(scope="module", params=PAGES)
-def page(request: pytest.FixtureRequest) -> Iterator[Page]:
+def page(request):
     """Each kind of page; its process ends well on SIGINT."""
     with Page(*request.param) as made:
         yield made
         made.end()
 
 
-def test_hostile_requests_are_refused_and_no_file_is_read(page: Page) -> None:
+def test_hostile_requests_are_refused_and_no_file_is_read(page):
     """Requests of other pages, under other names, and for files."""
     assert page.get()[0] == 200
     assert page.opened() == page.opened(Origin=f"http://127.0.0.1:{page.port}") == 101
     for headers in ({"Origin": "http://evil.example"}, {"Host": f"evil.example:{page.port}"}, {"Origin": "null"}, {"Host": ""}):
         assert page.opened(**headers) == 403, headers
-    for path in ("/", POLLING, "/live/overlay.jpg"):
-        assert page.get(path, Origin="http://evil.example")[0] == 403, path
-        assert page.get(path, Host=f"evil.example:{page.port}")[0] == 403, path
+        for path in ("/", POLLING, "/live/overlay.jpg"):
+            assert page.get(path, **headers)[0] == 403, (path, headers)
     etc = "..%2f..%2f..%2fetc%2fpasswd"
-    files = (f"/picture/{etc}", "/picture/extrinsic.json", f"/live/keyframe/{etc}.jpg", "/live/keyframe/%2fetc%2fpasswd.jpg")
-    for path in (*files, "/../../etc/passwd", "/live/../../etc/passwd", "/docs", "/openapi.json", "/reset", "/calibrate"):
+    live = (f"/live/keyframe/{etc}.jpg", "/live/keyframe/%2fetc%2fpasswd.jpg", "/live/../../etc/passwd")
+    for path in (f"/picture/{etc}", "/picture/extrinsic.json", *live, "/../../etc/passwd", "/docs", "/openapi.json", "/reset"):
         status, content = page.get(path)
         assert status in (400, 403, 404, 422), path
         assert b"root:" not in content
@@ -52,27 +51,21 @@ def test_hostile_requests_are_refused_and_no_file_is_read(page: Page) -> None:
         assert page.get(path, "POST")[0] in (404, 405), path
 
 
-@pytest.mark.parametrize(
-    "options",
-    [pytest.param([SOURCE, "--frames", "0"]), pytest.param(["--node", "/calib_ros"], marks=[pytest.mark.ros, pytest.mark.slow])],
-    ids=["source", "node"],
-)
-def test_with_a_token_nothing_is_told_without_it(options: list[str]) -> None:
+@pytest.mark.parametrize("options", [PAGES[0], pytest.param(*PAGES[1].values, marks=[pytest.mark.ros, pytest.mark.slow])])
+def test_with_a_token_nothing_is_told_without_it(options):
     with Page(*options, "--token", "sesame") as page:
         cookie = f"calib_ros_token_{page.port}"
         assert page.url.endswith("?token=sesame")
         for path in ("/", POLLING, "/live/overlay.jpg", "/live/keyframe/1.jpg"):
-            assert page.get(path)[0] == 403, path
-            assert page.get(path.partition("?")[0] + "?token=open")[0] == 403, path
+            assert page.get(path)[0] == page.get(path.partition("?")[0] + "?token=open")[0] == 403, path
         assert page.opened() == page.opened(Cookie=f"{cookie}=open") == 403
-        assert page.opened(Cookie=f"{cookie}=sesame", Origin="http://evil.example") == 403
         assert page.opened(Cookie=f"{cookie}=sesame") == 101
         assert page.get("/?token=sesame")[0] in (200, 302, 303, 307)
         assert page.get(Cookie=f"{cookie}=sesame")[0] == 200
         page.end(signal.SIGTERM)
 
 
-def test_bad_requests_get_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_requests_get_one_line(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         for options, named in (
             ([SOURCE, "--port", str(taken.getsockname()[1])], "--port"),
@@ -108,7 +101,7 @@ class Walk:
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory, open_page: Callable[..., Any]) -> Iterator[Walk]:  # noqa: F811
+def walk(tmp_path_factory, open_page):  # noqa: F811
     made = Walk(tmp_path_factory.mktemp("view"), open_page)
     with made.page:
         yield made
@@ -122,29 +115,26 @@ def picture(browser: Any) -> str:
 
 
 @pytest.mark.slow
-def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(walk: Walk) -> None:
+def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(walk):
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
     browser = walk.open()
     before = picture(browser)
 
-    def shows(words: str) -> None:
-        until(lambda: words in text(browser), words)
-
     tabs = {tab.text.strip(): tab for tab in browser.find_elements(By.CSS_SELECTOR, ".q-tab")}
     tabs["Numbers"].click()  # which then has the focus, but must not keep the arrow keys
-    shows("score of each frame")
+    shows(browser, "score of each frame")
     press(browser, *[Keys.SHIFT + Keys.ARROW_LEFT] * 5)
-    shows("set by hand: 2.50 deg")
+    shows(browser, "set by hand: 2.50 deg")
     until(lambda: picture(browser) not in ("", before), "another picture")
     press(browser, Keys.ENTER)
-    shows("refined:")
-    shows("refine: accepted")
+    shows(browser, "refined:")
+    shows(browser, "refine: accepted")
     press(browser, "z")
-    shows("set by hand: 2.50 deg")
+    shows(browser, "set by hand: 2.50 deg")
     press(browser, "y")
-    shows("refined:")
+    shows(browser, "refined:")
     browser.execute_script("[...document.querySelectorAll('button')].find(b => b.innerText == 'Save').click()")
     until(walk.out.exists, "the file")
     saved = result.load(walk.out)
@@ -155,20 +145,17 @@ def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(walk: Walk) ->
 
 
 @pytest.mark.slow
-def test_every_part_of_the_page_on_a_phone_and_all_browsers_see_the_same(walk: Walk) -> None:
+def test_every_part_of_the_page_on_a_phone_and_all_browsers_see_the_same(walk):
     phone, other = walk.open(420, 900), walk.open()
-
-    def shows(*words: str) -> None:
-        until(lambda: all(word in text(phone) for word in words), words)
 
     widths = phone.execute_script("return [document.documentElement.scrollWidth, window.innerWidth]")
     assert widths[0] <= widths[1]
     press(other, "d")
-    shows("from the start", "set by hand")
+    shows(phone, "from the start", "set by hand")
     for tab, sign in (("Numbers", "score of each frame"), ("Frames", "4"), ("3-D", "drag to turn")):
         script = "[...document.querySelectorAll('.q-tab')].find(t => t.innerText.includes(arguments[0])).click()"
         phone.execute_script(script, tab)
-        shows(sign)
+        shows(phone, sign)
     phone.execute_script("[...document.querySelectorAll('.q-tab')][1].click()")
     lines = "return document.querySelectorAll('svg.plot polyline').length"
     until(lambda: phone.execute_script(lines) == 6, "curves of the loss")

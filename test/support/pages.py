@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from waiting import LIMIT_S
+from waiting import LIMIT_S, until
 
 POLLING = "/_nicegui_ws/socket.io/?EIO=4&transport=polling"
 SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
@@ -107,6 +107,11 @@ def open_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[...
 def text(browser: Any) -> str:
     """All that the page shows."""
     return str(browser.execute_script("return document.body.innerText"))
+
+
+def shows(browser: Any, *words: str) -> None:
+    """It does, soon."""
+    until(lambda: all(word in text(browser) for word in words), words)
 
 
 def press(browser: Any, *keys: str) -> None:

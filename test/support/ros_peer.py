@@ -64,11 +64,6 @@ def start_parameters(T: np.ndarray) -> dict[str, Any]:
     }
 
 
-def errors_to(reference: np.ndarray, T: np.ndarray) -> tuple[float, float]:
-    """Degrees and metres."""
-    return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
-
-
 class Goal:
     """A goal of ~/calibrate. accepted: by the node; feedback: so far."""
 

@@ -25,9 +25,10 @@ PATIENT = {"max_data_age_s": 3600.0, "semantics__segmentation": "none"}  # data 
 
 
 @contextmanager
-def node_process(*parameters: str, managed: bool = False, **named: Any) -> Iterator[subprocess.Popen[str]]:
-    """The node, or the managed one, with parameters as "name:=value", or by their names with __ for the dot."""
-    command = [sys.executable, "-m", "calib_ros.ros.process", *["managed"] * managed, "--ros-args", *REMAP]
+def node_process(*parameters: str, managed: bool = False, program: str = "", **named: Any) -> Iterator[subprocess.Popen[str]]:
+    """The node, the managed one, or a program; with parameters as "name:=value", or by their names with __ for the dot."""
+    start = ["-c", program] if program else ["-m", "calib_ros.ros.process", *["managed"] * managed]
+    command = [sys.executable, *start, "--ros-args", *REMAP]
     for name, value in {**PATIENT, **named}.items():
         command += ["-p", f"{name.replace('__', '.')}:={str(value).lower() if isinstance(value, bool) else value}"]
     for parameter in parameters:

@@ -72,6 +72,10 @@ class RenderedDrive(SyntheticDrive):
         return replace(deepcopy(frame), camera=frame.camera)  # a test may draw on its frame
 
 
+def is_near(reference: np.ndarray, T: np.ndarray, deg: float, m: float) -> bool:
+    return se3.rotation_error_deg(reference, T) < deg and se3.translation_error_m(reference, T) < m
+
+
 class Scene:
     def __init__(self, seed: int, frames: int = 4, **options) -> None:
         drive = RenderedDrive(seed=seed, frames=frames, **{**SIZE, **options})
@@ -85,7 +89,7 @@ class Scene:
         return se3.perturb(self.truth, *by)
 
     def is_near(self, T: np.ndarray, deg: float, m: float) -> bool:
-        return se3.rotation_error_deg(self.truth, T) < deg and se3.translation_error_m(self.truth, T) < m
+        return is_near(self.truth, T, deg, m)
 
     def assert_found(self, result: Result, deg: float = 0.15, m: float = 0.03) -> None:
         assert result.status == CONVERGED, result.reason

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
+from scenes import is_near
 
 from calib_ros import se3
 from calib_ros.frame import NANOSECONDS, Frame
@@ -33,8 +34,7 @@ def off(reference: np.ndarray) -> np.ndarray:
 
 
 def is_right(reference: np.ndarray, extrinsic: Any, factor: float = 1.0) -> bool:
-    T = result_from_message(extrinsic).T_camera_lidar
-    return se3.rotation_error_deg(reference, T) < CLOSE_DEG * factor and se3.translation_error_m(reference, T) < CLOSE_M * factor
+    return is_near(reference, result_from_message(extrinsic).T_camera_lidar, CLOSE_DEG * factor, CLOSE_M * factor)
 
 
 class Vehicle:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import count
+
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
@@ -16,7 +18,7 @@ from calib_ros.ros.bags import Follower
 pytestmark = pytest.mark.ros
 
 
-def test_a_follower_keeps_one_scan_on_its_way(ros_in_this_process: None) -> None:
+def test_a_follower_keeps_one_scan_on_its_way(ros_in_this_process):
     """Topics that the node does not subscribe to, and messages that got lost, hold nothing up."""
     context = Context()
     rclpy.init(context=context)
@@ -24,24 +26,17 @@ def test_a_follower_keeps_one_scan_on_its_way(ros_in_this_process: None) -> None
 
     def turns(most: int) -> int:
         """How often it looks before it goes on; it is told to give up after so many."""
-        count = 0
-
-        def stopped() -> bool:
-            nonlocal count
-            count += 1
-            return count > most
-
-        follower.wait(stopped)
-        return count
+        looks = count(1)
+        follower.wait(lambda: next(looks) > most)
+        return next(looks) - 1
 
     def send(stamp: int) -> None:
         follower.add("/other_image", stamp, "rear", False)
         follower.add("/image", stamp, "camera", False)
         follower.add("/points", stamp, "lidar", True)
 
-    def done(stamp: int, *frames: str) -> None:
-        for frame in frames:
-            processed.publish(Header(stamp=Time(nanosec=stamp), frame_id=frame))
+    def done(stamp: int, frame: str) -> None:
+        processed.publish(Header(stamp=Time(nanosec=stamp), frame_id=frame))
 
     try:
         kept = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)

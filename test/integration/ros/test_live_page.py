@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
-
 import pytest
-from pages import Page, open_page, press, text  # noqa: F401  # a fixture
+from pages import Page, open_page, press, shows, text  # noqa: F401  # a fixture
 from ros_peer import Peer, start_parameters
 from vehicle import QUICK, Vehicle
 from waiting import until
-
-from calib_ros.frame import Frame
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytest.importorskip("nicegui", reason="needs nicegui")
 pytestmark = pytest.mark.ros
@@ -20,43 +14,34 @@ ESCAPE, ENTER = "\ue00c", "\ue007"
 
 
 @pytest.fixture(scope="module")
-def live() -> Iterator[Page]:
+def live():
     """The page of /calib_ros."""
     with Page("--node", "/calib_ros") as page:
         yield page
         page.end()
 
 
-def test_pictures_come_from_memory(live: Page) -> None:
-    assert live.get("/live/overlay.jpg")[0] == 404, "no picture yet"
-    assert live.get("/live/keyframe/1.jpg")[0] == 404
+def test_pictures_come_from_memory(live):
+    assert [live.get(f"/live/{name}.jpg")[0] for name in ("overlay", "keyframe/1")] == [404, 404], "no picture yet"
 
 
 @pytest.mark.slow
-def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(
-    live: Page,
-    open_page: Callable[..., Any],  # noqa: F811
-    street: list[Frame],
-    drive: SyntheticDrive,
-) -> None:
+def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(live, open_page, street, drive):  # noqa: F811
     browser = open_page(live.url, 420, 900)
-
-    def shows(*words: str) -> None:
-        until(lambda: all(word in text(browser) for word in words), words)
 
     def ask(key: str, question: str) -> None:
         press(browser, key)
-        shows(question)
+        shows(browser, question)
         until(lambda: browser.execute_script("return document.activeElement.innerText.includes('Yes')"), "the focus")
 
-    shows("No node /calib_ros is heard", "ROS_DOMAIN_ID")
+    shows(browser, "No node /calib_ros is heard", "ROS_DOMAIN_ID")
     with Peer(**start_parameters(drive.reference), **QUICK, online__mode="manual", initial_from_tf=False) as peer:
         vehicle = Vehicle(peer, street, drive.reference)
         peer.drive(vehicle.frame() for _ in range(4))
-        shows("Nothing estimated yet")
-        shows("keyframe", "drawn in")  # by itself
+        shows(browser, "Nothing estimated yet")
+        shows(browser, "keyframe", "drawn in")  # by itself
         press(browser, "g")
-        shows("4 keyframes, drawn in")
+        shows(browser, "4 keyframes, drawn in")
         loaded = "return [...document.querySelectorAll('figure img')].every(i => i.complete && i.naturalWidth > 100)"
         browser.execute_script("document.querySelector('figure').scrollIntoView()")
         until(lambda: browser.execute_script(loaded), "their pictures")
@@ -67,23 +52,23 @@ def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(
         assert recalibrator.current.accepted == 0
         ask("c", "Search and estimate now?")
         press(browser, ENTER)
-        shows("~/calibrate (")
+        shows(browser, "~/calibrate (")
         assert recalibrator.current.accepted == 1
         peer.change(search__starts=1 << 20)  # minutes
         ask("c", "Search and estimate now?")
         press(browser, ENTER)
         until(lambda: "search" in text(browser).splitlines() and "Stop" in text(browser), "how far it is")
         press(browser, ESCAPE)
-        shows("stopped before the estimate was done")
+        shows(browser, "stopped before the estimate was done")
         until(lambda: "Stop" not in text(browser).splitlines(), "nothing is to be stopped any more")
         assert browser.execute_script("return document.documentElement.scrollWidth") <= 420
         ask("r", "Forget all keyframes")
         press(browser, ENTER)
-        shows("~/reset (")
+        shows(browser, "~/reset (")
         assert len(recalibrator.buffer) == 0
         publisher = peer.calibration.overlay._publisher
         until(publisher.get_subscription_count, "somebody looks")
         browser.get("about:blank")
         until(lambda: publisher.get_subscription_count() == 0, "nobody looks any more")
         browser.get(live.url)
-    shows("Node gone since")
+    shows(browser, "Node gone since")

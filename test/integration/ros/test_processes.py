@@ -6,6 +6,8 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,26 +15,51 @@ import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from ros_processes import Observer, end, initial, node_process, play, played
-from vehicle import QUICK
+from scenes import is_near
+from sensor_msgs.msg import Image, PointCloud2
+from vehicle import CLOSE_DEG, CLOSE_M, QUICK, off
 from waiting import LIMIT_S
 
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.result import CONVERGED, Result
-from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.ros
 SMALL_SEARCH = {name: value for name, value in QUICK.items() if name.startswith("search")}
 LONG_SEARCH = {"search__starts": 1 << 20}  # minutes
 
 
-def assert_found(client: Observer, reference: np.ndarray, deg: float = 0.3, m: float = 0.08) -> None:
-    """The node answers with the right extrinsic, at the latest when it has worked off what it has received."""
+def assert_kept(client: Observer, reference: np.ndarray) -> None:
+    """The node answers with the right extrinsic."""
+    success, message, result, _ = client.get_extrinsic()
+    assert success, message
+    assert is_near(reference, result.T_camera_lidar, CLOSE_DEG, CLOSE_M)
+
+
+def assert_found(client: Observer, reference: np.ndarray) -> None:
+    """At the latest when it has worked off what it has received."""
     client.until(lambda: client.get_extrinsic()[0], "an extrinsic")
-    T = client.get_extrinsic()[2].T_camera_lidar
-    assert se3.rotation_error_deg(reference, T) < deg
-    assert se3.translation_error_m(reference, T) < m
+    assert_kept(client, reference)
+
+
+def assert_recovers(client: Observer, reference: np.ndarray) -> None:
+    """More pairs come, and another estimate is accepted."""
+    client.new_values()
+    pairs, accepted = client.count("pairs"), client.count("estimates accepted")
+    client.until(lambda: client.count("pairs") > pairs and client.count("estimates accepted") > accepted, "another estimate")
+    assert_kept(client, reference)
+
+
+@contextmanager
+def playing(bag: Path) -> Iterator[None]:
+    """A player that runs until it is killed, hard."""
+    player = play(bag, "--rate", "4", "--loop")
+    try:
+        yield
+    finally:
+        player.kill()
+        player.communicate()
 
 
 def assert_broken_off(text: str) -> None:
@@ -40,35 +67,31 @@ def assert_broken_off(text: str) -> None:
     assert not any(said in text for said in ("extrinsic from", "estimate refused", "unexpected")), text
 
 
-def test_bag_played_into_the_node(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
-    state, start = tmp_path / "state.json", se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
+def test_bag_played_into_the_node(street_bag, drive, tmp_path):
+    """Every pair is taken in, and gives an extrinsic."""
+    state, start = tmp_path / "state.json", off(drive.reference)
     quick = {"tracker__confirmations": 0, "online__rest_period_s": 0.0, "semantics__segmentation": "auto"}
     with node_process(*initial(start), state_file=state, **SMALL_SEARCH, **quick) as node, Observer() as client:
-        out = played(street_bag, "--rate", "4")
+        out = played(street_bag, "--rate", "10")  # ten times as fast as recorded, but as the node can take it
         counts = {line.split()[1]: int(line.split()[0]) for line in out.splitlines()}
         assert counts == {"/camera/camera_info": 8, "/camera/image_raw": 8, "/tf_static": 1, "/velodyne_points": 8}
-        client.until(lambda: client.count("images") == client.count("clouds") == 8, "all images and clouds")
+        client.until(lambda: client.count("images") == client.count("clouds") == client.count("pairs") == 8, "all pairs")
+        assert client.new_values()["pairs dropped by a busy worker"] == "0"
         client.until(lambda: client.get_extrinsic()[2].frames_used >= 7, "an estimate over the whole bag")
         assert_found(client, drive.reference)
         assert client.overlays > 0
-        current = lambda: client.get_extrinsic()[2].T_camera_lidar  # noqa: E731
-        # Classes of later keyframes may give another estimate meanwhile.
-        saved = lambda: np.array(json.loads(state.read_text())["T_camera_lidar"])  # noqa: E731
-        client.until(lambda: np.allclose(saved(), current(), atol=1e-9), "that the current extrinsic is saved")
-        end(node)
 
+        def is_saved() -> bool:
+            """Classes of later keyframes may give another estimate meanwhile."""
+            saved, current = json.loads(state.read_text())["T_camera_lidar"], client.get_extrinsic()[2].T_camera_lidar
+            return np.allclose(saved, current, atol=1e-9)
 
-def test_a_player_that_follows_the_node_loses_no_pair(street_bag: Path, drive: SyntheticDrive) -> None:
-    """Played ten times as fast as recorded, which no node keeps up with, every pair is taken in nevertheless."""
-    with node_process(*initial(drive.reference), search__starts=512) as node, Observer() as client:
-        assert "8  /camera/image_raw" in played(street_bag, "--rate", "10")
-        client.until(lambda: client.count("pairs") == 8, "all pairs")
-        assert client.new_values()["pairs dropped by a busy worker"] == "0"
+        client.until(is_saved, "that the current extrinsic is saved")
         end(node)
 
 
 @pytest.mark.slow
-def test_a_looping_bag_with_its_clock(street_bag: Path, drive: SyntheticDrive) -> None:
+def test_a_looping_bag_with_its_clock(street_bag, drive):
     """Stamps and /clock jump back at the end of every loop: keyframes, estimates and diagnostics go on, nothing is forgotten."""
     start = se3.perturb(drive.reference, [0.8, -0.6, 0.5], [0.04, 0.05, -0.05])
     quick = {"online__min_keyframes": 4, "search__starts": 512, "use_sim_time": True}
@@ -84,13 +107,12 @@ def test_a_looping_bag_with_its_clock(street_bag: Path, drive: SyntheticDrive) -
         assert player.returncode == 0, err
         assert "Traceback" not in err
         assert int(later["keyframes so far"]) > int(first["keyframes so far"])
-        assert int(later["estimates accepted"]) >= int(first["estimates accepted"])
         assert int(later["pairs"]) >= 0.8 * int(later["images"])
         assert "jumped back" in end(node)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_path: Path, number: signal.Signals) -> None:
+def test_signal_during_an_estimate(street_bag, drive, tmp_path, number):
     """The search takes minutes; the node ends without it, and the saved state stays whole."""
     state = tmp_path / "state.json"
     Result(drive.reference, CONVERGED, camera_frame="camera", lidar_frame="velodyne").save(state)
@@ -104,6 +126,18 @@ def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_
     assert state.read_bytes() == saved
 
 
+@pytest.mark.slow
+def test_sigint_during_a_long_estimate_of_the_thesis_objective(street_bag, drive):
+    """Eight smoothings of eq. 3.12 over three frames take minutes; the node ends without them."""
+    smoothing = {"thesis__smoothing": [16.0, 12.0, 8.0, 6.0, 4.0, 3.0, 2.0, 1.0], "thesis__evaluations": 100000}
+    long = {"refine__objective": "thesis", **smoothing, "search__rotation_deg": 0.0, "search__translation_m": 0.0}
+    start = se3.perturb(drive.reference, [0.5, -0.4, 0.3], [0.03, -0.02, 0.03])
+    with node_process(*initial(start), **long, online__min_keyframes=3) as node, Observer() as client:
+        played(street_bag, "--rate", "2")
+        client.until(lambda: client.count("estimate load") > 0.5, "an estimate under way")
+        assert_broken_off(end(node))
+
+
 @pytest.mark.parametrize(
     ("managed", "numbers"),
     [
@@ -114,7 +148,7 @@ def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_
         pytest.param(False, [signal.SIGTERM, signal.SIGINT], marks=pytest.mark.slow),
     ],
 )
-def test_signals_during_a_goal(street_bag: Path, managed: bool, numbers: list[signal.Signals]) -> None:
+def test_signals_during_a_goal(street_bag, managed, numbers):
     manual = {"online__mode": "manual", "initial_from_tf": False}
     with node_process(managed=managed, **LONG_SEARCH, **manual) as node, Observer() as client:
         if managed:
@@ -126,9 +160,57 @@ def test_signals_during_a_goal(street_bag: Path, managed: bool, numbers: list[si
         assert_broken_off(end(node, *numbers))
 
 
+@pytest.mark.slow
+def test_a_publisher_is_killed_and_comes_back(street_bag, drive):
+    """In the middle of its messages; between the two others publish the wrong types on the topics."""
+    start = initial(off(drive.reference))
+    with node_process(*start, **QUICK) as node, Observer() as client:
+        with playing(street_bag):
+            client.until(lambda: client.count("estimates accepted") > 1, "an estimate")
+            assert_recovers(client, drive.reference)
+        assert_kept(client, drive.reference)
+        topics = {"/camera/image_raw": PointCloud2, "/velodyne_points": Image, "/camera/camera_info": Image}
+        swapped = [client._node.create_publisher(kind, topic, 10) for topic, kind in topics.items()]
+
+        def disturb() -> None:
+            for publisher in swapped:
+                publisher.publish(publisher.msg_type())
+            client.spin(0.02)
+
+        for _ in range(20):
+            disturb()
+        assert_kept(client, drive.reference)
+        with playing(street_bag):
+            assert_recovers(client, drive.reference)
+            disturb()  # beside the right ones
+            assert_recovers(client, drive.reference)
+        assert_kept(client, drive.reference)
+        end(node)
+
+
+@pytest.mark.slow
+def test_killed_node_restarts_with_the_last_good_extrinsic(street_bag, drive, tmp_path):
+    """SIGKILL at any moment leaves a whole state file. The next node answers with it before the first image."""
+    state = tmp_path / "state.json"
+    settings = {**QUICK, "state_file": state}
+    with node_process(*initial(off(drive.reference)), **settings) as node, Observer() as client, playing(street_bag):
+        client.until(lambda: client.count("estimates accepted") > 1, "an estimate")
+        node.kill()
+        node.wait()
+    assert [path.name for path in tmp_path.iterdir() if not path.name.startswith(".")] == [state.name]
+    saved = json.loads(state.read_text())
+    assert saved["status"] == "converged"
+    with node_process(**settings), Observer() as client:
+        _, message, result, _ = client.get_extrinsic()
+        assert message
+        np.testing.assert_allclose(result.T_camera_lidar, saved["T_camera_lidar"], atol=1e-9)
+        with playing(street_bag):
+            assert_found(client, drive.reference)  # keyframes confirm what was saved
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("entry_point", ["calib_node", "calib_lifecycle_node"])
-def test_a_signal_while_the_libraries_are_imported(entry_point: str, number: signal.Signals) -> None:
+def test_a_signal_while_the_libraries_are_imported(entry_point, number):
     program = f"""
 import os, sys
 from calib_ros.ros.process import {entry_point}
@@ -143,24 +225,6 @@ sys.exit({entry_point}() + 3)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.slow
-def test_sigint_during_a_long_estimate_of_the_thesis_objective(street_bag: Path, drive: SyntheticDrive) -> None:
-    """Eight smoothings of eq. 3.12 over three frames take minutes; the node ends without them."""
-    long = {
-        "refine__objective": "thesis",
-        "thesis__smoothing": [16.0, 12.0, 8.0, 6.0, 4.0, 3.0, 2.0, 1.0],
-        "thesis__evaluations": 100000,
-        "search__rotation_deg": 0.0,
-        "search__translation_m": 0.0,
-        "online__min_keyframes": 3,
-    }
-    start = se3.perturb(drive.reference, [0.5, -0.4, 0.3], [0.03, -0.02, 0.03])
-    with node_process(*initial(start), **long) as node, Observer() as client:
-        played(street_bag, "--rate", "2")
-        client.until(lambda: client.count("estimate load") > 0.5, "an estimate under way")
-        assert_broken_off(end(node))
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -169,7 +233,7 @@ def test_sigint_during_a_long_estimate_of_the_thesis_objective(street_bag: Path,
         (["--params-file", "/nowhere.yaml"], "nowhere.yaml"),
     ],
 )
-def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments: list[str], text: str) -> None:
+def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path, arguments, text):
     (tmp_path / "bad.yaml").write_text("/**:\n  ros__parameters:\n    search.seed: [1, 2\n")
     command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args"]
     command += [argument.format(bad=tmp_path / "bad.yaml") for argument in arguments]
@@ -180,25 +244,19 @@ def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments
     assert text in lines[0]
 
 
-def test_a_player_says_where_it_follows_nobody(street_bag: Path) -> None:
-    player = play(street_bag, "--follow", "/nobody", "--wait", "0.2", "--rate", "50")
-    _, err = player.communicate(timeout=LIMIT_S)
-    assert player.returncode == 0, err
-    assert "/nobody is not heard" in err
-
-
-def test_player_refuses_paths_without_a_bag(tmp_path: Path) -> None:
-    for path in (tmp_path / "missing", tmp_path):
-        player = play(path)
+def test_a_player_says_where_it_follows_nobody_and_refuses_paths_without_a_bag(street_bag, tmp_path):
+    missing = tmp_path / "missing"
+    for path, code, said in ((street_bag, 0, "/nobody is not heard"), (missing, 2, str(missing)), (tmp_path, 2, str(tmp_path))):
+        player = play(path, "--follow", "/nobody", "--wait", "0.2", "--rate", "50")
         _, err = player.communicate(timeout=LIMIT_S)
-        assert player.returncode == 2
-        assert len(err.splitlines()) == 1
-        assert str(path) in err
+        assert player.returncode == code, err
+        assert said in err
+        assert code == 0 or len(err.splitlines()) == 1
 
 
 @pytest.mark.slow
 @pytest.mark.kitti
-def test_a_kitti_drive_played_into_the_node(kitti_root: Path, tmp_path: Path) -> None:
+def test_a_kitti_drive_played_into_the_node(kitti_root, tmp_path):
     """All images and clouds arrive, the service's answer is soon within 0.35 deg and 10 cm, an overlay comes."""
     source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
     bag = write_bag(source, tmp_path / "bag", "mcap")
@@ -211,7 +269,46 @@ def test_a_kitti_drive_played_into_the_node(kitti_root: Path, tmp_path: Path) ->
         client.until(lambda: client.count("estimates accepted") >= 1, "an extrinsic")
         # Whether the last keyframes, a second apart, make the monitor doubt it depends on which estimates there was time for.
         T = client.get_extrinsic()[2].T_camera_lidar
-        assert se3.rotation_error_deg(source.reference, T) < 0.35
-        assert se3.translation_error_m(source.reference, T) < 0.10
+        assert is_near(source.reference, T, 0.35, 0.10)
         assert client.overlays > 0
         end(node, signal.SIGTERM)
+
+
+# The core alone, without the packages beside it: thesis, semantics, check, view, synthetic.
+WITHOUT = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {"calib_ros_" + n for n in ("thesis", "semantics", "check", "view", "synthetic")}:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+"""
+NODE = WITHOUT + "from calib_ros.ros.process import calib_node\nsys.exit(calib_node())"
+
+
+def test_the_node_calibrates_without_the_packages_beside_it(street_bag, drive):
+    start = se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
+    with node_process(*initial(start), program=NODE, **QUICK, overlay_period_s=0.0) as node, Observer() as client:
+        client.get_extrinsic()
+        player = play(street_bag, "--rate", "4", "--follow", "/calib_ros", "--loop")
+        client.until(lambda: client.get_extrinsic()[2].converged, "an estimate")
+        found = client.get_extrinsic()[2]
+        player.send_signal(signal.SIGINT)
+        player.communicate(timeout=LIMIT_S)
+        services = dict(client._node.get_service_names_and_types())
+        end(node)
+    assert is_near(drive.reference, found.T_camera_lidar, 0.3, 0.08)
+    assert "/calib_ros/get_extrinsic" in services
+    assert "/calib_ros/check" not in services
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"), [(["--help"], 0), (["info", "synthetic"], 2), (["calibrate", "x", "--objective", "thesis"], 2)]
+)
+def test_the_command_line_does_without_what_the_packages_bring(arguments, code):
+    program = WITHOUT + f"from calib_ros.cli.main import main\nsys.exit(main({arguments!r}))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "evaluate" in done.stdout or code == 2
+    assert " demo" not in done.stdout

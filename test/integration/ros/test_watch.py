@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 
 import cv2
@@ -17,9 +16,7 @@ from vehicle import QUICK, Vehicle
 from waiting import LIMIT_S, until
 
 from calib_ros.errors import BadInputError
-from calib_ros.frame import Frame
 from calib_ros.ros.conversions import image_message
-from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_view.node.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch
 from calib_ros_view.session.live import NEUTRAL, Presence
 from calib_ros_view.web.live_words import words_of_check
@@ -29,26 +26,27 @@ PARAMETERS = {**QUICK, "online__mode": "manual"}
 
 
 @pytest.fixture(scope="module")
-def watch() -> Iterator[Watch]:
+def watch():
     with Watch("/calib_ros") as watching:
         yield watching
 
 
 @pytest.fixture(scope="module")
-def first_node() -> Iterator[ExitStack]:
-    """Ends the first node, at the latest when all tests are done."""
-    with ExitStack() as stack:
-        yield stack
-
-
-@pytest.fixture(scope="module")
-def peer(watch: Watch, first_node: ExitStack, drive: SyntheticDrive) -> Peer:
-    """Comes after the watch: the page is open before the node is."""
+def peer(watch, drive):
+    """Comes after the watch: the page is open before the node is. end(): ends it, before the tests are done."""
     assert watch.history.presence is Presence.WAITING
     answer = watch.call(GET_EXTRINSIC).result(LIMIT_S)
     assert not answer.success
     assert "is not there" in answer.message
-    return first_node.enter_context(Peer(**start_parameters(drive.reference), **PARAMETERS))
+    with ExitStack() as stack:
+        peer = stack.enter_context(Peer(**start_parameters(drive.reference), **PARAMETERS))
+        peer.end = stack.close
+        yield peer
+
+
+@pytest.fixture(scope="module")
+def vehicle(peer, street, drive):
+    return Vehicle(peer, street, drive.reference)
 
 
 def texts(watch: Watch) -> str:
@@ -56,21 +54,17 @@ def texts(watch: Watch) -> str:
         return "\n".join(event.text for event in watch.history.events)
 
 
-def test_a_node_that_starts_later_is_found_and_heard(watch: Watch, peer: Peer) -> None:
+def test_a_node_that_starts_later_is_found_and_heard(watch, peer):
     until(lambda: watch.history.presence is Presence.LIVE, "the node is heard")
     assert "/calib_ros" in until(watch.nodes_seen, "names of nodes")
     assert until(lambda: watch.history.diagnosis.values, "diagnostics")["status"] == "none"
 
 
-def test_without_keyframes_the_gallery_says_what_to_wait_for(watch: Watch, peer: Peer) -> None:
+def test_keyframes_are_drawn_with_score_and_age(watch, peer, vehicle):
     answer = watch.keyframes().result(LIMIT_S)
     assert not answer.success
     assert "no keyframe yet" in answer.message
     assert not answer.response.keyframes
-
-
-def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive) -> None:
-    vehicle = Vehicle(peer, street, drive.reference)
     peer.drive(vehicle.frame() for _ in range(4))
     answer = watch.keyframes(3, 200).result(LIMIT_S)
     assert answer.success, answer.message
@@ -81,21 +75,16 @@ def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street
     assert picture.shape == (60, 200, 3)
     assert np.ptp(picture.astype(int), axis=2).max() > 100, "edge points are coloured"
     assert answer.response.cpu > 0
-
-
-def test_a_width_that_makes_no_sense_is_refused(watch: Watch, peer: Peer) -> None:
     answer = watch.keyframes(1, 5000).result(LIMIT_S)
     assert not answer.success
     assert "64 to 1280 px wide" in answer.message
 
 
-def test_the_overlay_is_only_drawn_for_lookers(watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive) -> None:
+def test_the_overlay_is_only_drawn_for_lookers(watch, peer, vehicle):
     publisher = peer.calibration.overlay._publisher
     assert publisher.get_subscription_count() == 0
     lookers = [watch.look(), watch.look()]
     until(publisher.get_subscription_count, "a subscription")
-    vehicle = Vehicle(peer, street, drive.reference)
-    vehicle.stamp += 60 * 10**9
     until(lambda: peer.publish(vehicle.frame()) or watch.overlay.number, "an overlay")
     assert cv2.imdecode(np.frombuffer(watch.overlay.jpeg, np.uint8), cv2.IMREAD_COLOR).ndim == 3
     watch.leave(lookers[0])
@@ -106,7 +95,7 @@ def test_the_overlay_is_only_drawn_for_lookers(watch: Watch, peer: Peer, street:
     until(lambda: publisher.get_subscription_count() == 0, "no subscription")
 
 
-def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: Peer) -> None:
+def test_services_answer_and_what_they_say_becomes_an_event(watch, peer):
     assert "nothing to save" in watch.call(SAVE).result(LIMIT_S).message
     answers = [watch.call(CALIBRATE), watch.call(CALIBRATE)]
     assert "is being called already" in answers[1].result(LIMIT_S).message
@@ -122,19 +111,13 @@ def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: 
         assert text in texts(watch)
 
 
-def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(
-    watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive
-) -> None:
+def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(watch, peer, vehicle):
     assert watch.progress is None
     assert not watch.stop()
-    vehicle = Vehicle(peer, street, drive.reference)
-    vehicle.stamp += 120 * 10**9
     peer.drive(vehicle.frame() for _ in range(4))
     peer.change(search__starts=1 << 20)  # minutes
     answer = watch.call(CALIBRATE)
-    assert until(lambda: (watch.progress or ("", 0.0))[1] > 0, "progress")
-    assert watch.progress is not None
-    assert watch.progress[0] == "search"
+    until(lambda: watch.progress is not None and watch.progress[0] == "search" and watch.progress[1] > 0, "progress")
     assert watch.stop()
     stopped = answer.result(LIMIT_S)
     assert (stopped.success, stopped.message) == (False, "stopped before the estimate was done")
@@ -150,10 +133,8 @@ def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(
     peer.change(search__starts=64)
 
 
-def test_a_node_that_ends_is_noticed_and_its_restart_too(
-    watch: Watch, peer: Peer, first_node: ExitStack, drive: SyntheticDrive
-) -> None:
-    first_node.close()
+def test_a_node_that_ends_is_noticed_and_its_restart_too(watch, peer, drive):
+    peer.end()
     until(lambda: watch.history.presence is Presence.GONE, "it is gone")
     assert "nothing heard of the node" in texts(watch)
     with Peer(**start_parameters(drive.reference), **PARAMETERS):
@@ -162,7 +143,7 @@ def test_a_node_that_ends_is_noticed_and_its_restart_too(
     assert "the node is back after" in texts(watch)
 
 
-def test_a_call_to_a_node_that_was_killed_ends_once_another_is_there(street: list[Frame]) -> None:
+def test_a_call_to_a_node_that_was_killed_ends_once_another_is_there(street):
     with Watch("/calib_ros") as watching:
         images = watching._node.create_publisher(Image, "/camera/image_raw", 10)
         counted = lambda: watching.history.diagnosis.number("images") >= 3  # noqa: E731
@@ -177,12 +158,12 @@ def test_a_call_to_a_node_that_was_killed_ends_once_another_is_there(street: lis
 
 
 @pytest.mark.parametrize("name", ["", "/", "/a b", "/calib_ros; rm", "/../x"])
-def test_a_name_that_no_node_can_have_is_refused(name: str) -> None:
+def test_a_name_that_no_node_can_have_is_refused(name):
     with pytest.raises(BadInputError, match="no name of a ROS node"):
         Watch(name)
 
 
-def test_calls_under_way_are_answered_when_the_viewer_ends() -> None:
+def test_calls_under_way_are_answered_when_the_viewer_ends():
     watching = Watch("/nobody")
     watching.close()
     watching.close()

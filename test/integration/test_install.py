@@ -1,4 +1,4 @@
-"""The wheel as `pip install calib_ros` gets it: what it holds, what it declares, and that it calibrates alone."""
+"""What users install: the wheel, which declares and holds what it needs and calibrates alone, and packages for colcon."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import subprocess
 import sys
 import venv
 import xml.etree.ElementTree as ET
-from email.message import Message
 from email.parser import Parser
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+from catkin_pkg.packages import find_packages
 from paths import ROOT
 
 import calib_ros
 
-pytestmark = pytest.mark.slow
+slow = pytest.mark.slow
 # What a user types first; `mypy --strict` accepts it.
 USER_SCRIPT = """\
 from calib_ros import Calibrator, Result, SearchBox, open_dataset
@@ -36,7 +36,7 @@ def run(*command: object, **more: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(tmp_path_factory):
     """Built from a copy, since a build leaves folders behind."""
     folder = tmp_path_factory.mktemp("wheel")
     copy = folder / "calib_ros"
@@ -49,14 +49,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-@pytest.fixture(scope="module")
-def metadata(wheel: Path) -> Message:
-    with ZipFile(wheel) as file:
-        (name,) = (name for name in file.namelist() if name.endswith("METADATA"))
-        return Parser().parsestr(file.read(name).decode())
-
-
-def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel: Path) -> None:
+@slow
+def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel):
     with ZipFile(wheel) as file:
         names = file.namelist()
     sources = {
@@ -65,20 +59,22 @@ def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel: Path) 
         for path in package.parent.rglob("*")
         if path.suffix in (".py", ".typed", ".onnx") or path.name == "LICENSE"
     }
-    data = f"calib_ros-{calib_ros.__version__}.data/data/share/"
-    shared = {
-        f"{data}calib_ros/{name}"
-        for name in ("package.xml", *(path.relative_to(ROOT).as_posix() for path in (ROOT / "config").iterdir()))
+    files = [ROOT / "package.xml", *(ROOT / "config").iterdir(), *(ROOT / "launch").glob("*.launch.py")]
+    shared = {f"calib_ros/{path.relative_to(ROOT).as_posix()}" for path in files} | {
+        "ament_index/resource_index/packages/calib_ros"
     }
-    shared |= {f"{data}calib_ros/launch/{path.name}" for path in (ROOT / "launch").glob("*.launch.py")}
-    shared.add(f"{data}ament_index/resource_index/packages/calib_ros")
+    shared = {f"calib_ros-{calib_ros.__version__}.data/data/share/{name}" for name in shared}
     compiled = {name for name in names if name.endswith((".so", ".pyd"))}
     assert len(compiled) == 1
     assert compiled.pop().startswith("calib_ros/registration/score/kernel")
     assert {name for name in names if ".dist-info/" not in name and not name.endswith((".so", ".pyd"))} == sources | shared
 
 
-def test_its_metadata_name_version_requirements_and_extras(metadata: Message) -> None:
+@slow
+def test_its_metadata_name_version_requirements_and_extras(wheel):
+    with ZipFile(wheel) as file:
+        (name,) = (name for name in file.namelist() if name.endswith("METADATA"))
+        metadata = Parser().parsestr(file.read(name).decode())
     package = ET.parse(ROOT / "package.xml").getroot()
     assert metadata["Name"] == package.findtext("name") == "calib_ros"
     assert metadata["Version"] == package.findtext("version") == calib_ros.__version__
@@ -90,8 +86,9 @@ def test_its_metadata_name_version_requirements_and_extras(metadata: Message) ->
     assert {"bags", "models", "motion", "evaluation", "all", "cluster", "training", "test"} <= extras
 
 
+@slow
 @pytest.mark.timeout(900)  # pip, a calibration and mypy in a fresh environment
-def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel: Path, tmp_path: Path) -> None:
+def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel, tmp_path):
     """Without ROS, onnxruntime and rosbags: what install_requires names is enough."""
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
@@ -113,3 +110,28 @@ def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel: Pa
     assert done.stdout == "converged (4, 4)\n", done.stderr
     done = run(sys.executable, "-m", "mypy", "--strict", "--python-executable", python, script, cwd=tmp_path)
     assert done.returncode == 0, done.stdout
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    """The commands of the README, with a link in place of the clone."""
+    (link,) = re.findall(r"^ln -s (\S+) \.", (ROOT / "README.md").read_text(), re.MULTILINE)
+    source = tmp_path / "src"
+    source.mkdir()
+    (source / "calib_ros").symlink_to(ROOT)
+    (source / Path(link).name).symlink_to(link)
+    return tmp_path
+
+
+def test_rosdep_finds_both_packages(workspace):
+    found = {path: package.name for path, package in find_packages(str(workspace / "src")).items()}
+    assert found == {"calib_ros": "calib_ros", "calib_ros_msgs": "calib_ros_msgs"}
+
+
+@pytest.mark.skipif(shutil.which("colcon") is None, reason="colcon is not installed; see requirements-colcon.txt")
+def test_plain_colcon_finds_both_packages(workspace):
+    done = subprocess.run(["colcon", "list"], cwd=workspace, capture_output=True, text=True)
+    assert [line.split("\t") for line in done.stdout.splitlines()] == [
+        ["calib_ros", "src/calib_ros", "(ros.ament_python)"],
+        ["calib_ros_msgs", "src/calib_ros_msgs", "(ros.ament_cmake)"],
+    ], done.stderr

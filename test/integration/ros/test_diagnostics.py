@@ -1,0 +1,212 @@
+"""What /diagnostics reports: levels and warnings with their cause, figures of a node at work, and its accounting of CPU time."""
+
+from __future__ import annotations
+
+import logging
+import time
+from functools import partial
+from itertools import count
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_peer import Peer, start_parameters
+from sensor_msgs.msg import Image
+from vehicle import QUICK, Vehicle
+from waiting import until
+
+from calib_ros.camera import Camera
+from calib_ros.config import Config, OnlineConfig
+from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
+from calib_ros.online.events import Inputs
+from calib_ros.online.pacing import KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work
+from calib_ros.online.pipeline import Pipeline
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
+from calib_ros.ros.conversions import time_message
+from calib_ros.ros.diagnostics import Diagnostics, Health, refined_values
+
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+MAX_LOAD = 0.3
+DRIVE_S, PERIOD_S = 8.0, 0.05  # s after the budget has become tight, and between pairs
+# An estimate that nothing was known of before, and a keyframe: by so much the budget may be overdrawn, s of CPU time.
+OVERDRAWN_S = 3.0
+
+
+class Watched:
+    """Diagnostics of a pipeline that nothing is sent to; time is what the test says."""
+
+    def __init__(self) -> None:
+        config = Config(online=OnlineConfig(max_load=0.05))
+        self.now, self.health = 0.0, Health(logging.getLogger())
+        self.pipeline = Pipeline(config, Inputs(*3 * [lambda *_: None]), lambda event: None)
+        self.load = self.pipeline.load = LoadBudget(config.online, lambda: self.now)
+        self.diagnostics = Diagnostics("/calib_ros", self.health, self.pipeline)
+
+    def status(self, **extra: str) -> DiagnosticStatus:
+        return self.diagnostics.message(time_message(0), extra).status[0]
+
+
+@pytest.fixture
+def watched():
+    made = Watched()
+    yield made
+    assert made.pipeline.stop()
+
+
+@pytest.mark.parametrize(
+    ("status", "level", "text"),
+    [
+        (CONVERGED, OK, "converged"),
+        (REFUSED, WARN, "refused: because"),
+        (INSUFFICIENT, WARN, "insufficient: because"),
+        (SUSPECT, WARN, "suspect: because"),
+        (MOVED, ERROR, "moved: because"),
+        (BLINDED, ERROR, "blinded: check the hardware: a sensor shows nothing: because"),
+    ],
+)
+def test_every_status_has_its_level(watched, status, level, text):
+    assert watched.status().message == "collecting keyframes"
+    covariance = np.diag([1e-6, 4e-6, 1e-6, 1e-4, 1e-4, 9e-4])
+    result = Result(np.eye(4), status, "" if status == CONVERGED else "because", 0.9, covariance)
+    watched.health.add_extrinsic(Extrinsic(result, 1.25, 7, "does not fit", 0.031))
+    found = watched.status(more="yes")
+    assert (found.level, found.message) == (level, text)
+    said = {v.key: v.value for v in found.values}
+    assert (said["status"], said["drift"], said["estimates accepted"], said["more"]) == (status, "1.25", "7", "yes")
+    assert said["sigma of rotation, deg"] == f"{np.rad2deg(2e-3):.3f}"
+    assert said["sigma of translation, m"] == "0.0300"
+    assert (said["monitor p-value"], said["monitor"]) == ("0.031", "does not fit")
+
+
+def twice_the_budget(watched: Watched) -> None:
+    for _ in range(4):
+        watched.now += KEYFRAME_EVERY_S
+        watched.load.add(Work.INTAKE, 0.1 * KEYFRAME_EVERY_S)
+        assert watched.load.allows_keyframe()
+
+
+def frames_wait(watched: Watched) -> None:
+    for _ in range(100):
+        watched.now += 1.0
+        if watched.load.allows_keyframe():
+            watched.load.add(Work.KEYFRAMES, 0.2)
+    assert watched.load.counts().postponed > 50
+
+
+def motion_unknown(watched: Watched, keyframes: int) -> None:
+    watched.pipeline.recalibrator.motion.left_out = keyframes
+
+
+def pairs_dropped(watched: Watched, computed: float) -> None:
+    watched.pipeline.synchronizer.counts.pairs += 20
+    watched.pipeline._ingester.dropped += 15
+    watched.pipeline._ingester.busy_s += 4.0
+    watched.load.add(Work.KEYFRAMES, computed * 4.0)
+
+
+DROPPED = ("75% of the pairs are dropped", "lower online.max_load")
+
+
+@pytest.mark.parametrize(
+    ("happens", "texts"),
+    [
+        (twice_the_budget, ("online.max_load = 0.05 does not even allow for a keyframe in 5 s", "raise it")),
+        (twice_the_budget, ("keyframes beyond online.max_load: 4",)),
+        (frames_wait, ()),
+        (partial(motion_unknown, keyframes=2), ()),
+        (partial(motion_unknown, keyframes=3), ("3 keyframes of the last", "motion from scans: none needed so far")),
+        (partial(pairs_dropped, computed=1.0), (*DROPPED, "keyframes take all the time")),
+        (partial(pairs_dropped, computed=0.2), (*DROPPED, "the node gets too little CPU time")),
+    ],
+)
+def test_what_keeps_keyframes_away_is_a_warning_with_cause_and_advice(watched, drive, happens, texts):
+    watched.pipeline.recalibrator = Recalibrator(drive.camera, drive.reference, watched.pipeline.config)
+    assert watched.status().level == OK
+    happens(watched)
+    found = watched.status()
+    assert found.level == (WARN if texts else OK)
+    said = "\n".join([found.message, *(f"{v.key}: {v.value}" for v in found.values)])
+    assert all(text in said for text in texts), said
+
+
+def test_refined_intrinsics_are_told_in_numbers():
+    camera = Camera(np.array([[714.0, 0, 630.25], [0, 714, 370], [0, 0, 1]]), 1280, 720, D=np.array([-0.31, 0.1, 0, 0, 0]))
+    changes = {
+        "focal_length_share": IntrinsicEstimate(0.02, 0.001, True),
+        "principal_point_x_px": IntrinsicEstimate(-3.0, 1.5, True),
+        "k1": IntrinsicEstimate(0.0, 0.004, False),
+    }
+    assert refined_values(RefinedCamera(camera, np.eye(4), changes, np.eye(9))) == {
+        "refined focal length, px": "714.0 +- 0.7",
+        "refined principal point x, px": "630.2 +- 1.5",
+        "refined principal point y, px": "unknown",
+        "refined k1": "-0.3100 +- 0.0040, as stated",
+    }
+    assert set(refined_values(None).values()) == {"unknown"}
+
+
+def test_a_node_at_work(street, drive, monkeypatch):
+    """An exception in a callback ends neither node nor service."""
+    with Peer(**start_parameters(drive.reference), **QUICK, initial_from_tf=False) as peer:
+
+        def broken(*_: Any) -> Any:
+            raise ZeroDivisionError("by hand")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(peer.pipeline.synchronizer, "add_image", broken)
+            patch.setattr(peer.calibration.initial, "before_messages", broken)
+            peer.image_pub.publish(Image())
+            peer.until(lambda: peer.calibration.health.errors == 1)
+            assert "unexpected ZeroDivisionError in test_diagnostics.py:" in peer.last_error()
+            assert "please report it" in peer.get_extrinsic().message
+        peer.publish(street[0])
+        assert peer.get_extrinsic().message == "from the parameters"
+        peer.drive(street[1:5])
+        peer.image_pub.publish(Image())  # that no cloud belongs to
+        peer.until(lambda: peer.values.get("images") == "6" and peer.values["estimates accepted"] != "0")
+        said = peer.values
+    assert said["status"] == "converged"
+    assert (said["clouds"], said["pairs"], said["keyframes so far"]) == ("5", "5", "5")
+    assert float(said["age of the last estimate, s"]) >= 0
+    assert 0 < float(said["sigma of rotation, deg"]) < 1
+    assert 0 < float(said["sigma of translation, m"]) < 0.3
+    assert float(said["callback 99th percentile, ms"]) > 0
+    assert said["motion from scans"].startswith("failed: the scans are 1 s apart")
+    assert said["frames too fast for a keyframe"] == "0"
+
+
+def test_the_nodes_own_accounting_keeps_to_the_budget(street, drive):
+    """Every frame is to be a keyframe, at 20 Hz: that would take more than a core."""
+    wanted = {"keyframe_spacing_s": 0.0, "similarity_threshold": 1.0, "static_similarity": 1.0, "min_keyframes": 3}
+    options = {f"online__{name}": value for name, value in wanted.items()}
+    with Peer(**start_parameters(drive.reference), online__max_load=MAX_LOAD, search__rotation_deg=0.0, **options) as peer:
+        vehicle, pairs = Vehicle(peer, street, drive.reference), count(1)
+        now = 0.0  # s; time goes on with the pairs, so that the budget gets tight on a busy machine as well
+
+        def drive_on() -> None:
+            nonlocal now
+            peer.publish(vehicle.frame(1.0))
+            now = next(pairs) * PERIOD_S
+            time.sleep(PERIOD_S)
+
+        budget = peer.pipeline.load = LoadBudget(peer.pipeline.config.online, lambda: now)
+        until(lambda: budget.counts().postponed > 10, "a tight budget", drive_on)
+        began, before = now, budget.counts()
+        until(lambda: now - began >= DRIVE_S, "the end of the drive", drive_on)
+        took, after = now - began, budget.counts()
+        values = peer.new_values()
+
+    used = sum(after.seconds.values()) - sum(before.seconds.values())
+    assert used <= MAX_LOAD * took + OVERDRAWN_S
+    assert after.postponed > before.postponed
+    assert after.keyframes - before.keyframes >= int(took / (KEYFRAME_EVERY_S + 1.0))  # never none
+    assert after.seconds[Work.MESSAGES] > before.seconds[Work.MESSAGES] > 0
+    share, _, allowed = values["CPU, share of a core"].partition(" of ")
+    assert float(allowed) == MAX_LOAD
+    parts = [float(values[f"CPU for {work.value}"]) for work in Work]
+    assert sum(parts) == pytest.approx(float(share), abs=0.01)
+    assert sum(parts) <= MAX_LOAD + (SAVED_S * MAX_LOAD + OVERDRAWN_S) / min(took, 30.0)
+    assert int(values["frames that waited for online.max_load"]) >= after.postponed

@@ -1,0 +1,189 @@
+"""Parameters over real DDS: described, refused in one line, renamed, and changed while data flow."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.parameter import Parameter
+from ros_peer import Peer, camera_info_message
+from vehicle import vehicle_fixture  # noqa: F401  # a fixture
+
+from calib_ros.config import SearchConfig, stages
+from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.online import recalibrator as recalibrator_module
+from calib_ros.ros import parameters
+from calib_ros.ros.parameters import SETTINGS
+
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
+
+
+def test_misspelt_names_are_answered_with_the_nearest():
+    declared = ["search.rotation_deg", "online.buffer_size", "publish_tf", "use_sim_time"]
+    given = [
+        *("serch.rotation_deg", "online.bufer_size", "publish_tf", "use_sim_time", "zzz", "start_type_description_service"),
+        "qos_overrides./image.subscription.depth",
+    ]
+    assert parameters.misspelt(dict.fromkeys(given, 1), declared) == [
+        "parameter 'online.bufer_size' is unknown and has no effect; did you mean 'online.buffer_size'?",
+        "parameter 'serch.rotation_deg' is unknown and has no effect; did you mean 'search.rotation_deg'?",
+        "parameter 'zzz' is unknown and has no effect; config/calib_ros.yaml lists all there are",
+    ]
+    (changed,) = parameters.misspelt({"search.distinct": 80}, [])
+    assert changed == "search.distinct has no effect any more, 20 is used; remove it"
+
+
+def test_misspelt_former_and_removed_names_are_logged_once_at_the_start(capfd):
+    """The value of a former name is taken over."""
+    former = {"tracker__drift_deg": 0.2, "tracker__drift_m": 0.02}
+    removed = {"search__distinct": 20, "lidar__jump_min": 0.3, "score__sigma": [16.0, 8.0, 4.0, 2.0, 1.2]}
+    with Peer(serch__rotation_deg=5.0, use_sim_time=False, online__buffer_size=9, **former, **removed) as peer:
+        config = peer.calibration.parameters.config
+        assert (config.tracker.process_noise_deg, config.tracker.process_noise_m) == (0.2, 0.02)
+        assert peer.node.get_parameter("tracker.process_noise_deg").value == 0.2
+        assert config.search.starts == SearchConfig().starts
+        assert not any(map(peer.node.has_parameter, ("tracker.drift_deg", "search.distinct")))
+    lines = capfd.readouterr().err.splitlines()
+    assert ["did you mean 'search.rotation_deg'?" in line for line in lines if "is unknown" in line] == [True]
+    renamed = [line for line in lines if "is now called" in line]
+    assert len(renamed) == 2
+    assert any("'tracker.drift_deg' is now called 'tracker.process_noise_deg'; its value is used" in line for line in renamed)
+    (line,) = [line for line in lines if "have no effect any more; remove them" in line]
+    assert "lidar.jump_min" in line
+    assert "score.sigma" in line
+
+
+def test_a_parameter_under_both_names_is_refused():
+    with pytest.raises(ConfigError, match=r"tracker.drift_deg is the former name of tracker.process_noise_deg; give only"):
+        Peer(tracker__drift_deg=0.2, tracker__process_noise_deg=0.2)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"search__rotation_deg": -5.0}, "search.rotation_deg"),
+        ({"search__rotation_deg": "wide"}, "search.rotation_deg"),
+        ({"initial_quaternion_xyzw": [0.0, 1.0]}, "quaternion"),
+        ({"initial_translation_m": [0.0], "initial_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}, "initial_translation_m"),
+        ({"image_transport": "theora"}, "image_transport"),
+        ({"overlay_period_s": -1}, "overlay_period_s"),
+        ({"overlay_period_s": "often"}, "overlay_period_s"),
+        ({"constraints__sigma_m": [1.0, 2.0]}, "constraints.sigma_m"),
+    ],
+)
+def test_bad_parameters_at_the_start(wrong, text):
+    with pytest.raises(CalibrationError, match=text):
+        Peer(**wrong)
+
+
+def test_every_parameter_describes_its_meaning_and_range(vehicle):
+    defaults = {name: setting.default for name, setting in SETTINGS.items()}
+    defaults |= {f"{stage}.{f.name}": f.default for stage, cls in stages().items() for f in dataclasses.fields(cls)}
+    client = vehicle.peer.peer.create_client(DescribeParameters, "/calib_ros/describe_parameters")
+    found = vehicle.peer.call(client, DescribeParameters.Request(names=list(defaults))).descriptors
+    assert [d.name for d in found] == list(defaults)
+    for d in found:
+        assert d.description
+        ranged = d.floating_point_range or d.integer_range or d.additional_constraints
+        assert ranged or isinstance(defaults[d.name], (bool, str)) or d.name.startswith("initial_"), d.name
+        assert d.read_only == (d.name in SETTINGS and not SETTINGS[d.name].live)
+
+
+GOOD_VALUES: list[tuple[str, Any]] = [
+    ("search.rotation_deg", 7),  # a whole number where a fraction may stand
+    ("online.buffer_size", 9),
+    ("image.max_width", 800),
+    ("score.weight_reflectivity", 0.5),
+    ("constraints.sigma_m", [0.1, 0.1, 0.2]),
+    ("publish_tf", True),
+    ("overlay_period_s", 0.07),
+    ("reliability", "reliable"),
+    ("online.mode", "manual"),
+    ("refine.optimizer", "nelder_mead"),
+    ("search.starts", 512),
+]
+BAD_VALUES: list[tuple[str, Any, str]] = [
+    ("search.rotation_deg", -5.0, "search.rotation_deg"),
+    ("search.rotation_deg", "wide", "must be of type float"),
+    ("search.rotation_deg", float("nan"), "search.rotation_deg"),
+    ("search.starts", 2**40, "search.starts"),
+    ("search.starts", "many", "parameter type"),
+    ("refine.optimizer", "magic", "refine.optimizer"),
+    ("constraints.sigma_m", [1.0], "constraints.sigma_m"),
+    ("online.min_keyframes", 150, "online.min_keyframes"),
+    ("camera_frame", "other", "camera_frame"),
+    ("tf_parent", "map", "tf_child must name its child"),
+    ("search.nothing", 1, "undeclared"),
+]
+
+
+def test_rapid_changes_while_data_flow(vehicle, monkeypatch):
+    """Every one is answered, good and bad by turns, and what holds is what was taken. No message is lost, and what is heavy is
+    made once per keyframe at most."""
+    peer, made = vehicle.peer, []
+    client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
+    before = {name: peer.node.get_parameter(name) for name, _ in GOOD_VALUES}
+    original = recalibrator_module.Calibrator
+    monkeypatch.setattr(recalibrator_module, "Calibrator", lambda *given: made.append(given) or original(*given))
+    counts, frames = peer.pipeline.synchronizer.counts, len(GOOD_VALUES)
+    pairs, unpaired = counts.pairs, counts.unpaired_images
+
+    def change(name: str, value: Any) -> Any:
+        parameter = (value if isinstance(value, Parameter) else Parameter(name, value=value)).to_parameter_msg()
+        return peer.call(client, SetParameters.Request(parameters=[parameter])).results[0]
+
+    def held(name: str) -> Any:
+        assert peer.pipeline.config == peer.calibration.parameters.config
+        return peer.calibration.parameters.to_dict().get(name)
+
+    for (name, value), (bad, wrong, text) in zip(GOOD_VALUES, BAD_VALUES, strict=True):
+        for good in (value, before[name], value):
+            answer = change(name, good)
+            assert answer.successful, (name, answer.reason)
+        assert held(name) == value
+        kept = held(bad)
+        refused = change(bad, wrong)
+        assert not refused.successful, (bad, wrong)
+        assert text in refused.reason
+        assert held(bad) == kept
+        peer.publish(vehicle.frame(1.0), settle=False)
+    assert not change("search.starts", Parameter("search.starts", Parameter.Type.NOT_SET)).successful
+    peer.until(lambda: peer.calibration.overlay.period_s == 0.07, "the other period")
+    peer.until(lambda: peer.peer.count_publishers("/tf_static") == 1, "the publisher of TF")
+    peer.until(lambda: counts.pairs == pairs + frames, "all pairs")
+    peer.settle()
+    vehicle.assert_kept()
+    assert counts.unpaired_images == unpaired
+    assert len(made) <= frames + 1
+    for name, parameter in before.items():
+        assert change(name, parameter).successful
+        assert np.all(np.array(held(name)) == np.array(peer.node.get_parameter(name).value))
+    peer.until(lambda: peer.peer.count_publishers("/tf_static") == 0, "the end of TF")
+    vehicle.assert_recovers()
+    vehicle.assert_kept()
+
+
+def test_settings_take_effect_at_run_time(vehicle, tmp_path):
+    peer, state = vehicle.peer, tmp_path / "state.json"
+    recalibrator = peer.recalibrator
+    peer.change(online__buffer_size=7)
+    assert recalibrator.buffer.maxlen == 7
+    peer.change(state_file=str(state))  # from the next accepted estimate on
+    vehicle.assert_recovers()
+    assert json.loads(state.read_text())["status"] == "converged"
+
+    # Rectified images: another camera, without a new CameraInfo.
+    camera, message = peer.pipeline.camera, camera_info_message(vehicle.frame())
+    message.p[0] *= 1.05
+    peer.info_pub.publish(message)
+    peer.change(image_is_rectified=True)
+    peer.until(lambda: peer.pipeline.camera != camera)
+    assert peer.pipeline.camera.K[0, 0] == pytest.approx(1.05 * camera.K[0, 0])
+    peer.change(image_is_rectified=False)
+    peer.until(lambda: peer.pipeline.camera == camera)
+    assert peer.get_extrinsic().last_good_known  # the extrinsic stays through both, to be tested again
+    vehicle.assert_recovers()
