@@ -35,7 +35,7 @@ from calib_ros.ros import parameters
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import image_message, time_message, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health, refined_values
-from calib_ros.ros.parameters import SETTINGS
+from calib_ros.ros.parameters import LIVE, SETTINGS
 from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -111,7 +111,7 @@ def test_every_parameter_describes_its_meaning_and_range() -> None:
         assert d.description
         ranged = d.floating_point_range or d.integer_range or d.additional_constraints
         assert ranged or isinstance(defaults[d.name], (bool, str)) or d.name.startswith("initial_"), d.name
-        assert d.read_only == (d.name in SETTINGS and not SETTINGS[d.name].live)
+        assert d.read_only == (d.name in SETTINGS and d.name not in LIVE)
 
 
 def test_settings_take_effect_at_run_time(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
@@ -193,7 +193,7 @@ def test_a_camera_that_is_stamped_late_is_found_with_the_mount() -> None:
         seed=3, frames=11, width=640, height=240, rings=32, speed=8, stride=3, ride="weaving", image_late_ms=80.0
     )
     T = se3.perturb(drive.reference, [0.3, -0.2, 0.2], [0.02, 0, 0])
-    keyframes = {"min_keyframes": 5, "buffer_size": 12, "keyframe_interval_s": 0.2, "mode": "manual"}
+    keyframes = {"min_keyframes": 5, "buffer_size": 12, "similarity_threshold": 1.0, "mode": "manual"}
     with Peer(**start(T), **{**QUICK, **{f"online__{name}": value for name, value in keyframes.items()}}) as peer:
         for k in range(len(drive)):
             # The motion is that of the scans. A pair is final when the next messages have come.
