@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from calib_ros import io, se3
 from calib_ros.camera import Camera
@@ -19,6 +20,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros.result import Result, parse
 
+T = TypeVar("T")
 CHECKSUM = "sha256"
 REMEDY = "delete it or name another state_file"
 
@@ -101,34 +103,25 @@ def read_state(path: str | Path) -> State:
         # A file with a provenance has a checksum; where it is missing, its key is what was damaged.
         if (CHECKSUM in data or "provenance" in data) and data.pop(CHECKSUM, None) != _digest(data):
             raise BadInputError(f"saved state {path} is damaged or edited: its checksum does not fit its content; {REMEDY}")
-        return State(result, _camera(data.get("camera")), _provenance(data.get("provenance")))
-    except _UnusableError as error:
-        raise BadInputError(f"saved state {path} holds no usable {error}; {REMEDY}") from None
     except (TypeError, ValueError, RecursionError):  # keys that are no text, or lists that hold themselves
         raise BadInputError(f"saved state {path} cannot be checked for damage; {REMEDY}") from None
 
+    def usable(name: str, made_of: Callable[[Any], T]) -> T | None:
+        try:
+            return None if data.get(name) is None else made_of(data[name])
+        except (AttributeError, LookupError, TypeError, ValueError, OverflowError, BadInputError):
+            raise BadInputError(f"saved state {path} holds no usable {name}; {REMEDY}") from None
 
-class _UnusableError(Exception):
-    """Its text names what cannot be used."""
-
-
-def _camera(data: Any) -> Camera | None:
-    if data is None:
-        return None
-    try:
-        return Camera(data["K"], int(data["width"]), int(data["height"]), data["model"], data["D"])
-    except (AttributeError, LookupError, TypeError, ValueError, OverflowError, BadInputError):
-        raise _UnusableError("camera") from None
+    return State(result, usable("camera", _camera), usable("provenance", _provenance))
 
 
-def _provenance(data: Any) -> Provenance | None:
-    if data is None:
-        return None
-    try:
-        numbers = {name: int(data.get(name, 0)) for name in ("accepted", "keyframes", "sensor_stamp_ns")}
-        return Provenance(objective=str(data.get("objective", "")), config=str(data.get("config", "")), **numbers)
-    except (AttributeError, TypeError, ValueError, OverflowError):
-        raise _UnusableError("provenance") from None
+def _camera(data: Any) -> Camera:
+    return Camera(data["K"], int(data["width"]), int(data["height"]), data["model"], data["D"])
+
+
+def _provenance(data: Any) -> Provenance:
+    numbers = {name: int(data.get(name, 0)) for name in ("accepted", "keyframes", "sensor_stamp_ns")}
+    return Provenance(objective=str(data.get("objective", "")), config=str(data.get("config", "")), **numbers)
 
 
 def _digest(data: dict[str, Any]) -> str:

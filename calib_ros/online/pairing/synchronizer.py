@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
+from bisect import insort
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -31,7 +32,7 @@ class SynchronizerCounts:
 @dataclass(eq=False)
 class _Stream:
     capacity: int
-    waiting: deque[tuple[int, object]] = field(default_factory=deque)
+    waiting: list[tuple[int, object]] = field(default_factory=list)
     latest: int | None = None
     rhythm: Rhythm = field(default_factory=Rhythm)
 
@@ -39,14 +40,9 @@ class _Stream:
         """Insert in stamp order; returns how many old items were dropped."""
         self.rhythm.add(stamp)
         self.latest = stamp if self.latest is None else max(self.latest, stamp)
-        place = len(self.waiting)
-        while place and self.waiting[place - 1][0] > stamp:
-            place -= 1
-        self.waiting.insert(place, (stamp, item))
-        dropped = 0
-        while len(self.waiting) > self.capacity:
-            self.waiting.popleft()
-            dropped += 1
+        insort(self.waiting, (stamp, item), key=itemgetter(0))
+        dropped = max(len(self.waiting) - self.capacity, 0)
+        del self.waiting[:dropped]
         return dropped
 
     def earliest_next(self) -> int:
@@ -163,14 +159,12 @@ class Synchronizer(Generic[Image, Cloud]):
         for i, c in zip(*nearest_pairs(at_image, at_cloud, self.tolerance), strict=True):
             if self._nearer_may_come(int(at_image[i]), int(at_cloud[c])):
                 break
-            pairs.append((images[i][1], clouds[c][1]))  # type: ignore[arg-type]
+            pairs.append((images[i][1], clouds[c][1]))
             settled_images, settled_clouds = int(i) + 1, int(c) + 1
         self.counts.pairs += len(pairs)
         self.counts.unpaired_images += settled_images - len(pairs)
         self.counts.unpaired_clouds += settled_clouds - len(pairs)
-        for waiting, settled in ((images, settled_images), (clouds, settled_clouds)):
-            for _ in range(settled):
-                waiting.popleft()
+        del images[:settled_images], clouds[:settled_clouds]
         return pairs
 
     def _nearer_may_come(self, image_moment: int, cloud_moment: int) -> bool:

@@ -135,7 +135,7 @@ def test_the_node_answers_others_while_a_goal_is_under_way(calibrated: Calibrate
     assert peer.get_extrinsic().extrinsic.status
     peer.until(lambda: len(peer.extrinsics) > published, "the heartbeat")
     assert peer.trigger("reset").success  # the estimate is void, but goes on
-    assert peer.pipeline.estimating
+    assert peer.pipeline._estimator.busy
     assert goal.cancel()
     assert goal.result()[0] == GoalStatus.STATUS_CANCELED
     peer.settle()

@@ -150,7 +150,7 @@ def test_deactivation_ends_a_goal_and_shutdown_a_running_search(
     assert managed.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert managed.state == State.PRIMARY_STATE_FINALIZED
     assert peer.calibration is None
-    assert not pipeline.estimating
+    assert not pipeline._estimator.busy
     peer.until(lambda: "/calib_ros/get_extrinsic" not in managed.topics(), "that all services are gone")
     assert managed.state == State.PRIMARY_STATE_FINALIZED  # it still answers: no answer was sent through a service that is gone
 

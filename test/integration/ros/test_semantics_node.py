@@ -81,14 +81,14 @@ def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:
 def test_unusable_models_are_named_and_left_out(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference), online__mode="periodic", online__period_s=1.5) as peer:
         lines: list[str] = []
-        sink = peer.pipeline._sink
+        sink = peer.pipeline._announcer.tell
 
         def listen(event: Event) -> None:
             if isinstance(event, Problem):
                 lines.append(event.message)
             sink(event)
 
-        peer.pipeline._sink = listen
+        peer.pipeline._announcer.tell = listen
         vehicle = Vehicle(peer, street, drive.reference)
         for name, (parameters, text, times) in bad_models(tmp_path).items():
             lines.clear()
