@@ -103,7 +103,7 @@ class Pipeline:
         self._add(self._pairing.add_cloud, stamp, message)
 
     @property
-    def synchronizer(self) -> Synchronizer[Any, Any]:
+    def synchronizer(self) -> Synchronizer:
         """What pairs the messages."""
         return self._pairing.synchronizer
 

@@ -12,7 +12,7 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.state import Provenance, load_state, read_state, save_state
+from calib_ros.online.state import load_state, provenance_of, read_state, save_state
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.result import INITIAL, InitialSource, Result
 from calib_ros.ros.parameters import Parameters
@@ -75,7 +75,7 @@ class InitialExtrinsic:
         accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
         try:
             newest = result.data_stamp or stamp
-            save_state(path, result, camera, Provenance.of(recalibrator.config, accepted, keyframes, newest))
+            save_state(path, result, camera, provenance_of(recalibrator.config, accepted, keyframes, newest))
         except BadInputError as error:
             self._error(str(error))
             return False, str(error)

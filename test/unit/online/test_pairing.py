@@ -90,7 +90,7 @@ class Drive:
         images += 1000 * (swept if self.phase is None else self.phase)
         self.images = np.sort(images + rng.uniform(-self.jitter, self.jitter, len(images)))
         self.sweeps = starts + 1000 * swept
-        self.synchronizer: Synchronizer[float, float] = Synchronizer(self.tolerance_s, 8, None)
+        self.synchronizer = Synchronizer(self.tolerance_s, 8, None)
         sweep = SweepOffset(MotionConfig())
         # Images arrive 20 ms after their moment; a scan when it is complete, and 10 ms later.
         arrivals = [(t + 20, "image", t, t) for t in self.images.tolist()]
@@ -214,7 +214,7 @@ def test_every_stamping_rate_and_phase_pairs_with_the_scan_that_swept_the_view(s
 
 
 def test_nothing_pairs_before_the_sweep_is_known():
-    synchronizer: Synchronizer[int, int] = Synchronizer(0.0, 8, None)
+    synchronizer = Synchronizer(0.0, 8, None)
     for k in range(20):
         assert synchronizer.add_image(T0 + 100 * k * MS, k) == []
         assert synchronizer.add_cloud(T0 + (100 * k - 60) * MS, k) == []
@@ -231,7 +231,7 @@ class Watched:
     """A synchronizer fed in real order, and what is said about it once a second of the data's time."""
 
     def __init__(self, tolerance_s: float = 0.0, capacity: int = 8) -> None:
-        self.synchronizer: Synchronizer[object, object] = Synchronizer(tolerance_s, capacity)
+        self.synchronizer = Synchronizer(tolerance_s, capacity)
         self.health = PairingHealth(self.synchronizer)
 
     def feed(self, images: np.ndarray, clouds: np.ndarray, image_delay: float = 0.0, image_clock: float = 0.0) -> list[str]:

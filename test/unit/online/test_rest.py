@@ -42,7 +42,7 @@ class Parade:
         self.recalibrator = Recalibrator(frames[0].camera, start, update(CONFIG, changes))
         self.estimates: list[float] = []
         self.keyframes: list[float] = []
-        self.n = 0.0  # frames, each GAP_S later
+        self.n: float = 0  # frames, each GAP_S later
 
     def __call__(self, seconds: float, turned_deg: float = 0.0, drift_deg_s: float = 0.0) -> None:
         for _ in range(round(seconds / GAP_S)):

@@ -19,7 +19,7 @@ class Streams:
     """Feeds a synchronizer with stamps in ms and checks what must hold at any time."""
 
     def __init__(self, tolerance_s: float = 0.05, capacity: int = 8) -> None:
-        self.synchronizer: Synchronizer[float, float] = Synchronizer(tolerance_s, capacity)
+        self.synchronizer = Synchronizer(tolerance_s, capacity)
         self.pairs: Pairs = []
 
     def add(self, kind: str, ms: float) -> Pairs:
