@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.config import stages
-from calib_ros.ros.parameters import SETTINGS
+from calib_ros.ros.parameters import LIVE, SETTINGS
 
 ROOT = Path(__file__).resolve().parents[1]
 YAML, VEHICLE = ROOT / "config" / "calib_ros.yaml", ROOT / "config" / "vehicle.yaml"
@@ -161,16 +161,13 @@ class Parameter:
 
 def parameters() -> dict[str, Parameter]:
     """All parameters by name: the node's settings, then the stages."""
+    fields = SETTINGS | {f"{stage}.{f.name}": f for stage, cls in stages().items() for f in dataclasses.fields(cls)}
     out = {}
-    for name, setting in SETTINGS.items():
-        allowed = _allowed(setting.low, setting.high, setting.choices)
-        out[name] = Parameter(setting.default, setting.doc, allowed, at_start=not setting.live)
-    for stage, cls in stages().items():
-        for f in dataclasses.fields(cls):
-            m = f.metadata
-            former = m["formerly"] and f"{stage}.{m['formerly']}"
-            allowed = _allowed(m["low"], m["high"], m["choices"])
-            out[f"{stage}.{f.name}"] = Parameter(f.default, m["doc"], allowed, former)
+    for name, f in fields.items():
+        m = f.metadata
+        former = m["formerly"] and f"{name.partition('.')[0]}.{m['formerly']}"
+        at_start = name in SETTINGS and name not in LIVE
+        out[name] = Parameter(f.default, m["doc"], _allowed(m["low"], m["high"], m["choices"]), former, at_start)
     return out
 
 

@@ -25,13 +25,7 @@ class OnlineConfig(Stage):
     similarity_threshold: float = option(
         0.92, "an image less similar to the last keyframe's than this becomes a keyframe (eq. 3.15)", low=0.0, high=1.0
     )
-    keyframe_interval_s: float = option(
-        1.0, "after this time without a keyframe any image that has changed becomes one, s", low=0.05, high=3600.0
-    )
     keyframe_spacing_s: float = option(0.25, "smallest time between keyframes, s", low=0.0, high=60.0)
-    static_similarity: float = option(
-        0.995, "images more similar than this show the same scene and never become a keyframe", low=0.5, high=1.0
-    )
     buffer_size: int = option(20, "number of keyframes in the ring buffer", low=1, high=200)
     min_keyframes: int = option(5, "number of keyframes before the first estimate", low=1, high=200)
     mode: str = option(
@@ -47,12 +41,6 @@ class OnlineConfig(Stage):
         "the data's stamps, s; 0 = no rest",
         low=0.0,
         high=3600.0,
-    )
-    rest_spacing_s: float = option(
-        2.0,
-        "smallest time between keyframes while the extrinsic is converged and all newer keyframes fit it, s",
-        low=0.0,
-        high=60.0,
     )
     max_load: float = option(
         0.5,
@@ -83,13 +71,6 @@ class TrackerConfig(Stage):
         high=1.0,
         formerly="drift_m",
     )
-    max_step_deg: float = option(
-        1.0, "an estimate that rotates the current extrinsic further than this is rejected, deg", low=0.01, high=90.0
-    )
-    max_step_m: float = option(
-        0.15, "an estimate that shifts the current extrinsic further than this is rejected, m", low=0.001, high=10.0
-    )
-    gate: float = option(1e-4, "an estimate less probable than this, given the current extrinsic, is rejected", low=0.0, high=0.5)
     confirmations: int = option(
         5,
         "keyframes after the first accepted estimate that must be consistent with it before the status is converged; "

@@ -57,11 +57,6 @@ class Deferred:
         with self._lock:
             return bool(self._waiting)
 
-    @property
-    def running(self) -> bool:
-        """True while a job is under way."""
-        return self._running is not None
-
     def add(self, job: DeferredJob[T], obstacle: str = "") -> Future[T]:
         """A new job. It fails at once with a CalibrationError if there is an obstacle, jobs are refused, or too many wait."""
         future: Future[T] = Future()
@@ -85,7 +80,11 @@ class Deferred:
 
         check_cancelled: raises Cancelled where the thread is to end.
         """
-        begun = self._begin()
+        begun = None
+        with self._lock:
+            while self._waiting and begun is None:
+                asked = self._waiting.popleft()
+                begun = self._running = asked if asked[1].set_running_or_notify_cancel() else None
         if begun is None:
             return None
         job, future = begun
@@ -106,13 +105,11 @@ class Deferred:
             error = caught
         with self._lock:
             mine, self._running = self._running is begun, None
-        if not mine:
-            return None  # answered already
-        if error is None:
+        if mine and error is None:  # else: answered already
             future.set_result(outcome)
-        else:
+        elif mine:
             future.set_exception(error)
-        return outcome
+        return outcome if mine else None
 
     def refuse(self, reason: str = "") -> None:
         """Fail all jobs with a CalibrationError, new ones too, and end the one under way. reason: "" = the node is stopping."""
@@ -129,12 +126,3 @@ class Deferred:
         """Take jobs again."""
         with self._lock:
             self._refusal = None
-
-    def _begin(self) -> _PendingJob | None:
-        with self._lock:
-            while self._waiting:
-                asked = self._waiting.popleft()
-                if asked[1].set_running_or_notify_cancel():
-                    self._running = asked
-                    return asked
-        return None

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
+from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
+from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import Extrinsic, Result
 
 
@@ -54,11 +55,6 @@ class IntakeIdle:
 Event = FrameIngested | ExtrinsicUpdated | Problem | JobDone | IntakeIdle
 
 
-def no_vehicle_frames(camera_frame: str, lidar_frame: str) -> dict[str, NDArray[np.float64]]:
-    """Where no other frames of the vehicle are known."""
-    return {}
-
-
 @dataclass(frozen=True)
 class Inputs:
     """What the pipeline asks its owner for, on worker threads.
@@ -74,4 +70,61 @@ class Inputs:
     frame_ids: Callable[[Any, Any], tuple[str, str]]
     initial: Callable[[Camera, str, str], Result | None]
     decode_cloud: Callable[[Any], PointCloud] | None = None
-    vehicle_frames: Callable[[str, str], Mapping[str, NDArray[np.float64]]] = no_vehicle_frames
+    vehicle_frames: Callable[[str, str], Mapping[str, Transform]] = lambda camera_frame, lidar_frame: {}
+
+
+class Announcer:
+    """Thread-safe. tell: takes every event. stamp: of the newest keyframe, ns."""
+
+    def __init__(self, tell: Callable[[Event], None]) -> None:
+        self.stamp = 0
+        self.tell, self._lock = tell, threading.Lock()
+        self._published: Result | None = None
+        self._notes: set[str] = set()
+
+    def publish(self, recalibrator: Recalibrator, in_use: Callable[[], bool], again: bool) -> None:
+        """The current extrinsic, if it or its status differs from the one published last; none of a replaced recalibrator.
+
+        The monitor's assessment of an extrinsic that is right goes to the diagnostics alone.
+        """
+        with self._lock:
+            extrinsic = recalibrator.current
+            if in_use() and (again or extrinsic.result is not self._published):
+                self._published = extrinsic.result
+                self.tell(ExtrinsicUpdated(extrinsic, self.stamp or extrinsic.estimated_at))
+
+    def read(self, reader: Callable[[Extrinsic, int], None], source: Callable[[], Recalibrator | None], wait: bool) -> None:
+        """See `Pipeline.read_current`."""
+        if not self._lock.acquire(blocking=wait):
+            return
+        try:
+            recalibrator = source()
+            if recalibrator is not None:
+                reader(recalibrator.current, self.stamp or recalibrator.current.estimated_at)
+        finally:
+            self._lock.release()
+
+    def note_what_is_missing(self, recalibrator: Recalibrator, keyframe: Frame) -> None:
+        """Tell what the estimates have to do without, once each."""
+        newest, notes = recalibrator.newest(), [recalibrator.motion.missing]
+        if keyframe.cloud.time_problem:
+            notes.append(f"{keyframe.cloud.time_problem}; until then the clouds count as without point times")
+        if newest is not None and not newest.has_reflectivity:
+            notes.append("the cloud has no intensity: reflectivity edges are off, everything else works")
+        for note in notes:
+            if note and note not in self._notes:
+                self._notes.add(note)
+                self.tell(Problem(note))
+
+    def other_sensors(self, names: Result, camera_frame: str, lidar_frame: str) -> None:
+        """A pair of other sensors than those of a result came."""
+        what = f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to"
+        self.tell(Problem(f"{what} {names.camera_frame}; give every camera-LiDAR pair its own node"))
+
+    def report(self, error: Exception) -> None:
+        """Of a worker: a defect of ours says what it is, and the node goes on."""
+        if isinstance(error, CalibrationError):
+            self.tell(Problem(str(error)))
+        else:
+            line = f"unexpected {type(error).__name__}: {error}; please report it with the data that led to it"
+            self.tell(Problem(line))

@@ -34,24 +34,30 @@ NEW_S = 0.5 * RUN_S  # s of further frames after a guess that failed, before the
 class FirstGuess:
     """Finds the first extrinsic. `add` may be called from another thread than `estimate`.
 
-    config may be replaced at any time.
+    start: what stands in until something is known, if it is nominal. pending: nothing is known.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, start: Result | None = None) -> None:
         self.config = config
+        self._placeholder = start if start is not None and start.origin is InitialSource.NOMINAL else None
+        self.pending = self._placeholder is not None and self._wanted
         self._lock = threading.Lock()
         self._run: deque[Frame] = deque()
         self._tried_at: int | None = None  # stamp of the newest frame of the last guess from motion that failed
         self._failure = ""  # why it did
 
     @property
-    def wanted(self) -> bool:
-        """True if nominal is no start, but what stands in until something is known."""
+    def _wanted(self) -> bool:
+        """Is nominal no start, but what stands in until something is known?"""
         return self.config.initial.method != NOMINAL
 
     @property
-    def uses_classes(self) -> bool:
-        """True if the classes of keyframes are waited for."""
+    def needs_classes(self) -> bool:
+        """True while the classes of keyframes are waited for."""
+        return self.pending and self._uses_classes
+
+    @property
+    def _uses_classes(self) -> bool:
         return self.config.initial.method in (SEMANTIC, AUTO)
 
     @property
@@ -75,8 +81,26 @@ class FirstGuess:
             while self._lasted(self._run) > RUN_S:
                 self._run.popleft()
 
-    def clear(self) -> None:
-        """Forget the frames: something is known, or everything begins anew."""
+    def configure(self, config: Config, is_estimated: bool) -> bool:
+        """Use another configuration; True if from now on nothing is known. is_estimated: an estimate has been accepted."""
+        before, self.config = self.pending, config
+        self.pending = self._wanted and (before or (self._placeholder is not None and not is_estimated))
+        if not self._wanted:
+            self._clear()
+        return self.pending and not before
+
+    def begin_anew(self) -> Result | None:
+        """Nothing is known again: what stands in, None where the start was given."""
+        self._clear()
+        self.pending = self._placeholder is not None and self._wanted
+        return self._placeholder if self.pending else None
+
+    def end(self) -> None:
+        """An extrinsic is known."""
+        self.pending = False
+        self._clear()
+
+    def _clear(self) -> None:
         with self._lock:
             self._run.clear()
             self._tried_at, self._failure = None, ""
@@ -91,7 +115,7 @@ class FirstGuess:
         tried: list[Result] = []
         if self._uses_motion:
             tried.append(self._from_motion(calibrator, features, initial, progress))
-        if self.uses_classes and not any(r.converged for r in tried):
+        if self._uses_classes and not any(r.converged for r in tried):
             tried.append(self._from_classes(calibrator, features, initial, progress))
         others_failed = self._tried_at is not None and not any(r.converged for r in tried)
         if self.config.initial.method == AUTO and others_failed and not self._classes_may_come(calibrator, features):

@@ -4,32 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Transform
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import ALL, Segmentation
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.search.constraints import SearchBox
-
-Matrix = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class SegmentedKeyframe:
-    """Outcome for one keyframe: its features before and with semantics, None if no model recognised anything.
-
-    problems: a line for each model that failed.
-    """
-
-    plain: FrameFeatures
-    features: FrameFeatures | None
-    problems: tuple[str, ...]
 
 
 class KeyframeSegmenter:
@@ -59,10 +44,11 @@ class KeyframeSegmenter:
         calibrator: Calibrator,
         cancelled: Callable[[], bool],
         kinds: Sequence[str] = ALL,
-        around: Sequence[tuple[Matrix, SearchBox]] = (),
-    ) -> SegmentedKeyframe | None:
-        """Segment the keyframe that waits; None if there is none. cancelled, kinds: see Segmentation. around: extrinsics (4, 4)
-        and how far off each may be; points that come into view nowhere there need no classes. Empty = nothing is known."""
+        around: Sequence[tuple[Transform, SearchBox]] = (),
+    ) -> tuple[FrameFeatures, FrameFeatures | None, tuple[str, ...]] | None:
+        """Segment the keyframe that waits: its features before, and with semantics if a model recognised something, and a line
+        for each model that failed; None if none waits. cancelled, kinds: see Segmentation. around: extrinsics (4, 4) and how far
+        off each may be; points that come into view nowhere there need no classes. Empty = nothing is known."""
         with self._lock:
             waiting, self._waiting = self._waiting, None
         if waiting is None:
@@ -73,10 +59,10 @@ class KeyframeSegmenter:
         semantics = calibrator.segmentation(frame, cancelled, kinds, points)
         self.seconds = dict(semantics.seconds)
         if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):
-            return SegmentedKeyframe(plain, None, semantics.problems)
+            return plain, None, semantics.problems
         features = calibrator.extract(frame, semantics, plain)
         self.done += 1
-        return SegmentedKeyframe(plain, features, semantics.problems)
+        return plain, features, semantics.problems
 
     def describe(self, segmentation: Segmentation) -> str:
         """Progress, failures, and the weights in use, for people."""

@@ -10,18 +10,21 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import MotionConfig, OnlineConfig
+from calib_ros.config import Config, MotionConfig, OnlineConfig, TrackerConfig
 from calib_ros.errors import BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
 from calib_ros.registration.features import FrameFeatures
 
+INTERVAL_S = 1.0  # without a keyframe, after which any image that has changed becomes one
+STATIC_SIMILARITY = 0.995  # images more similar show the same scene and never become a keyframe
 REMEMBERED_S = 3.0  # a vehicle that moved so long ago may still move
 MAX_MEASUREMENT_AGE_S = 0.5  # a measurement farther than this from a frame's stamp says nothing about the frame
 
@@ -29,11 +32,6 @@ Histogram = NDArray[np.float32]
 StampedCloud = tuple[int, PointCloud]
 ScanBefore = Callable[[int], StampedCloud | None]
 Permit = Callable[[], bool]
-
-
-def always() -> bool:
-    """Where every keyframe that is wanted may be one."""
-    return True
 
 
 class KeyframeSelector:
@@ -52,7 +50,7 @@ class KeyframeSelector:
         """Start a new series: the next image is a keyframe."""
         self._histogram = None
 
-    def select(self, image: NDArray[np.uint8], stamp: int, permit: Permit = always, spacing_s: float = 0.0) -> bool:
+    def select(self, image: NDArray[np.uint8], stamp: int, permit: Permit = lambda: True, spacing_s: float = 0.0) -> bool:
         """True if the image (stamp in ns) is a keyframe; the next images are then compared with it.
 
         permit: asked only about an image that is to be a keyframe; where it refuses, the next image is as good. spacing_s:
@@ -65,7 +63,7 @@ class KeyframeSelector:
     def _is_too_early(self, stamp: int, spacing_s: float = 0.0) -> bool:
         return 0 <= (stamp - self._stamp) / NANOSECONDS < max(self.config.keyframe_spacing_s, spacing_s)
 
-    def select_histogram(self, new: Histogram, stamp: int, permit: Permit = always) -> bool:
+    def select_histogram(self, new: Histogram, stamp: int, permit: Permit = lambda: True) -> bool:
         """The same for the histogram of an image."""
         last = self._histogram  # reset() may come from another thread
         if last is not None:
@@ -73,14 +71,25 @@ class KeyframeSelector:
                 return False
             self.last_similarity = similarity(last, new)
             elapsed = (stamp - self._stamp) / NANOSECONDS
-            overdue = elapsed >= self.config.keyframe_interval_s or elapsed < 0  # the clock was set back
-            changed = self.last_similarity < self.config.static_similarity
+            overdue = elapsed >= INTERVAL_S or elapsed < 0  # the clock was set back
+            changed = self.last_similarity < STATIC_SIMILARITY
             if not (changed and (overdue or self.last_similarity < self.config.similarity_threshold)):
                 return False
         if not permit():
             return False
         self._histogram, self._stamp = new, stamp
         return True
+
+
+class Batch(NamedTuple):
+    """Keyframes of an estimate, oldest first. new: keyframes since the one before. unfused: how many of the buffer are in no
+    accepted estimate yet. unfused_features: how many of the estimate's own."""
+
+    features: Sequence[FrameFeatures]
+    generation: int
+    new: int
+    unfused: int
+    unfused_features: int
 
 
 class KeyframeBuffer:
@@ -114,6 +123,16 @@ class KeyframeBuffer:
         """How many of the newest `count` keyframes are among the chosen ones."""
         ids = set(map(id, chosen))
         return sum(id(own) in ids for own in list(self.features)[-count:]) if count > 0 else 0
+
+    def batch(self, chosen: Sequence[FrameFeatures]) -> Batch:
+        """The chosen keyframes, for an estimate that begins now."""
+        new, self.new = self.new, 0
+        return Batch(chosen, self.generation, new, self.unfused, self.newest_among(chosen, self.unfused))
+
+    def give_back(self, batch: Batch) -> None:
+        """The estimate ended without a result: what was new still is."""
+        if batch.generation == self.generation:
+            self.new += batch.new
 
     def replace(self, before: FrameFeatures, after: FrameFeatures) -> None:
         """Put other features in the place of a keyframe's, if it is still there."""
@@ -150,8 +169,7 @@ class KeyframeBuffer:
         self.incomplete = True
 
 
-@dataclass(frozen=True)
-class MotionMeasurement:
+class MotionMeasurement(NamedTuple):
     """The newest measurement of odometry or an IMU. stamp: ns. speed: m/s, turn_rate: deg/s, None if the source lacks it."""
 
     stamp: int
@@ -203,11 +221,6 @@ class SpeedGate:
         return speed, turn_rate
 
 
-def no_scan(since: int) -> StampedCloud | None:
-    """Where every scan is handed over."""
-    return None
-
-
 class EgoMotion:
     """Twist of the LiDAR from scan to scan, for keyframes that come without odometry. Not thread-safe.
 
@@ -229,7 +242,7 @@ class EgoMotion:
         usable = frame.cloud_stamp is not None and not frame.compensated
         self._before, self._newest = self._newest, (frame.cloud_stamp or 0, frame.cloud) if usable else None
 
-    def with_twist(self, frame: Frame, scan_before: ScanBefore = no_scan) -> Frame:
+    def with_twist(self, frame: Frame, scan_before: ScanBefore = lambda since: None) -> Frame:
         """The newest frame with its twist, if it has none and the cloud before allows an estimate; 50 ms for 130 000 points.
 
         scan_before: gives the scan before the frame's if it is newer than a stamp, where frames between have been dropped.
@@ -254,21 +267,28 @@ class EgoMotion:
         self._known = (stamp, self.last.twist)
         return replace(frame, twist=self.last.twist)
 
-    def check_known(self, frame: Frame, sweep_s: float, limits: tuple[float, float]) -> None:
-        """BadTimesError if a frame's motion is unknown although the vehicle moved shortly before, by more than the limits (rad,
-        m) within sweep_s: nobody knows how its scan is bent."""
+    def check_known(self, frame: Frame, limits: TrackerConfig) -> None:
+        """BadTimesError if a frame's motion is unknown although the vehicle moved shortly before, in half the time in which the
+        scan sweeps the image by more than a converged extrinsic may be off: nobody knows how the scan is bent."""
         stamp = frame.cloud_stamp
         if stamp is None or self._known is None or not needs_ego_motion(frame, self.config):
             return
         since, twist = (stamp - self._known[0]) / NANOSECONDS, self._known[1]
+        sweep_s = self.config.scan_period_s * frame.camera.field_deg / 720
         turn, way = (sweep_s * float(np.linalg.norm(part)) for part in (twist[:3], twist[3:]))
-        if 0 <= since <= REMEMBERED_S and (turn > limits[0] or way > limits[1]):
+        if 0 <= since <= REMEMBERED_S and (turn > np.deg2rad(limits.max_sigma_deg) or way > limits.max_sigma_m):
             self.left_out += 1
             reason = self.last.reason if self.last is not None and self.last.twist is None else "the scan before is missing"
             raise BadTimesError(
                 f"keyframe left out: the vehicle moved at {np.linalg.norm(twist[3:]):.1f} m/s {since:.1f} s ago, and its motion "
                 f"now is unknown ({reason}); if this lasts, the LiDAR's messages get lost"
             )
+
+
+def feature_config(config: Config) -> tuple[object, ...]:
+    """What features depend on; how fast models run, and where, does not change what they recognise."""
+    semantics = replace(config.semantics, threads=1, budget_s=1.0, provider="cpu")
+    return config.image, config.lidar, config.motion, config.score, config.others, semantics, config.refine.objective
 
 
 def histogram(image: NDArray[np.uint8]) -> Histogram:

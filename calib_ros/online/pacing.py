@@ -1,4 +1,4 @@
-"""What the CPU time that online.max_load allows is spent on.
+"""When estimates are made, and what the CPU time that online.max_load allows is spent on.
 
 The budget counts the CPU time of threads, not how long they take: other processes on the same cores do not make the node do less.
 Every pair is looked at, whatever it costs; keyframes, then estimates, then classes wait until the budget allows for them.
@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from calib_ros.config import OnlineConfig
+from calib_ros.config.online import CONTINUOUS, PERIODIC
+from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.search.parallel import cpu_time
 
 # Work saved up while there was little to do, in s of the whole budget: the first keyframes and the first search come at once, and
@@ -179,3 +181,44 @@ class LoadBudget:
                 self._seconds[Work.MESSAGES] += spent - before
                 self._saved -= spent - before
         return now
+
+
+class Schedule:
+    """When estimates are made, by online.mode over the data's own stamps: a recording gives the same ones at any speed.
+
+    config may be replaced at any time. Stamps are in ns.
+    """
+
+    def __init__(self, config: OnlineConfig) -> None:
+        self.config = config
+        self._newest: int | None = None
+        self._estimated: int | None = None
+        self._estimated_before: int | None = None
+
+    def add_frame(self, stamp: int) -> None:
+        """A frame, keyframe or not, with its stamp."""
+        self._newest = stamp
+
+    def start_estimate(self) -> None:
+        """An estimate begins, on request or not: the next period counts from the newest frame."""
+        self._estimated_before, self._estimated = self._estimated, self._newest
+
+    def cancel_estimate(self) -> None:
+        """The estimate that began last ended without a result."""
+        self._estimated = self._estimated_before
+
+    def due(self, at_rest: bool = False, urgent: bool = False) -> bool:
+        """True if new keyframes are to be estimated now; the first ones at once, as after a clock was set back.
+
+        at_rest: the extrinsic is steady and all newer keyframes fit it, for which mode continuous waits. urgent: it has moved or
+        is to be confirmed, for which mode periodic does not.
+        """
+        if self.config.mode == CONTINUOUS:
+            return not at_rest or self._elapsed(self.config.rest_period_s)
+        return self.config.mode == PERIODIC and (urgent or self._elapsed(self.config.period_s))
+
+    def _elapsed(self, period_s: float) -> bool:
+        if self._newest is None or self._estimated is None:
+            return True
+        elapsed = (self._newest - self._estimated) / NANOSECONDS
+        return elapsed < 0 or elapsed >= period_s

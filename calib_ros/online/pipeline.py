@@ -6,17 +6,14 @@
 Callers hand messages over and return at once. One thread decodes pairs and extracts keyframe features, another estimates, a third
 runs the models of ``semantics`` on keyframes; each has a queue of one item, so that nothing slow ever holds up the others. What
 happens goes out as typed events through one sink.
-
-The ingest worker also looks at a first cloud before anything is paired (pairing.py).
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -28,7 +25,7 @@ from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.deferred import Deferred, DeferredJob
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, JobDone, Problem
+from calib_ros.online.events import Announcer, Event, FrameIngested, Inputs, IntakeIdle, JobDone, Problem
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
 from calib_ros.online.pairing.pairing import Intake, Pairing
@@ -44,6 +41,8 @@ from calib_ros.result import Extrinsic, Result
 T = TypeVar("T")
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
+NO_CAMERA = "images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"
+JUMPED_BACK = "time stamps jumped back (a looping bag, or a clock was set back): messages that waited for a partner were dropped"
 
 
 class Pipeline:
@@ -62,19 +61,16 @@ class Pipeline:
         self._pairing = Pairing(config, inputs.decode_cloud is not None)
         self.speed_gate = SpeedGate(config.online)
         self.load = LoadBudget(config.online)
-        self._inputs, self._sink = inputs, sink
+        self._inputs = inputs
         self._segmentation = models_of(config.semantics)
-        self._requests = Requests()
-        self._deferred = Deferred()
+        self._requests, self._deferred = Requests(), Deferred()
         self._lock = threading.Lock()
-        self._publish_lock = threading.Lock()
-        self._published: Result | None = None
-        self._published_notes: set[str] = set()
-        self._stamp = 0  # of the newest keyframe, ns
+        self._announcer = Announcer(sink)
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
-        self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, self._report, on_idle=lambda: sink(IntakeIdle()))
-        self._estimator: Worker[None] = Worker("calib_estimate", self._estimate_and_defer, self._report)
-        self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, self._report, SEMANTICS_NICE)
+        report = self._announcer.report
+        self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, report, on_idle=lambda: sink(IntakeIdle()))
+        self._estimator: Worker[None] = Worker("calib_estimate", self._estimate_and_defer, report)
+        self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, report, SEMANTICS_NICE)
 
     # ---- input --------------------------------------------------------------------------------------------------------
 
@@ -87,33 +83,27 @@ class Pipeline:
             self._requests.close()
             if self.recalibrator is not None:
                 tracker = self.recalibrator.tracker
-                self.recalibrator = Recalibrator(
-                    camera,
-                    initial=tracker.initial,
-                    config=self.config,
-                    camera_frame=tracker.initial.camera_frame,
-                    lidar_frame=tracker.initial.lidar_frame,
-                    current=tracker.carry_over,
-                    speed_gate=self.speed_gate,
-                    segmentation=self.segmentation,
-                )
+                self.recalibrator = self._recalibrator_at(camera, tracker.initial, tracker.carry_over)
         if self.recalibrator is not None:
             self._follow_clocks(self.recalibrator)
         if changed:
-            self._sink(Problem("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays"))
+            self._announcer.tell(Problem("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays"))
+
+    def _recalibrator_at(self, camera: Camera, initial: Result, current: Result | None = None) -> Recalibrator:
+        """A new one; its frames are those of the initial extrinsic."""
+        names = initial.camera_frame, initial.lidar_frame
+        return Recalibrator(camera, initial, self.config, *names, current, self.speed_gate, self.segmentation)
 
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""
-        with self._synchronizing():
-            self._hand_over(self._pairing.add_image(stamp, message))
+        self._add(self._pairing.add_image, stamp, message)
 
     def add_cloud(self, stamp: int, message: Any) -> None:
         """A cloud message, stamp in ns."""
-        with self._synchronizing():
-            self._hand_over(self._pairing.add_cloud(stamp, message))
+        self._add(self._pairing.add_cloud, stamp, message)
 
     @property
-    def synchronizer(self) -> Synchronizer[Any, Any]:
+    def synchronizer(self) -> Synchronizer:
         """What pairs the messages."""
         return self._pairing.synchronizer
 
@@ -122,28 +112,21 @@ class Pipeline:
         for intake in found:
             self._ingester.put(intake)
 
-    @contextmanager
-    def _synchronizing(self) -> Iterator[None]:
-        """Holds the lock; reports time stamps that jumped back."""
+    def _add(self, take: Callable[[int, Any], list[Intake]], stamp: int, message: Any) -> None:
         with self._lock:
             jumps = self.synchronizer.counts.jumps_back
-            yield
+            self._hand_over(take(stamp, message))
             jumped = self.synchronizer.counts.jumps_back > jumps
         if jumped:
-            self._sink(
-                Problem(
-                    "time stamps jumped back (a looping bag, or a clock was set back): "
-                    "messages that waited for a partner were dropped"
-                )
-            )
+            self._announcer.tell(Problem(JUMPED_BACK))
 
     # ---- requests -----------------------------------------------------------------------------------------------------
 
     def request_estimate(self, progress: Callback | None = None) -> Future[Extrinsic]:
         """Search and estimate now over the buffer; the future holds the current extrinsic afterwards, or an exception.
 
-        Requests over the same keyframes share one estimate. cancel() of the future ends the request, and the estimate if it was
-        the last one that waited for it; the extrinsic stays. progress: called on the thread of estimates; must not raise.
+        Requests over the same keyframes share one estimate. cancel() ends the request, and the estimate if it was the last one
+        that waited for it; the extrinsic stays. progress: called on the thread of estimates; must not raise.
         """
         with self._lock:
             future, needs_run = self._requests.add(self._keyframes_seen(), progress)
@@ -152,11 +135,8 @@ class Pipeline:
         return future
 
     def defer(self, job: DeferredJob[T], obstacle: str = "") -> Future[T]:
-        """A job for the thread of estimates, after estimates and jobs under way; its CPU time is not charged to online.max_load.
-
-        The future holds what the job returns, or an exception: a CalibrationError where it is not taken, for an obstacle among
-        other reasons.
-        """
+        """A job for the thread of estimates, after those under way; its CPU time is not charged to online.max_load. The future
+        holds what it returns, or an exception: a CalibrationError where it is not taken, for an obstacle among other reasons."""
         future = self._deferred.add(job, obstacle)
         if not future.done():
             self._estimator.put(None)
@@ -165,16 +145,12 @@ class Pipeline:
     def vehicle_frames(self) -> Mapping[str, NDArray[np.float64]]:
         """T_camera_F (4, 4) of other frames F of the vehicle, by name, as far as they are known."""
         recalibrator = self.recalibrator
-        if recalibrator is None:
-            return {}
-        names = recalibrator.tracker.initial
-        return self._inputs.vehicle_frames(names.camera_frame, names.lidar_frame)
+        names = None if recalibrator is None else recalibrator.tracker.initial
+        return {} if names is None else self._inputs.vehicle_frames(names.camera_frame, names.lidar_frame)
 
     def pause(self, reason: str) -> None:
-        """Take in no pairs, and make no estimates and do no jobs, from now on; keyframes and extrinsic stay.
-
-        Those under way end, requests fail with the reason; the models leave out the keyframe that they are at.
-        """
+        """Take in no pairs, make no estimates and do no jobs; those under way end, requests fail with the reason, and the models
+        leave out the keyframe that they are at. Keyframes and extrinsic stay."""
         self._requests.refuse(reason)
         self._deferred.refuse(reason)
 
@@ -219,18 +195,9 @@ class Pipeline:
             self._hand_over(self._pairing.configure(config))
 
     def read_current(self, reader: Callable[[Extrinsic, int], None], wait: bool = True) -> None:
-        """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile.
-
-        wait: until a newer one that is being published is out; else nothing is done then.
-        """
-        if not self._publish_lock.acquire(blocking=wait):
-            return
-        try:
-            recalibrator = self.recalibrator
-            if recalibrator is not None:
-                reader(recalibrator.current, self._stamp or recalibrator.current.estimated_at)
-        finally:
-            self._publish_lock.release()
+        """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile. wait:
+        until a newer one that is being published is out; else nothing is done then."""
+        self._announcer.read(reader, lambda: self.recalibrator, wait)
 
     def stop(self) -> bool:
         """End all threads, an estimate or job under way included; True if they ended."""
@@ -256,11 +223,6 @@ class Pipeline:
     def dropped_pairs(self) -> int:
         """Pairs that a newer one replaced before they were ingested."""
         return self._ingester.dropped
-
-    @property
-    def estimating(self) -> bool:
-        """True while an estimate or a job is under way or waits."""
-        return self._estimator.busy
 
     @property
     def taking_in(self) -> bool:
@@ -296,7 +258,7 @@ class Pipeline:
         frame_ids = self._inputs.frame_ids(*pair)
         names = recalibrator.tracker.initial
         if (names.camera_frame, names.lidar_frame) != frame_ids:
-            self._report_other_sensors(names, *frame_ids)
+            self._announcer.other_sensors(names, *frame_ids)
             return
         frame = self._inputs.decode(*pair, recalibrator.camera)
         try:
@@ -309,22 +271,21 @@ class Pipeline:
         self._learn_sweep(frame.cloud, recalibrator)
         if is_keyframe:
             self.last_keyframe = frame
-            self._stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
-            self._note_what_is_missing(recalibrator, frame)
+            self._announcer.stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
+            self._announcer.note_what_is_missing(recalibrator, frame)
         meter.switch(Work.INTAKE)
-        if is_keyframe and recalibrator.segments_keyframes and self.load.allows_classes(recalibrator.needs_classes):
+        if is_keyframe and recalibrator.segments_keyframes and self.load.allows_classes(recalibrator.first_guess.needs_classes):
             self._segmenter.put(None)
         if self._is_due(recalibrator):
             self._estimator.put(None)
-        self._sink(FrameIngested(frame, is_keyframe, *pair))
+        self._announcer.tell(FrameIngested(frame, is_keyframe, *pair))
 
     def _prepare(self, intake: Intake) -> Recalibrator | None:
         """The recalibrator to ingest a pair; None while camera or start are unknown, and for messages that do not belong together
         by what this cloud tells of the sweep."""
-        with self._lock:
-            camera = self.camera
+        camera = self.camera
         if camera is None:
-            self._sink(Problem("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"))
+            self._announcer.tell(Problem(NO_CAMERA))
             return None
         recalibrator = self.recalibrator or self._start(camera, *self._inputs.frame_ids(intake.image, intake.cloud))
         if recalibrator is None:
@@ -353,9 +314,8 @@ class Pipeline:
             earlier = self._pairing.newest_cloud_between(since, frame.moment_of_cloud)
         if self._inputs.decode_cloud is None or earlier is None:
             return None
-        stamp, message = earlier
         try:
-            return stamp, self._inputs.decode_cloud(message)
+            return earlier[0], self._inputs.decode_cloud(earlier[1])
         except CalibrationError:  # a damaged neighbour does not make the frame unusable
             return None
 
@@ -365,15 +325,9 @@ class Pipeline:
         if initial is None:
             return None
         with self._lock:
-            recalibrator = self.recalibrator = Recalibrator(
-                self.camera or camera,  # it may have changed while the initial extrinsic was looked up
-                initial=initial,
-                config=self.config,
-                camera_frame=camera_frame,
-                lidar_frame=lidar_frame,
-                speed_gate=self.speed_gate,
-                segmentation=self.segmentation,
-            )
+            camera = self.camera or camera  # it may have changed while the initial extrinsic was looked up
+            named = replace(initial, camera_frame=camera_frame, lidar_frame=lidar_frame)
+            recalibrator = self.recalibrator = self._recalibrator_at(camera, named)
         self._follow_clocks(recalibrator)
         self._publish(recalibrator)
         return recalibrator
@@ -390,7 +344,7 @@ class Pipeline:
         with self.load.counting(Work.CHECKS, charged=False):
             outcome = self._deferred.run_next(self._estimator.check_cancelled)
         if outcome is not None:
-            self._sink(JobDone(outcome))
+            self._announcer.tell(JobDone(outcome))
         if self._deferred.waiting:
             self._estimator.put(None)
 
@@ -422,7 +376,6 @@ class Pipeline:
                 self._hand_over(self._pairing.configure(replace(self.config, motion=motion)))
 
     def _report_progress(self, stage: str, share: float) -> None:
-        """Of an estimate. Raises Cancelled where it is to end."""
         self._estimator.check_cancelled()
         self._requests.report(stage, share)
 
@@ -435,49 +388,12 @@ class Pipeline:
             with self.load.counting(Work.CLASSES):
                 problems = recalibrator.segment_keyframe(lambda: self._segmenter.stopping or self.paused)
             for problem in problems:
-                self._sink(Problem(problem))
+                self._announcer.tell(Problem(problem))
             if self._is_due(recalibrator):
                 self._estimator.put(None)
 
     def _is_due(self, recalibrator: Recalibrator) -> bool:
         return not self.paused and self.load.allows_estimate(recalibrator.ready())
 
-    # ---- events -------------------------------------------------------------------------------------------------------
-
     def _publish(self, recalibrator: Recalibrator, again: bool = False) -> None:
-        """The current extrinsic, if it or its status differs from the one published last; none of a replaced recalibrator.
-
-        The monitor's assessment of an extrinsic that is right goes to the diagnostics alone.
-        """
-        with self._publish_lock:
-            extrinsic = recalibrator.current
-            if recalibrator is self.recalibrator and (again or extrinsic.result is not self._published):
-                self._published = extrinsic.result
-                self._sink(ExtrinsicUpdated(extrinsic, self._stamp or extrinsic.estimated_at))
-
-    def _note_what_is_missing(self, recalibrator: Recalibrator, keyframe: Frame) -> None:
-        """Report what the estimates have to do without, once each."""
-        newest, notes = recalibrator.newest(), [recalibrator.motion.missing]
-        if keyframe.cloud.time_problem:
-            notes.append(f"{keyframe.cloud.time_problem}; until then the clouds count as without point times")
-        if newest is not None and not newest.has_reflectivity:
-            notes.append("the cloud has no intensity: reflectivity edges are off, everything else works")
-        for note in notes:
-            if note and note not in self._published_notes:
-                self._published_notes.add(note)
-                self._sink(Problem(note))
-
-    def _report_other_sensors(self, names: Result, camera_frame: str, lidar_frame: str) -> None:
-        self._sink(
-            Problem(
-                f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to "
-                f"{names.camera_frame}; give every camera-LiDAR pair its own node"
-            )
-        )
-
-    def _report(self, error: Exception) -> None:
-        if isinstance(error, CalibrationError):
-            self._sink(Problem(str(error)))
-        else:  # a defect of ours: say where, keep the node alive
-            line = f"unexpected {type(error).__name__}: {error}; please report it with the data that led to it"
-            self._sink(Problem(line))
+        self._announcer.publish(recalibrator, lambda: recalibrator is self.recalibrator, again)

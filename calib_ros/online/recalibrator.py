@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.config.online import CONTINUOUS, PERIODIC
+from calib_ros.config.online import CONTINUOUS
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.intrinsics import RefinedCamera
 from calib_ros.lidar.range_image import require_returns
@@ -20,9 +20,9 @@ from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_move
 from calib_ros.online.first_guess import FirstGuess
 from calib_ros.online.glance import Glance
 from calib_ros.online.keyframe_classes import KeyframeSegmenter
-from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, Permit, ScanBefore, SpeedGate, always, no_scan
+from calib_ros.online.keyframes import Batch, EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, feature_config
 from calib_ros.online.monitor import Assessment, Monitor, Verdict
-from calib_ros.online.schedule import Schedule
+from calib_ros.online.pacing import Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
@@ -33,22 +33,12 @@ from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, RefusalCode, Result
+from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, RefusalCode, Result
 
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
+REST_SPACING_S = 2.0  # smallest time between keyframes at rest
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 DOUBTFUL_P = 0.05  # p value of a keyframe that asks for an estimate at rest: one in twenty of those that fit
-
-
-@dataclass(frozen=True, eq=False)
-class _Batch:
-    """Keyframes of an estimate, oldest first. unfused: how many of the buffer are in no accepted estimate yet. unfused_features:
-    how many of the estimate's own."""
-
-    features: Sequence[FrameFeatures]
-    generation: int
-    unfused: int
-    unfused_features: int
 
 
 class Recalibrator:
@@ -57,24 +47,10 @@ class Recalibrator:
     `ingest` takes frames, `segment_keyframe` adds semantics to a keyframe, `estimate` estimates from all keyframes. Each of them
     may run on a thread of its own: an estimate works on a copy of the buffer's references.
 
-    Parameters
-    ----------
-    camera : Camera
-        Intrinsics of all frames.
-    initial : (4, 4) array or Result
-        T_camera_lidar to start from, which `reset` goes back to.
-    config : Config, optional
-        All constants; replaced by `configure`.
-    camera_frame : str
-        Name of the camera's optical frame, for the results.
-    lidar_frame : str
-        Name of the LiDAR's frame, for the results.
-    current : Result, optional
-        The extrinsic to go on with, where it is another than the initial one.
-    speed_gate : SpeedGate, optional
-        Speed gate that is fed with odometry from outside.
-    segmentation : Segmentation, optional
-        The models, where they are loaded already.
+    camera: intrinsics of all frames. initial: T_camera_lidar (4, 4) to start from, or a result that has it, which `reset` goes
+    back to. config: all constants, replaced by `configure`. camera_frame, lidar_frame: names of the frames, for the results.
+    current: the extrinsic to go on with, where it is another. speed_gate: one that is fed with odometry from outside.
+    segmentation: the models, where they are loaded already.
     """
 
     def __init__(
@@ -105,20 +81,15 @@ class Recalibrator:
         self.schedule = Schedule(self.config.online)
         self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
         self._calibrator = Calibrator(camera, self.config, self.segmentation)
-        self._calibrator_lock = threading.Lock()
-        self._lock = threading.Lock()
-        self._blind_frames = 0
+        self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
         self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
         self._test_wanted = False  # a look has struck, and the load has not allowed for a test yet
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
-        # The nominal extrinsic is a placeholder until there is a first guess.
-        self._nominal_start = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
         self.refined_camera: RefinedCamera | None = None  # by the newest estimate that tells of it
-        self.first_guess = FirstGuess(self.config)
-        self._extrinsic_unknown = self._nominal_start is not None and self.first_guess.wanted
+        self.first_guess = FirstGuess(self.config, self.tracker.initial)
 
     # ---- state --------------------------------------------------------------------------------------------------------
 
@@ -126,8 +97,7 @@ class Recalibrator:
     def calibrator(self) -> Calibrator:
         """Calibrator of the current configuration. Made on demand: its look-up tables for the lens take up to 50 ms."""
         with self._calibrator_lock:
-            config = self.config
-            last = self._calibrator
+            config, last = self.config, self._calibrator
             if replace(config, online=last.config.online) != last.config:
                 self._calibrator = Calibrator(self.camera, config, self.segmentation)
             return self._calibrator
@@ -150,18 +120,13 @@ class Recalibrator:
     @property
     def segments_keyframes(self) -> bool:
         """True if there are models to segment keyframes, and estimates that want it."""
-        wanted = self.needs_classes or self._in_doubt or not self.calibrator.classes_in_doubt_only
+        wanted = self.first_guess.needs_classes or self._in_doubt or not self.calibrator.classes_in_doubt_only
         return self.segmentation.active and wanted
-
-    @property
-    def needs_classes(self) -> bool:
-        """True while the first guess of the extrinsic waits for the classes of keyframes."""
-        return self._extrinsic_unknown and self.first_guess.uses_classes
 
     @property
     def at_rest(self) -> bool:
         """True while the extrinsic is steady and every keyframe since the last estimate fits it: less is done then."""
-        return self.tracker.steady and self._keyframes_fit
+        return self.config.online.rest_period_s > 0 and self.tracker.steady and self._keyframes_fit
 
     def newest(self) -> FrameFeatures | None:
         """Features of the newest keyframe, None before the first."""
@@ -169,38 +134,26 @@ class Recalibrator:
             return self.buffer[-1] if self.buffer else None
 
     def evidence(self) -> tuple[list[FrameFeatures], Config, Result]:
-        """All of one moment: the keyframes that an estimate would use, oldest first, the configuration of their features, and the
-        current extrinsic."""
+        """The keyframes that an estimate would use, oldest first, the configuration of their features, the current extrinsic."""
         with self._lock:
             return self._informative() or list(self.buffer), self.config, self.current.result
 
     def ready(self) -> bool:
-        """True if an estimate is due: enough keyframes, new ones among them, and online.mode allows it.
-
-        Mode periodic does not wait while the calibration has moved, or the first estimate is to be confirmed. Mode continuous
-        waits for online.rest_period_s while the extrinsic is steady and every keyframe since the last estimate fits it.
-        """
+        """True if an estimate is due: enough keyframes, new ones among them, and online.mode allows it."""
         with self._lock:
-            config = self.config.online
-            if config.mode == CONTINUOUS and self.at_rest and not self.schedule.rested:
+            if self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < self.config.online.min_keyframes:
                 return False
-            due = self.schedule.due or (config.mode == PERIODIC and (self.tracker.lost or self.tracker.tentative))
-            if not due or self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < config.min_keyframes:
-                return False
-            return self._has_enough()
+            return self.schedule.due(self.at_rest, self.tracker.lost or self.tracker.tentative) and self._has_enough()
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
         left out: an empty road would give a biased one."""
-        if not self.tracker.monitored:
-            return list(self.buffer)
-        return self.monitor.informative(list(self.buffer), self.tracker.T)
+        keyframes = list(self.buffer)
+        return self.monitor.informative(keyframes, self.tracker.T) if self.tracker.monitored else keyframes
 
     def _has_enough(self) -> bool:
-        """With the lock held: there are enough keyframes to estimate from, and new ones among them.
-
-        Asked at every frame while an estimate waits for the budget, and computed anew for a new keyframe or extrinsic.
-        """
+        """With the lock held: there are enough keyframes to estimate from, and new ones among them."""
+        # Asked at every frame while an estimate waits for the budget.
         state = (self.keyframes.generation, self.keyframes.seen, self.keyframes.new, self.tracker.current)
         if self._enough is None or self._enough[0] != state:
             informative = self._informative()
@@ -210,31 +163,34 @@ class Recalibrator:
 
     # ---- frames -------------------------------------------------------------------------------------------------------
 
-    def ingest(self, frame: Frame, scan_before: ScanBefore = no_scan, permit: Permit = always) -> bool:
+    def ingest(
+        self, frame: Frame, scan_before: ScanBefore = lambda since: None, permit: Callable[[], bool] = lambda: True
+    ) -> bool:
         """Check a frame, and add it to the keyframes if it is one; True if it is. CalibrationError for an unusable frame.
 
-        scan_before: see `EgoMotion.with_twist`. permit: see `KeyframeSelector.select`. The cloud of every frame is checked: a
-        LiDAR that dies beside a parked car must not go unnoticed.
+        scan_before: see `EgoMotion.with_twist`. permit: see `KeyframeSelector.select`.
         """
-        healthy = self._check_sensors(frame)
-        require_returns(frame.cloud)
+        problem = self.sensors.check(frame)
+        if problem is None or self.sensors.faulty_frames >= BLIND_FRAMES:
+            with self._lock:
+                self.tracker.set_sensor_problem(problem)
+        require_returns(frame.cloud)  # of every frame: a LiDAR that dies beside a parked car must not go unnoticed
         self.motion.add(frame)
-        if self._extrinsic_unknown:
+        if self.first_guess.pending:
             self.first_guess.add(frame)
         self.schedule.add_frame(frame.stamp)
-        spacing_s = self.config.online.rest_spacing_s if self.at_rest else 0.0
-        if not healthy or not self.speed_gate.allows(frame):
+        spacing_s = REST_SPACING_S if self.at_rest else 0.0
+        if problem is not None or not self.speed_gate.allows(frame):
             return False
         is_keyframe = self.selector.select(frame.image, frame.stamp, permit, spacing_s)
         if is_keyframe:
             self.glance.put_off(frame.stamp)
         elif not (self._worth_a_test(frame) and permit()):
             return False
-        with self._lock:
-            generation = self.keyframes.generation
+        generation = self.keyframes.generation
         try:
             frame_with_twist = self.motion.with_twist(frame, scan_before)
-            self.motion.check_known(frame_with_twist, *self._motion_limits())
+            self.motion.check_known(frame_with_twist, self.config.tracker)
             if frame_with_twist is not frame and not self.speed_gate.allows(frame_with_twist):
                 return False  # the selector goes on from this frame: scans in a turn are not aligned one by one
             features = self.calibrator.extract(frame_with_twist)
@@ -245,10 +201,8 @@ class Recalibrator:
         with self._lock:
             current = generation == self.keyframes.generation  # else: reset or configured meanwhile
             if current and is_keyframe:
-                if self.needs_classes:  # classes may come for one keyframe in many, and a first guess needs several
-                    self.keyframes.add(features, lambda f: f.view is not None)
-                else:
-                    self.keyframes.add(features)
+                # Classes may come for one keyframe in many, and a first guess needs several.
+                self.keyframes.add(features, lambda f: self.first_guess.needs_classes and f.view is not None)
                 if self.segments_keyframes:
                     self.segmenter.put(frame_with_twist, features)
         if current or is_keyframe:
@@ -265,41 +219,22 @@ class Recalibrator:
         self._test_wanted = self.glance.strikes(frame, self.tracker.T, self.config)
         return self._test_wanted
 
-    def _motion_limits(self) -> tuple[float, tuple[float, float]]:
-        """Half the time, s, in which the scan sweeps the image, and how far (rad, m) the vehicle may move in it unknown: as far
-        as a converged extrinsic may be off."""
-        motion, limits = self.config.motion, self.config.tracker
-        return motion.scan_period_s * self.camera.field_deg / 720, (np.deg2rad(limits.max_sigma_deg), limits.max_sigma_m)
-
     def segment_keyframe(self, cancelled: Callable[[], bool] = lambda: False) -> tuple[str, ...]:
-        """Add semantics to the newest keyframe, if it has none yet; returns a line for each model that failed.
-
-        Takes seconds: to be called from a thread of its own. Estimates use a keyframe without semantics until then. cancelled:
-        see Segmentation.
-        """
-        if self.needs_classes:
-            segmented = self.segmenter.segment(self.calibrator, cancelled, CLASSES)
-        else:
-            box, tracker = SearchBox(self.config.search.rotation_deg, self.config.search.translation_m), self.tracker
-            # Where searches begin that come by themselves, and those on request.
-            around = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
-            segmented = self.segmenter.segment(self.calibrator, cancelled, ALL, [(T, box) for T in around])
+        """Add semantics to the newest keyframe, if it has none yet, which takes seconds; returns a line for each model that
+        failed. cancelled: see Segmentation."""
+        guessing, tracker = self.first_guess.needs_classes, self.tracker
+        # Where searches begin that come by themselves, and those on request.
+        starts = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
+        around = [] if guessing else [(T, self._search_box()) for T in starts]
+        segmented = self.segmenter.segment(self.calibrator, cancelled, CLASSES if guessing else ALL, around)
         if segmented is None:
             return ()
-        if segmented.features is not None:
+        plain, features, problems = segmented
+        if features is not None:
             with self._lock:
-                self.keyframes.replace(segmented.plain, segmented.features)
-                self.keyframes.new += self.needs_classes  # the classes are what the guess waits for
-        return segmented.problems
-
-    def _check_sensors(self, frame: Frame) -> bool:
-        """True if both sensors show something. One bad frame is passed over, more of them are a status."""
-        problem = self.sensors.check(frame)
-        self._blind_frames = self._blind_frames + 1 if problem else 0
-        if problem is None or self._blind_frames >= BLIND_FRAMES:
-            with self._lock:
-                self.tracker.set_sensor_problem(problem)
-        return problem is None
+                self.keyframes.replace(plain, features)
+                self.keyframes.new += self.first_guess.needs_classes  # the classes are what the guess waits for
+        return problems
 
     def _monitor_extrinsic(self, tested: FrameFeatures | None = None) -> None:
         """Test the current extrinsic with the newest keyframe, or with a frame that becomes one if it speaks against it. Where it
@@ -343,75 +278,61 @@ class Recalibrator:
         """Joint estimate over the keyframes (thesis eq. 3.16), passed to the tracker; returns the current extrinsic afterwards.
 
         Until two successive estimates agree, and on request (force_search), the whole search box is searched; then the current
-        extrinsic is refined. A failure keeps the current extrinsic and says why in its status.
-
-        progress: see `Calibrator.calibrate`. After a Cancelled that it raises, everything is as before the estimate.
+        extrinsic is refined. A failure keeps the current extrinsic and says why in its status. progress: see
+        `Calibrator.calibrate`. After a Cancelled that it raises, everything is as before the estimate.
         """
         with self._lock:
-            informative, unfused = self._informative() or list(self.buffer), self.keyframes.unfused
-            batch = _Batch(informative, self.keyframes.generation, unfused, self.keyframes.newest_among(informative, unfused))
-            new, self.keyframes.new = self.keyframes.new, 0
+            batch = self.keyframes.batch(self._informative() or list(self.buffer))
             self.schedule.start_estimate()
             fitted, self._keyframes_fit = self._keyframes_fit, self.config.monitor.enabled  # until one from now on does not
+        names, force_search = self.tracker.initial, force_search and bool(batch.features)
         try:
             if not batch.features:
                 result = Result(self.tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds")
-            elif self._extrinsic_unknown:
-                result, force_search = self._first_estimate(batch, progress), False
+            elif self.first_guess.pending:
+                force_search = False
+                result = self.first_guess.estimate(self.calibrator, batch.features, names, progress)
             else:
                 result = self._search_or_refine(batch, progress, force_search)
         except Cancelled:
             with self._lock:
-                if batch.generation == self.keyframes.generation:
-                    self.keyframes.new += new
+                self.keyframes.give_back(batch)
                 self.schedule.cancel_estimate()
                 self._keyframes_fit = self._keyframes_fit and fitted
             raise
-        extrinsic = self._update_tracker(result, batch, force_search and bool(batch.features))
+        result = replace(result, camera_frame=names.camera_frame, lidar_frame=names.lidar_frame)
+        extrinsic = self._update_tracker(result, batch, force_search)
         if self.config.online.mode != CONTINUOUS or self.tracker.steady:
             self.calibrator.objectives.free_memory()
         return extrinsic
 
-    def _first_estimate(self, batch: _Batch, progress: Callback | None) -> Result:
-        """The first extrinsic, from nothing, or why there is none yet."""
-        initial = self.tracker.initial
-        result = self.first_guess.estimate(self.calibrator, batch.features, initial, progress)
-        result = replace(result, camera_frame=initial.camera_frame, lidar_frame=initial.lidar_frame)
-        with self._lock:
-            if result.converged and batch.generation == self.keyframes.generation:
-                self.tracker = Tracker(replace(result, status=INITIAL, covariance=None), None, self.config)
-                self._extrinsic_unknown = False
-                self.first_guess.clear()
-        return result
+    def _search_box(self, rounds: int | None = None) -> SearchBox:
+        return SearchBox(self.config.search.rotation_deg, self.config.search.translation_m, rounds)
 
-    def _search_or_refine(self, batch: _Batch, progress: Callback | None, force_search: bool) -> Result:
-        tracker, config = self.tracker, self.config.search
-        box, start = None, tracker.T
-        if force_search:
-            box = SearchBox(config.rotation_deg, config.translation_m)
-        elif not tracker.settled:
+    def _search_or_refine(self, batch: Batch, progress: Callback | None, force_search: bool) -> Result:
+        tracker = self.tracker
+        box, start = self._search_box() if force_search else None, tracker.T
+        if not (force_search or tracker.settled):
             # A search on request may use all rounds; automatic ones are limited, since the next keyframe tries again.
-            box = SearchBox(config.rotation_deg, config.translation_m, SEARCH_ROUNDS)
-            start = tracker.search_center
+            box, start = self._search_box(SEARCH_ROUNDS), tracker.search_center
         # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
-        initial = tracker.initial
-        result = self.calibrator.estimate(batch.features, start, box, progress, anchor=initial.T_camera_lidar)
-        return replace(result, camera_frame=initial.camera_frame, lidar_frame=initial.lidar_frame)
+        return self.calibrator.estimate(batch.features, start, box, progress, anchor=tracker.initial.T_camera_lidar)
 
-    def _update_tracker(self, result: Result, batch: _Batch, on_request: bool) -> Extrinsic:
+    def _update_tracker(self, result: Result, batch: Batch, on_request: bool) -> Extrinsic:
         with self._lock:
             if batch.generation != self.keyframes.generation:  # reset, configured or moved meanwhile: the estimate is void
                 return self.tracker.current
-            seconds = 0.0
-            self._in_doubt = leaves_doubt(result)
+            if self.first_guess.pending and result.converged:
+                self.tracker = Tracker(replace(result, status=INITIAL, covariance=None), None, self.config)
+                self.first_guess.end()
+            seconds, self._in_doubt = 0.0, leaves_doubt(result)
             if batch.features:
                 newest = batch.features[-1].stamp
                 seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
                 self._estimated_at = newest
             accepted = self.tracker.current.accepted
             share_new = min(batch.unfused_features / max(len(batch.features), 1), 1.0)
-            covers_all = not self.keyframes.incomplete
-            extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all)
+            extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all=not self.keyframes.incomplete)
             if result.converged or result.refusal is RefusalCode.WRONG_INTRINSICS:  # where they are wrong, it is wanted most
                 self.refined_camera = result.refined_camera
             if extrinsic.accepted > accepted:
@@ -438,11 +359,11 @@ class Recalibrator:
             self._clear_keyframes()
             self.sensors = SensorHealth(self.config.monitor)
             self.glance.reset()
-            self.first_guess.clear()
-            if self._nominal_start is not None and self.first_guess.wanted:
-                self.tracker, self._extrinsic_unknown = Tracker(self._nominal_start, None, self._configured), True
-            else:
+            placeholder = self.first_guess.begin_anew()
+            if placeholder is None:
                 self.tracker.reset()
+            else:
+                self.tracker = Tracker(placeholder, None, self._configured)
             self.config = self.tracker.config = with_clocks(self._configured, self.tracker.initial)
             self.motion.config = self.config.motion
 
@@ -453,18 +374,12 @@ class Recalibrator:
             before, self._configured = self._configured.motion, config
             if before == config.motion:
                 config = replace(config, motion=self.config.motion)
-            features_changed = _feature_config(config) != _feature_config(self.config)
+            features_changed = feature_config(config) != feature_config(self.config)
             if config.semantics != self.config.semantics:  # else the models stay loaded
                 self.segmentation = models_of(config.semantics)
             self.config, self._enough = config, None
-            untouched = self._nominal_start is not None and not self.tracker.current.accepted
-            was_unknown = self._extrinsic_unknown
-            self.first_guess.config = config
-            if not self.first_guess.wanted:
-                self.first_guess.clear()
-            self._extrinsic_unknown = self.first_guess.wanted and (was_unknown or untouched)
-            if self._extrinsic_unknown and not was_unknown:
-                features_changed = True  # so far only points near the nominal view have classes
+            # Where it begins to guess, only points near the nominal view have classes so far.
+            features_changed = self.first_guess.configure(config, self.tracker.current.accepted > 0) or features_changed
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
             self.motion.config = config.motion
             self.monitor.config = self.sensors.config = config.monitor
@@ -482,10 +397,3 @@ class Recalibrator:
         self._restart_monitor = self._in_doubt = True
         self.segmenter.clear()
         self.selector.reset()
-
-
-def _feature_config(config: Config) -> tuple[object, ...]:
-    """The part of the configuration that features depend on."""
-    # How fast models run, and where, does not change what they recognise.
-    semantics = replace(config.semantics, threads=1, budget_s=1.0, provider="cpu")
-    return config.image, config.lidar, config.motion, config.score, config.others, semantics, config.refine.objective

@@ -44,7 +44,10 @@ class SensorProblem:
 
 
 class SensorHealth:
-    """Checks every frame, which takes a millisecond. Not thread-safe. config may be replaced at any time."""
+    """Checks every frame, which takes a millisecond. Not thread-safe. config may be replaced at any time.
+
+    faulty_frames: the newest ones, in a row.
+    """
 
     def __init__(self, config: MonitorConfig) -> None:
         self.config = config
@@ -52,11 +55,14 @@ class SensorHealth:
         self._returns: deque[int] = deque(maxlen=HISTORY)
         self._image: NDArray[np.uint8] | None = None
         self._points: NDArray[np.float32] | None = None
+        self.faulty_frames = 0
         self._repeated_images = self._low_contrast = self._few_returns = 0  # frames in a row
 
     def check(self, frame: Frame) -> SensorProblem | None:
         """The problem of the frame's image or scan, None if there is none. The camera comes first."""
-        return self._check_camera(frame) or self._check_lidar(frame.cloud)
+        problem = self._check_camera(frame) or self._check_lidar(frame.cloud)
+        self.faulty_frames = self.faulty_frames + 1 if problem else 0
+        return problem
 
     def _check_camera(self, frame: Frame) -> SensorProblem | None:
         small = _shrunk(frame.image)

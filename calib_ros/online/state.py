@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 from calib_ros import io, se3
 from calib_ros.camera import Camera
@@ -19,41 +20,32 @@ from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros.result import Result, parse
 
+T = TypeVar("T")
 CHECKSUM = "sha256"
 REMEDY = "delete it or name another state_file"
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """How a saved extrinsic was estimated, beyond the result itself (stamp, version, frames_used, score, frames).
-
-    accepted: estimates accepted since the node started. keyframes: since then. objective: score that was maximised.
-    config: fingerprint of all constants. sensor_stamp_ns: of the newest frame in it, by the sensors' clock; 0 if unknown.
-    """
-
-    accepted: int = 0
-    keyframes: int = 0
-    objective: str = ""
-    config: str = ""
-    sensor_stamp_ns: int = 0
-
-    @staticmethod
-    def of(config: Config, accepted: int = 0, keyframes: int = 0, sensor_stamp_ns: int = 0) -> Provenance:
-        """With objective and fingerprint of a configuration."""
-        fingerprint = _digest(config.to_dict())[:16]
-        return Provenance(int(accepted), int(keyframes), config.refine.objective, fingerprint, int(sensor_stamp_ns))
-
-
-@dataclass(frozen=True, eq=False)
-class State:
+class State(NamedTuple):
     """What a state file holds; camera and provenance are None where a plain result file serves as one."""
 
     result: Result
-    camera: Camera | None = None
-    provenance: Provenance | None = None
+    camera: Camera | None
+    provenance: dict[str, Any] | None
 
 
-def save_state(path: str | Path, result: Result, camera: Camera, provenance: Provenance | None = None) -> None:
+def provenance_of(config: Config, accepted: int, keyframes: int, sensor_stamp_ns: int) -> dict[str, Any]:
+    """How a saved extrinsic was estimated: estimates accepted and keyframes since the node started, the score that was
+    maximised, a fingerprint of all constants, and the stamp of the newest frame in it by the sensors' clock, 0 = unknown."""
+    return {
+        "accepted": int(accepted),
+        "keyframes": int(keyframes),
+        "objective": config.refine.objective,
+        "config": _digest(config.to_dict())[:16],
+        "sensor_stamp_ns": int(sensor_stamp_ns),
+    }
+
+
+def save_state(path: str | Path, result: Result, camera: Camera, provenance: Mapping[str, Any] | None = None) -> None:
     """Write an accepted estimate with the camera that it is valid for, atomically.
 
     BadInputError if the folder cannot be written or the result could not be read again; an old file stays then.
@@ -67,7 +59,7 @@ def save_state(path: str | Path, result: Result, camera: Camera, provenance: Pro
         "model": camera.model,
         "D": camera.D.tolist(),
     }
-    data["provenance"] = asdict(provenance or Provenance())
+    data["provenance"] = dict(provenance or {})
     # As it will be read: a value that JSON changes must not be mistaken for damage.
     data = json.loads(json.dumps(data))
     # Checksum first, provenance last: whatever piece of the file is lost, one of the two still shows it.
@@ -89,7 +81,7 @@ def load_state(path: str | Path, camera: Camera, camera_frame: str, lidar_frame:
         raise BadInputError(
             f"saved state {path} was estimated with other camera intrinsics ({_difference(saved, camera)}); {REMEDY}"
         )
-    return replace(result, data_stamp=state.provenance.sensor_stamp_ns if state.provenance is not None else 0)
+    return replace(result, data_stamp=(state.provenance or {}).get("sensor_stamp_ns", 0))
 
 
 def read_state(path: str | Path) -> State:
@@ -101,34 +93,24 @@ def read_state(path: str | Path) -> State:
         # A file with a provenance has a checksum; where it is missing, its key is what was damaged.
         if (CHECKSUM in data or "provenance" in data) and data.pop(CHECKSUM, None) != _digest(data):
             raise BadInputError(f"saved state {path} is damaged or edited: its checksum does not fit its content; {REMEDY}")
-        return State(result, _camera(data.get("camera")), _provenance(data.get("provenance")))
-    except _UnusableError as error:
-        raise BadInputError(f"saved state {path} holds no usable {error}; {REMEDY}") from None
     except (TypeError, ValueError, RecursionError):  # keys that are no text, or lists that hold themselves
         raise BadInputError(f"saved state {path} cannot be checked for damage; {REMEDY}") from None
 
+    def usable(name: str, made_of: Callable[[Any], T]) -> T | None:
+        try:
+            return None if data.get(name) is None else made_of(data[name])
+        except (AttributeError, LookupError, TypeError, ValueError, OverflowError, BadInputError):
+            raise BadInputError(f"saved state {path} holds no usable {name}; {REMEDY}") from None
 
-class _UnusableError(Exception):
-    """Its text names what cannot be used."""
-
-
-def _camera(data: Any) -> Camera | None:
-    if data is None:
-        return None
-    try:
-        return Camera(data["K"], int(data["width"]), int(data["height"]), data["model"], data["D"])
-    except (AttributeError, LookupError, TypeError, ValueError, OverflowError, BadInputError):
-        raise _UnusableError("camera") from None
+    return State(result, usable("camera", _camera), usable("provenance", _provenance))
 
 
-def _provenance(data: Any) -> Provenance | None:
-    if data is None:
-        return None
-    try:
-        numbers = {name: int(data.get(name, 0)) for name in ("accepted", "keyframes", "sensor_stamp_ns")}
-        return Provenance(objective=str(data.get("objective", "")), config=str(data.get("config", "")), **numbers)
-    except (AttributeError, TypeError, ValueError, OverflowError):
-        raise _UnusableError("provenance") from None
+def _camera(data: Any) -> Camera:
+    return Camera(data["K"], int(data["width"]), int(data["height"]), data["model"], data["D"])
+
+
+def _provenance(data: Any) -> dict[str, Any]:
+    return {**data, "sensor_stamp_ns": int(data.get("sensor_stamp_ns", 0))}
 
 
 def _digest(data: dict[str, Any]) -> str:

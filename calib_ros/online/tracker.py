@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import Config
 from calib_ros.config.online import MANUAL
 from calib_ros.online.clocks import ClockEvidence
@@ -27,17 +26,9 @@ UNSETTLING_REJECTIONS = 3  # so many in a row, and the whole box is searched aga
 # a wrong optimum, and 2 did so on a KITTI junction.
 RECOVERING = 3
 SAME_S = 1e-3  # s; time offsets nearer than this are the same: no stamps are better
-
-Matrix = NDArray[np.float64]
-
-
-class GateVerdict(Enum):
-    """What the tracker's gate says about an estimate."""
-
-    PASSED = "passed"
-    NOT_CONVERGED = "not converged"
-    STEP_TOO_LARGE = "step too large"  # beyond tracker.max_step_deg or max_step_m
-    IMPROBABLE = "improbable"  # less probable than tracker.gate
+# An estimate farther from a settled extrinsic, or less probable given it, is rejected: a mount that drifts does not jump.
+MAX_STEP_DEG, MAX_STEP_M = 1.0, 0.15
+GATE = 1e-4
 
 
 class Tracker:
@@ -75,7 +66,7 @@ class Tracker:
     # ---- state --------------------------------------------------------------------------------------------------------
 
     @property
-    def T(self) -> Matrix:
+    def T(self) -> Transform:
         """The current T_camera_lidar (4, 4)."""
         return self._result.T_camera_lidar
 
@@ -85,7 +76,7 @@ class Tracker:
         return self.state is TrackerState.LOST
 
     @property
-    def search_center(self) -> Matrix:
+    def search_center(self) -> Transform:
         """Where to search while not settled (4, 4): the initial extrinsic, until an estimate has been confirmed by another."""
         return self.T if self._has_settled else self._search_start
 
@@ -107,7 +98,7 @@ class Tracker:
         return self.settled and self._result.status == CONVERGED and not doubted
 
     @property
-    def spread(self) -> Matrix:
+    def spread(self) -> Covariance:
         """Random part of the current extrinsic's covariance (6, 6), rad and m: without the systematic error of all estimates."""
         if self._accepted:
             return self.filter.spread
@@ -118,9 +109,8 @@ class Tracker:
     def carry_over(self) -> Result:
         """What another tracker goes on with: the last good extrinsic if there is one; a calibration that has moved stays so."""
         if self.lost:
-            return replace(
-                self._result, T_camera_lidar=self.search_center, status=MOVED, reason=self._objection or "", covariance=None
-            )
+            reason = self._objection or ""
+            return replace(self._result, T_camera_lidar=self.search_center, status=MOVED, reason=reason, covariance=None)
         if self.tentative:
             return replace(self.last_good or self._result, status=INITIAL, reason="not confirmed before", covariance=None)
         return self.last_good or self._result
@@ -150,11 +140,11 @@ class Tracker:
             return self.current
         if self._rests_on_other_clocks(estimate) and (self.tentative or on_request):
             self._start_anew()
-        verdict = self._gate(estimate, on_request)
-        if verdict is GateVerdict.PASSED:
-            self._accept(estimate, share_new, on_request, covers_all)
+        why = self._objection_to(estimate, on_request)
+        if why:
+            self._reject(estimate, why)
         else:
-            self._reject(estimate, verdict)
+            self._accept(estimate, share_new, on_request, covers_all)
         return self._published()
 
     def _rests_on_other_clocks(self, estimate: Result) -> bool:
@@ -198,36 +188,34 @@ class Tracker:
 
     # ---- gate ---------------------------------------------------------------------------------------------------------
 
-    def _gate(self, estimate: Result, on_request: bool) -> GateVerdict:
+    def _objection_to(self, estimate: Result, on_request: bool) -> str:
+        """Why an estimate is rejected, for a person; "" if it is not."""
         if not estimate.converged:
-            return GateVerdict.NOT_CONVERGED
-        if not self.settled or on_request or estimate.covariance is None:
-            return GateVerdict.PASSED
-        return self._innovation_gate(estimate)
+            return estimate.reason or estimate.status
+        known = self.settled and not on_request and estimate.covariance is not None
+        return self._too_far(estimate) if known else ""
 
-    def _innovation_gate(self, estimate: Result) -> GateVerdict:
-        """Is an estimate nearer to the current extrinsic than the process noise allows for?"""
-        limits, (deg, m) = self.config.tracker, self._innovation_of(estimate)
-        if deg > limits.max_step_deg or m > limits.max_step_m:
-            return GateVerdict.STEP_TOO_LARGE
-        covariance = estimate.covariance
-        if covariance is not None and self.filter.probability(estimate.T_camera_lidar, covariance) < limits.gate:
-            return GateVerdict.IMPROBABLE
-        return GateVerdict.PASSED
-
-    def _passes_innovation_gate(self, estimate: Result) -> bool:
-        return self._innovation_gate(estimate) is GateVerdict.PASSED
+    def _too_far(self, estimate: Result) -> str:
+        """Why an estimate is farther from the current extrinsic than the process noise allows for; "" if it is not."""
+        (deg, m), covariance = self._innovation_of(estimate), estimate.covariance
+        away, kept = f"{deg:.2f} deg / {100 * m:.0f} cm away", "kept until more keyframes confirm it"
+        if deg > MAX_STEP_DEG or m > MAX_STEP_M:
+            limits = f"{MAX_STEP_DEG:g} deg / {100 * MAX_STEP_M:g} cm"
+            return f"the estimate is {away} from the current extrinsic, beyond {limits}: {kept}"
+        if covariance is not None and self.filter.probability(estimate.T_camera_lidar, covariance) < GATE:
+            return f"the estimate does not fit the current extrinsic ({away}, far beyond the uncertainty of both): {kept}"
+        return ""
 
     def _innovation_of(self, estimate: Result) -> tuple[float, float]:
         """Angle, deg, and distance, m, of an estimate from the current extrinsic."""
         T = estimate.T_camera_lidar
         return se3.rotation_error_deg(self.T, T), se3.translation_error_m(self.T, T)
 
-    def _reject(self, estimate: Result, verdict: GateVerdict) -> None:
+    def _reject(self, estimate: Result, why: str) -> None:
         self._result = replace(
             self._result,
             status=REFUSED if estimate.converged else estimate.status,
-            reason=self._rejection(estimate, verdict),
+            reason=why,
             frames_used=estimate.frames_used,
             score=estimate.score,
             refusal=estimate.refusal,
@@ -236,23 +224,6 @@ class Tracker:
         self._rejected_in_a_row += 1
         if self._rejected_in_a_row >= UNSETTLING_REJECTIONS:  # refinement has lost the calibration: the mount may have moved
             self.settled = False
-
-    def _rejection(self, estimate: Result, verdict: GateVerdict) -> str:
-        """Why an estimate is rejected, for a person."""
-        if verdict is GateVerdict.NOT_CONVERGED:
-            return estimate.reason or estimate.status
-        limits, (deg, m) = self.config.tracker, self._innovation_of(estimate)
-        if verdict is GateVerdict.STEP_TOO_LARGE:
-            why = (
-                f"the estimate is {deg:.2f} deg / {100 * m:.0f} cm away from the current extrinsic, beyond "
-                f"{limits.max_step_deg:g} deg / {100 * limits.max_step_m:g} cm"
-            )
-        else:
-            why = (
-                f"the estimate does not fit the current extrinsic ({deg:.2f} deg / {100 * m:.0f} cm away, far beyond the "
-                "uncertainty of both)"
-            )
-        return f"{why}: kept until more keyframes confirm it"
 
     def _accept(self, estimate: Result, share_new: float, on_request: bool, covers_all: bool) -> None:
         before, (deg, m) = self.T, self._innovation_of(estimate)
@@ -270,7 +241,7 @@ class Tracker:
             self._change(TrackerEvent.ESTIMATE_ELSEWHERE)
         if on_request:
             self.settled = False
-        elif self._has_settled and not self.settled and not self.lost and not self._passes_innovation_gate(estimate):
+        elif self._has_settled and not self.settled and not self.lost and self._too_far(estimate):
             # Rejected estimates have opened the search, and it ended elsewhere: one estimate is not enough to believe that.
             self._change(TrackerEvent.MOVED)
             self._accepted_since_moved, self._search_start = 0, before
@@ -314,11 +285,8 @@ class Tracker:
         needed, monitored = self.config.tracker.confirmations, self.config.monitor.enabled
         if self.state is not TrackerState.TENTATIVE or not needed:
             return False
-        return (monitored and self._consistent_keyframes < needed) or self._rests_on_clocks or not self._is_agreed
-
-    @property
-    def _rests_on_clocks(self) -> bool:
-        return self._clocks.open and self.config.motion.max_time_offset_s > 0
+        rests_on_clocks = self._clocks.open and self.config.motion.max_time_offset_s > 0
+        return (monitored and self._consistent_keyframes < needed) or rests_on_clocks or not self._is_agreed
 
     @property
     def _is_agreed(self) -> bool:
@@ -347,11 +315,8 @@ class Tracker:
         weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)  # more scenes would help there
         if estimate.shared_covariance is not None:
             covariance = covariance + estimate.shared_covariance
-        reason = estimate.reason
-        if weak:
-            reason = "; ".join(
-                filter(None, [f"the scenes do not show {', '.join(map(str, weak))} well; drive on", estimate.reason])
-            )
+        hidden = f"the scenes do not show {', '.join(map(str, weak))} well; drive on" if weak else ""
+        reason = "; ".join(filter(None, [hidden, estimate.reason]))
         # What these frames do not show of the clocks earlier ones may.
         clocks = estimate if estimate.time_offset_s is not None else self._result
         return replace(
@@ -365,7 +330,7 @@ class Tracker:
             reason=reason,
         )
 
-    def _box_covariance(self) -> Matrix:
+    def _box_covariance(self) -> Covariance:
         """Covariance (6, 6) of an extrinsic that has not settled: it lies in the search box."""
         search = self.config.search
         deg, m = search.rotation_deg or REFINEMENT_DEG, search.translation_m or REFINEMENT_M

@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
@@ -21,8 +22,8 @@ class Worker(Generic[Item]):
     """Runs `work(item)` on a thread with a queue of one item: a newer item replaces the one that waits.
 
     on_error: called on the worker thread with whatever `work` raises; the thread goes on. nice: by how much it yields to others
-    where all cores are busy, 0 to 19. on_idle: called on the worker thread whenever it has nothing left to do. done, dropped:
-    items worked on and replaced so far.
+    where all cores are busy, 0 to 19. on_idle: called on the worker thread whenever it has nothing left to do. dropped: items
+    replaced so far.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class Worker(Generic[Item]):
         self._waiting: list[Item] = []
         self._busy = self._stopping = False
         self._busy_since = 0.0
-        self.done = self.dropped = 0
+        self.dropped = 0
         self.busy_s = 0.0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -100,27 +101,23 @@ class Worker(Generic[Item]):
                     return
                 item = self._waiting.pop(0)
                 self._busy, self._busy_since = True, time.monotonic()
-            try:
-                self._work(item)
-            except Cancelled:
-                pass
-            except Exception as error:  # the thread must outlive any bad frame; on_error reports it
-                self._report(error)
-            finally:
-                with self._changed:
-                    self._busy = False
-                    self.busy_s += time.monotonic() - self._busy_since
-                    self.done += 1
-                    idle = not self._waiting
-                    self._changed.notify_all()
+            self._guarded(partial(self._work, item))
+            with self._changed:
+                self._busy = False
+                self.busy_s += time.monotonic() - self._busy_since
+                idle = not self._waiting
+                self._changed.notify_all()
             if idle:
-                try:
-                    self._on_idle()
-                except Exception as error:
-                    self._report(error)
+                self._guarded(self._on_idle)
 
-    def _report(self, error: Exception) -> None:
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """The thread must outlive any bad frame, and a reporter that fails, as a log does at shutdown."""
         try:
-            self._on_error(error)
-        except Exception:  # a reporter that fails, as a log does at shutdown, must not end the thread either
-            traceback.print_exc()
+            work()
+        except Cancelled:
+            pass
+        except Exception as error:
+            try:
+                self._on_error(error)
+            except Exception:
+                traceback.print_exc()

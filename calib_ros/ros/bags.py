@@ -11,18 +11,17 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from itertools import islice, product
+from itertools import chain, count, islice, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import rclpy
 import yaml
-from builtin_interfaces.msg import Time
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -38,16 +37,16 @@ from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import stamp_ns
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
+from calib_ros.ros.conversions import time_message
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import PROCESSED_KEPT
 from calib_ros.ros.subscriptions import type_name
 
-# Player.
 SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
-LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
 CLOCK_PERIOD = NANOSECONDS // 100
 SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
+LINGER_S = 1.0  # after the last message, so that late joiners get latched topics and nothing in flight is lost
 CLOUD_TYPE = SENSOR_TYPES[2]
 SENT_KEPT = 10  # messages on their way to a node that says nothing
 FOLLOW_S = 60.0  # longest wait for a followed node, which may have lost messages or have ended
@@ -134,12 +133,8 @@ class Capture:
 
 def _free_name(folder: Path) -> Path:
     name = f"capture_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
-    free = folder / name
-    k = 1
-    while free.exists():
-        k += 1
-        free = folder / f"{name}_{k}"
-    return free
+    names = chain([name], (f"{name}_{k}" for k in count(2)))
+    return next(path for path in map(folder.joinpath, names) if not path.exists())
 
 
 def _types() -> Any:
@@ -184,19 +179,17 @@ def _write_bag(path: Path, frames: list[RawKeyframe], result: Result, rectified:
 @dataclass(frozen=True)
 class PlayOptions:
     """rate: times the recorded pace. loop: start over at the end. clock: publish /clock. wait_s: seconds to wait until every
-    image and cloud topic has a subscriber. linger_s: seconds to stay after the last message, so that late joiners get
-    latched topics and nothing in flight is lost. follow: a node of this package that the playing waits for where it is slower,
-    for example /calib_ros; empty = none."""
+    image and cloud topic has a subscriber. follow: a node of this package that the playing waits for where it is slower, for
+    example /calib_ros; empty = none."""
 
     rate: float = 1.0
     loop: bool = False
     clock: bool = False
     wait_s: float = 10.0
-    linger_s: float = 1.0
     follow: str = ""
 
     def __post_init__(self) -> None:
-        for name, low, high in (("rate", 0.01, 1000.0), ("wait_s", 0.0, 3600.0), ("linger_s", 0.0, 3600.0)):
+        for name, low, high in (("rate", 0.01, 1000.0), ("wait_s", 0.0, 3600.0)):
             if not low <= getattr(self, name) <= high:
                 raise BadInputError(f"{name} = {getattr(self, name)!r} is out of range [{low:g}, {high:g}]")
 
@@ -252,15 +245,12 @@ class Follower:
 
     def add(self, topic: str, stamp: int, frame: str, is_scan: bool) -> None:
         """An image or a scan has been sent; those of topics that the node does not subscribe to do not count."""
-        if self._subscribes_to(topic):
+        if self.subscribes_to(topic):
             self._scans += is_scan
             self._in_flight.append(((stamp, frame), self._scans))
 
-    def is_heard(self, topics: Iterable[str]) -> bool:
-        """Whether the node subscribes to two of these topics or more, an image's and a cloud's among them, and tells us."""
-        return sum(map(self._subscribes_to, topics)) >= 2
-
-    def _subscribes_to(self, topic: str) -> bool:
+    def subscribes_to(self, topic: str) -> bool:
+        """Whether the node subscribes to a topic, and tells us."""
         told = [_owner(end) for end in self._node.get_publishers_info_by_topic(self._processed)]
         owners = [_owner(end) for end in self._node.get_subscriptions_info_by_topic(topic)]
         return any(a == b for ends in product(told, owners) for a, b in zip(*ends, strict=True))
@@ -296,7 +286,7 @@ class Player:
             except MissingDependencyError as error:
                 self.skipped.append(f"{topic.name}: {error}")
                 continue
-            latched = topic.type in LATCHED_TYPES and "static" in topic.name
+            latched = topic.type == "tf2_msgs/msg/TFMessage" and "static" in topic.name
             durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
             qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
             publisher = node.create_publisher(cls, topic.name, qos)
@@ -312,29 +302,21 @@ class Player:
         """Wait until every image and cloud topic has a subscriber, and a followed node is known; False when the time is up
         first."""
         end = time.monotonic() + self.options.wait_s
-        while not stopped():
+        while not stopped() and time.monotonic() < end:
             if self.hears_followed_node() and all(publisher.get_subscription_count() for publisher in self._sensors):
                 # Discovery has two sides: the subscribers may not know us yet; best-effort ones would miss the first messages.
                 _sleep(SETTLE_S, stopped)
                 return True
-            if time.monotonic() >= end:
-                return False
             time.sleep(0.02)
         return False
 
     def hears_followed_node(self) -> bool:
         """False where one is to be followed that is not heard, or does not subscribe to an image and a cloud of the bag."""
-        topics = (publisher.topic_name for publisher in self._sensors)
-        return self._follower is None or self._follower.is_heard(topics)
+        follower = self._follower
+        return follower is None or sum(follower.subscribes_to(sensor.topic_name) for sensor in self._sensors) >= 2
 
-    def play(self, stopped: Callable[[], bool], progress: Callable[[float], None] | None = None) -> None:
-        """Publish the bag once, or for ever with `loop`, until `stopped` says True."""
-        while not stopped():
-            self._play_once(stopped, progress)
-            if not self.options.loop:
-                return
-
-    def _play_once(self, stopped: Callable[[], bool], progress: Callable[[float], None] | None) -> None:
+    def play_once(self, stopped: Callable[[], bool], progress: Callable[[float], None]) -> None:
+        """Publish the bag, until `stopped` says True."""
         started = time.monotonic()
         first: int | None = None
         clock_at = 0
@@ -351,7 +333,7 @@ class Player:
                 if self._clock is not None:
                     recorded = min(first + int((now - started) * self.options.rate * NANOSECONDS), stamp)
                     if recorded >= clock_at:
-                        self._publish_clock(recorded)
+                        self._clock.publish(Clock(clock=time_message(recorded)))
                         clock_at = recorded + CLOCK_PERIOD
                 if now >= due:
                     break
@@ -362,36 +344,27 @@ class Player:
             if follower is not None and kind in SENSOR_TYPES:
                 follower.add(name, *peek_header(data), kind == CLOUD_TYPE)
             self.published[name] = self.published.get(name, 0) + 1
-            if progress is not None and self.bag.duration_s > 0:
+            if self.bag.duration_s > 0:
                 progress(min((stamp - first) / NANOSECONDS / self.bag.duration_s, 1.0))
 
-    def _publish_clock(self, stamp: int) -> None:
-        assert self._clock is not None
-        seconds, rest = divmod(stamp, NANOSECONDS)
-        self._clock.publish(Clock(clock=Time(sec=seconds, nanosec=rest)))
 
-
-def play(
-    path: str,
-    options: PlayOptions,
-    report: Callable[[str], None],
-    progress: Callable[[float], None] | None = None,
-    domain_id: int | None = None,
-) -> dict[str, int]:
+def play(path: str, options: PlayOptions, report: Callable[[str], None], progress: Callable[[float], None]) -> dict[str, int]:
     """Play a bag as a process of its own until its end or SIGINT/SIGTERM; returns the messages published per topic."""
     use_large_message_profile()
-    bag = BagFile(Path(path))
-    with _no_keyboard_interrupt():
-        return _play(bag, options, report, progress, domain_id)
+    with _no_keyboard_interrupt(), closing(BagFile(Path(path))) as bag:
+        rclpy.init()
+        node = rclpy.create_node("calib_player")
+        try:
+            return _play(node, bag, options, report, progress)
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
 
 
 @contextmanager
 def _no_keyboard_interrupt() -> Iterator[None]:
     """SIGINT ends the ROS context, which the player looks at; an exception besides could come in the middle of anything, such as
     the end of a generator, where nobody can catch it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     before = signal.signal(signal.SIGINT, lambda *_: None)
     try:
         yield
@@ -400,21 +373,15 @@ def _no_keyboard_interrupt() -> Iterator[None]:
 
 
 def _play(
-    bag: BagFile,
-    options: PlayOptions,
-    report: Callable[[str], None],
-    progress: Callable[[float], None] | None,
-    domain_id: int | None,
+    node: Node, bag: BagFile, options: PlayOptions, report: Callable[[str], None], progress: Callable[[float], None]
 ) -> dict[str, int]:
-    rclpy.init(domain_id=domain_id)
-
     def stopped() -> bool:
         return not rclpy.ok()
 
-    node = rclpy.create_node("calib_player")
-    player = None
+    published: dict[str, int] = {}
     try:
         player = Player(node, bag, options)
+        published = player.published
         for text in player.skipped:
             report(f"not played: {text}")
         if options.wait_s and not player.wait_for_subscribers(stopped) and not stopped():
@@ -422,13 +389,11 @@ def _play(
             if not player.hears_followed_node():
                 problem = f"{options.follow} is not heard, or subscribes to other topics (check name, remapping, ROS_DOMAIN_ID)"
             report(f"{problem} after {options.wait_s:g} s; playing all the same")
-        player.play(stopped, progress)
-        _sleep(options.linger_s, stopped)
+        player.play_once(stopped, progress)
+        while options.loop and not stopped():
+            player.play_once(stopped, progress)
+        _sleep(LINGER_S, stopped)
     except Exception:
         if rclpy.ok():
             raise  # else: a signal took the context away meanwhile
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
-        bag.close()
-    return player.published if player is not None else {}
+    return published

@@ -16,6 +16,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from calib_ros.online.pipeline import Pipeline
+from calib_ros.registration.progress import Callback
 from calib_ros.result import CONVERGED, TENTATIVE, Extrinsic
 from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.diagnostics import Health
@@ -62,7 +63,7 @@ class CalibrateServers:
         return response
 
     def _begin(self, goal: ServerGoalHandle) -> None:
-        self._promises[bytes(goal.goal_id.uuid)] = self._pipeline.request_estimate(_Feedback(goal, self._node, self._health))
+        self._promises[bytes(goal.goal_id.uuid)] = self._pipeline.request_estimate(self._feedback(goal))
         goal.execute()
 
     def _cancel(self, goal: ServerGoalHandle) -> CancelResponse:
@@ -86,24 +87,22 @@ class CalibrateServers:
             goal.abort()
         return result
 
+    def _feedback(self, goal: ServerGoalHandle) -> Callback:
+        """Progress of an estimate as feedback of a goal, on the thread of estimates."""
+        last = float("-inf")
 
-class _Feedback:
-    """Progress of an estimate as feedback of a goal, on the thread of estimates."""
+        def tell(stage: str, share: float) -> None:
+            nonlocal last
+            if time.monotonic() - last < FEEDBACK_PERIOD_S:
+                return
+            last = time.monotonic()
+            try:
+                goal.publish_feedback(Calibrate.Feedback(stage=stage, progress=min(max(float(share), 0.0), 1.0)))
+            except Exception as error:  # it must not end the estimate, which others may share
+                if self._node.context.ok():  # else the node is about to end
+                    self._health.unexpected(error)
 
-    def __init__(self, goal: ServerGoalHandle, node: Node, health: Health) -> None:
-        self._goal, self._node, self._health = goal, node, health
-        self._last = float("-inf")
-
-    def __call__(self, stage: str, share: float) -> None:
-        now = time.monotonic()
-        if now - self._last < FEEDBACK_PERIOD_S:
-            return
-        self._last = now
-        try:
-            self._goal.publish_feedback(Calibrate.Feedback(stage=stage, progress=min(max(float(share), 0.0), 1.0)))
-        except Exception as error:  # it must not end the estimate, which others may share
-            if self._node.context.ok():  # else the node is about to end
-                self._health.unexpected(error)
+        return tell
 
 
 def _outcome(estimate: Promise[Any]) -> tuple[bool, str]:

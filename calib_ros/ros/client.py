@@ -16,33 +16,27 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
-from calib_ros import se3
 from calib_ros.errors import CalibrationError
 from calib_ros.messages import decode_image, stamp_ns
 from calib_ros.result import Result
+from calib_ros.ros.conversions import covariance_from_ros, matrix_from_transform
 from calib_ros.ros.dds import use_large_message_profile
-
-_INSIDE_ORDER = [3, 4, 5, 0, 1, 2]  # from ROS's translation first to rotation first
 
 
 def result_from_message(msg: Any) -> Result:
     """calib_ros_msgs/Extrinsic -> Result."""
-    t, q = msg.transform.transform.translation, msg.transform.transform.rotation
-    T = se3.from_parts(se3.rotation_from_quaternion([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
-    covariance = None
-    if msg.covariance[0] >= 0:
-        covariance = np.asarray(msg.covariance, float).reshape(6, 6)[np.ix_(_INSIDE_ORDER, _INSIDE_ORDER)]
+    known = msg.time_offset_sigma >= 0
     return Result(
-        T,
+        matrix_from_transform(msg.transform.transform),
         msg.status,
         msg.reason,
         msg.score,
-        covariance,
+        covariance_from_ros(msg.covariance),
         int(msg.frames_used),
         msg.transform.header.frame_id,
         msg.transform.child_frame_id,
-        time_offset_s=msg.time_offset if msg.time_offset_sigma >= 0 else None,
-        time_offset_sigma_s=msg.time_offset_sigma if msg.time_offset_sigma >= 0 else None,
+        time_offset_s=msg.time_offset if known else None,
+        time_offset_sigma_s=msg.time_offset_sigma if known else None,
     )
 
 

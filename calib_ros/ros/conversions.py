@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Duration, Time
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
@@ -19,8 +20,8 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
 from calib_ros.result import Extrinsic
 
-# ROS orders covariances of poses translation first; calib_ros has rotation first.
-_ROS_ORDER = [3, 4, 5, 0, 1, 2]
+# ROS orders covariances of poses translation first; calib_ros has rotation first. The way back is the same.
+_ROS_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 
 
 def frame_from_messages(image: Any, cloud: Any, camera: Camera) -> Frame:
@@ -29,18 +30,14 @@ def frame_from_messages(image: Any, cloud: Any, camera: Camera) -> Frame:
     return Frame(pixels, decode_cloud(cloud), camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
 
 
-def time_message(stamp: int) -> Any:
+def time_message(stamp: int) -> Time:
     """Nanoseconds -> builtin_interfaces/Time."""
-    from builtin_interfaces.msg import Time
-
     seconds, rest = divmod(int(stamp), NANOSECONDS)
     return Time(sec=seconds, nanosec=rest)
 
 
-def duration_message(seconds: float) -> Any:
+def duration_message(seconds: float) -> Duration:
     """Seconds -> builtin_interfaces/Duration; what no Duration can hold becomes -1 s."""
-    from builtin_interfaces.msg import Duration
-
     if not 0 <= seconds < 2**31:
         return Duration(sec=-1)
     whole, rest = divmod(round(seconds * NANOSECONDS), NANOSECONDS)
@@ -106,7 +103,12 @@ def covariance_for_ros(covariance: NDArray[np.float64] | None) -> NDArray[np.flo
     since rclpy takes a (6, 6) array and sends it wrongly."""
     if covariance is None:
         return np.r_[-1.0, np.zeros(35)]
-    return np.asarray(covariance[np.ix_(_ROS_ORDER, _ROS_ORDER)]).reshape(36)
+    return np.asarray(covariance[_ROS_ORDER]).reshape(36)
+
+
+def covariance_from_ros(values: Any) -> NDArray[np.float64] | None:
+    """The other way; None where it is unknown."""
+    return np.asarray(values, float).reshape(6, 6)[_ROS_ORDER] if values[0] >= 0 else None
 
 
 def image_message(image: NDArray[np.uint8], frame_id: str, stamp: int) -> Image:

@@ -23,16 +23,11 @@ def config_file(name: str) -> Path:
 
     MissingDependencyError if the installation lacks it.
     """
-    source_tree = Path(__file__).resolve().parents[2] / "config" / name
-    if source_tree.exists():
-        return source_tree
-    candidates = [
-        Path(prefix) / "share/calib_ros/config" / name for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if prefix
-    ]
-    candidates.append(Path(sys.prefix) / "share/calib_ros/config" / name)
-    for path in candidates:
-        if path.exists():
-            return path
+    prefixes = filter(None, [*os.environ.get("AMENT_PREFIX_PATH", "").split(":"), sys.prefix])
+    folders = [Path(__file__).resolve().parents[2] / "config", *(Path(p) / "share/calib_ros/config" for p in prefixes)]
+    for folder in folders:
+        if (folder / name).exists():
+            return folder / name
     raise MissingDependencyError(f"{name} is not installed with calib_ros; build the package anew")
 
 

@@ -39,13 +39,16 @@ MEANINGS = {BLINDED: "check the hardware: a sensor shows nothing"}
 
 
 class Health:
-    """Collects what happens to the node, for log and diagnostics. Thread-safe, since every field is replaced whole."""
+    """Collects what happens to the node, for log and diagnostics. Thread-safe, since every field is replaced whole.
+
+    last_error: the newest problem, and when it came by time.monotonic(). extrinsic: its newest state.
+    """
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger
         self._logged: dict[str, float] = {}
-        self._last_error = ("", -1e9)
-        self._extrinsic: Extrinsic | None = None
+        self.last_error = ("", -1e9)
+        self.extrinsic: Extrinsic | None = None
         self._estimated_at: float | None = None
         self.losses: dict[str, str] = {}
         self.callback_ms: deque[float] = deque(maxlen=2000)
@@ -55,7 +58,7 @@ class Health:
         """Log a problem in one line, a repeated one once in REPEAT_S. kind: what counts as the same, if not the text."""
         now, kind = time.monotonic(), kind or text
         self.errors += 1
-        self._last_error = (text, now)
+        self.last_error = (text, now)
         if now - self._logged.get(kind, -1e9) >= REPEAT_S:
             if len(self._logged) > 100:  # texts may hold numbers that never repeat
                 self._logged.clear()
@@ -78,9 +81,9 @@ class Health:
         self.error(line)
         return line
 
-    def add_extrinsic(self, extrinsic: Extrinsic) -> bool:
-        """Log a change of the current extrinsic; True if a newly accepted estimate caused it."""
-        before, self._extrinsic = self._extrinsic, extrinsic
+    def add_extrinsic(self, extrinsic: Extrinsic) -> None:
+        """Log a change of the current extrinsic."""
+        before, self.extrinsic = self.extrinsic, extrinsic
         result = extrinsic.result
         accepted = extrinsic.accepted > 0 and (before is None or extrinsic.accepted != before.accepted)
         if accepted:
@@ -99,7 +102,6 @@ class Health:
             self.error(f"estimate {result.status}: {result.reason}")
         elif result.status not in (CONVERGED, TENTATIVE):  # published with every frame, with other figures each time
             self.error(f"extrinsic {result.status}: {result.reason or extrinsic.monitor_message}", result.status)
-        return accepted
 
     @contextmanager
     def guard(self) -> Iterator[None]:
@@ -116,16 +118,6 @@ class Health:
         """99th percentile of the newest 2000 callbacks, ms; 0 before the first."""
         times = list(self.callback_ms)
         return float(np.percentile(times, 99)) if times else 0.0
-
-    @property
-    def last_error(self) -> tuple[str, float]:
-        """The newest problem, and when it came by time.monotonic()."""
-        return self._last_error
-
-    @property
-    def extrinsic(self) -> Extrinsic | None:
-        """The newest state of the extrinsic."""
-        return self._extrinsic
 
     @property
     def age_s(self) -> float | None:
@@ -252,8 +244,7 @@ class Diagnostics:
         level, text = _level(extrinsic)
         if level == ERROR:
             return level, text
-        silent = self._silence(watched, images, clouds, pairs)
-        if silent is not None:
+        if (silent := self._silence(watched, images, clouds, pairs)) is not None:
             return silent
         input_problems = [*self._health.losses.values(), *filter(None, [unpaired])]
         if level == WARN or input_problems:

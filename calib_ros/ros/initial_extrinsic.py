@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,19 +12,11 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.state import Provenance, load_state, read_state, save_state
+from calib_ros.online.state import load_state, provenance_of, read_state, save_state
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.result import INITIAL, InitialSource, Result
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.tf import StaticTf
-
-
-@dataclass(frozen=True)
-class SaveOutcome:
-    """Whether an extrinsic was saved, and where or why not, for a person."""
-
-    saved: bool
-    message: str
 
 
 class InitialExtrinsic:
@@ -74,19 +66,20 @@ class InitialExtrinsic:
             return False
         return not np.allclose(T, initial.T_camera_lidar, atol=1e-6)
 
-    def save(self, result: Result, pipeline: Pipeline, stamp: int) -> SaveOutcome:
-        """Write an accepted estimate to the state file. stamp: ns, of the newest data, if the estimate does not tell its own."""
+    def save(self, result: Result, pipeline: Pipeline, stamp: int) -> tuple[bool, str]:
+        """Write an accepted estimate to the state file; whether it was, and where or why not, for a person. stamp: ns, of the
+        newest data, if the estimate does not tell its own."""
         path, camera, recalibrator = self._parameters()["state_file"], pipeline.camera, pipeline.recalibrator
         if not path or camera is None or recalibrator is None:
-            return SaveOutcome(False, "nothing saved: set the parameter state_file to a path")
+            return False, "nothing saved: set the parameter state_file to a path"
         accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
         try:
             newest = result.data_stamp or stamp
-            save_state(path, result, camera, Provenance.of(recalibrator.config, accepted, keyframes, newest))
+            save_state(path, result, camera, provenance_of(recalibrator.config, accepted, keyframes, newest))
         except BadInputError as error:
             self._error(str(error))
-            return SaveOutcome(False, str(error))
-        return SaveOutcome(True, f"saved to {path}")
+            return False, str(error)
+        return True, f"saved to {path}"
 
     def _saved(self) -> Result | None:
         """The saved extrinsic, unless the parameters name other frames."""

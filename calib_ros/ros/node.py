@@ -21,11 +21,11 @@ from calib_ros.ros.bags import Capture
 from calib_ros.ros.calibrate import CalibrateServers
 from calib_ros.ros.conversions import frame_from_messages, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
-from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
+from calib_ros.ros.initial_extrinsic import InitialExtrinsic
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, ProcessedPublisher
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
-from calib_ros.ros.tf import LATCHED, Edge, StaticTf
+from calib_ros.ros.tf import LATCHED, StaticTf
 
 INACTIVE = "the node is not active; activate it first"
 
@@ -123,10 +123,12 @@ class RosInterface:
         self._node.remove_on_set_parameters_callback(self._on_parameters)
         for service in self.beside.values():
             service.destroy()
-        for part in (self.calibrating, self.serving, self.extrinsic, self.overlay, self.processed, self.tf):
+        for part in (self.calibrating, self.serving, self.tf):
             part.destroy()
         for publisher in (self._transform_pub, self._diagnostics_pub):
             self._node.destroy_publisher(publisher)
+        for publishing in (self.extrinsic, self.overlay, self.processed):
+            self._node.destroy_publisher(publishing.publisher)
         return ended
 
     # ---- pipeline, on its threads -------------------------------------------------------------------------------------
@@ -168,12 +170,12 @@ class RosInterface:
             service.add(event)
 
     def _publish_tf(self, extrinsic: Extrinsic, stamp: int) -> None:
-        self.tf.publish(extrinsic.result, Edge(self.parameters["tf_parent"], self.parameters["tf_child"]), stamp)
+        self.tf.publish(extrinsic.result, self.parameters["tf_parent"], self.parameters["tf_child"], stamp)
 
     def _tf_parameters(self) -> tuple[bool, str, str]:
         return self.parameters["publish_tf"], self.parameters["tf_parent"], self.parameters["tf_child"]
 
-    def _save(self, result: Result) -> SaveOutcome:
+    def _save(self, result: Result) -> tuple[bool, str]:
         return self.initial.save(result, self.pipeline, self._last_stamp)
 
     # ---- parameters and timer, on the executor ------------------------------------------------------------------------

@@ -18,126 +18,93 @@ from rclpy.parameter import Parameter
 
 from calib_ros import se3
 from calib_ros.config import Config, former_names, load_stages, stages, update
+from calib_ros.config.options import checked, option
 from calib_ros.config.removed import REMOVED, notices
-from calib_ros.errors import BadInputError, CalibrationError, ConfigError
+from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.result import INITIAL, InitialSource, Result
 
 # Prefixes of the parameters that every ROS node has.
 OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
-@dataclass(frozen=True)
-class Setting:
-    """A node setting: default, meaning, allowed values (texts) or range (numbers); live = it may change while the node runs."""
-
-    default: Any
-    doc: str
-    choices: tuple[str, ...] = ()
-    low: float | None = None
-    high: float | None = None
-    live: bool = False
-
-
-# The node's own settings, beside the constants of the stages: defaults, meanings and ranges.
-SETTINGS = {
-    "image_transport": Setting(
-        "raw", "type of the image topic: raw = sensor_msgs/Image, compressed = sensor_msgs/CompressedImage", ("raw", "compressed")
+# The node's own settings, beside the constants of the stages.
+SETTINGS: dict[str, dataclasses.Field[Any]] = {
+    "image_transport": option(
+        "raw",
+        "type of the image topic: raw = sensor_msgs/Image, compressed = sensor_msgs/CompressedImage",
+        choices=("raw", "compressed"),
     ),
-    "image_is_rectified": Setting(
-        False,
-        "the image topic is rectified: use P of CameraInfo and no distortion; a change discards the keyframes",
-        live=True,
+    "image_is_rectified": option(
+        False, "the image topic is rectified: use P of CameraInfo and no distortion; a change discards the keyframes"
     ),
-    "reliability": Setting(
+    "reliability": option(
         "auto",
         "QoS of the image, cloud and CameraInfo subscriptions: auto = reliable where all publishers are, else best effort, which "
         "receives from both kinds",
-        ("auto", "best_effort", "reliable"),
-        live=True,
+        choices=("auto", "best_effort", "reliable"),
     ),
-    "camera_frame": Setting("", "name of the camera's optical frame; empty = the image's header.frame_id"),
-    "lidar_frame": Setting("", "name of the LiDAR's frame; empty = the cloud's header.frame_id"),
-    "motion_source": Setting(
+    "camera_frame": option("", "name of the camera's optical frame; empty = the image's header.frame_id"),
+    "lidar_frame": option("", "name of the LiDAR's frame; empty = the cloud's header.frame_id"),
+    "motion_source": option(
         "none",
         "source of the vehicle's velocity for online.max_speed and online.max_turn_deg_s: odom = topic odom (nav_msgs/Odometry), "
         "imu (sensor_msgs/Imu, turn rate only), twist (geometry_msgs/TwistStamped); none = estimated from the scans if possible",
-        ("none", "odom", "imu", "twist"),
+        choices=("none", "odom", "imu", "twist"),
     ),
-    "state_file": Setting(
+    "state_file": option(
         "",
         "file that the last accepted extrinsic is written to and read from at the next start; empty = none; a change takes "
         "effect at the next accepted estimate",
-        live=True,
     ),
-    "initial_translation_m": Setting(
-        [0.0, 0.0, 0.0], "initial T_camera_lidar: translation x, y, z, m; used if initial_quaternion_xyzw is given"
+    "initial_translation_m": option(
+        (0.0,) * 3, "initial T_camera_lidar: translation x, y, z, m; used if initial_quaternion_xyzw is given", length=3
     ),
-    "initial_quaternion_xyzw": Setting([0.0, 0.0, 0.0, 0.0], "initial T_camera_lidar: rotation x, y, z, w; all zero = not given"),
-    "initial_from_tf": Setting(True, "take the initial extrinsic from /tf_static if no state and no parameters give it"),
-    "nominal_yaw_deg": Setting(
-        0.0, "yaw of the camera to the left of the LiDAR's +x axis without any other initial extrinsic, deg", (), -180.0, 180.0
+    "initial_quaternion_xyzw": option((0.0,) * 4, "initial T_camera_lidar: rotation x, y, z, w; all zero = not given"),
+    "initial_from_tf": option(True, "take the initial extrinsic from /tf_static if no state and no parameters give it"),
+    "nominal_yaw_deg": option(
+        0.0,
+        "yaw of the camera to the left of the LiDAR's +x axis without any other initial extrinsic, deg",
+        low=-180.0,
+        high=180.0,
     ),
-    "publish_tf": Setting(False, "publish the extrinsic on /tf_static", live=True),
-    "tf_parent": Setting(
+    "publish_tf": option(False, "publish the extrinsic on /tf_static"),
+    "tf_parent": option(
         "camera",
         "parent of the published TF: camera (camera -> LiDAR) or lidar (LiDAR -> camera); with tf_child, the name of its parent",
-        live=True,
     ),
-    "tf_child": Setting(
+    "tf_child": option(
         "",
         "child of an edge of the TF tree, anywhere between the sensors, that is corrected instead; empty = the sensor that is "
         "not tf_parent",
-        live=True,
     ),
-    "publish_period_s": Setting(
-        1.0, "~/extrinsic is published at least this often, s; 2.5 periods are its DDS deadline", (), 0.05, 60.0
+    "publish_period_s": option(
+        1.0, "~/extrinsic is published at least this often, s; 2.5 periods are its DDS deadline", low=0.05, high=60.0
     ),
-    "max_data_age_s": Setting(
+    "max_data_age_s": option(
         5.0,
         "without a usable pair of image and cloud for this long the extrinsic is no longer usable, s",
-        (),
-        0.5,
-        3600.0,
-        live=True,
+        low=0.5,
+        high=3600.0,
     ),
-    "overlay_period_s": Setting(
+    "overlay_period_s": option(
         1.0,
         "shortest time between two overlays, s; 0 = one for every pair; drawn only while there is a subscriber",
-        (),
-        0.0,
-        3600.0,
-        live=True,
+        low=0.0,
+        high=3600.0,
     ),
-    "capture_dir": Setting(
-        "", "folder that ~/capture writes the raw messages of the newest keyframes to; empty = ~/capture is off", live=True
+    "capture_dir": option(
+        "", "folder that ~/capture writes the raw messages of the newest keyframes to; empty = ~/capture is off"
     ),
-    "capture_frames": Setting(
+    "capture_frames": option(
         0,
         "keyframes whose raw messages are kept in memory for ~/capture, 0 = none; each takes the size of one image and one cloud",
-        (),
-        0,
-        200,
-        live=True,
+        low=0,
+        high=200,
     ),
 }
-
-
-def checked(name: str, value: Any) -> Any:
-    """The value of a setting in its default's type, 10 as 10.0. ConfigError if it is of another, out of range or no choice."""
-    setting = SETTINGS[name]
-    if setting.choices and value not in setting.choices:
-        raise ConfigError(f"{name} = {value!r} must be one of {', '.join(setting.choices)}")
-    if isinstance(setting.default, (float, list)):
-        numbers = value if isinstance(setting.default, list) else [value]
-        if not isinstance(numbers, list) or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in numbers):
-            kind = "a list of numbers" if isinstance(setting.default, list) else "a number"
-            raise ConfigError(f"{name} = {value!r} must be {kind}")
-        value = [float(v) for v in numbers] if isinstance(setting.default, list) else float(value)
-    elif type(value) is not type(setting.default):
-        raise ConfigError(f"{name} = {value!r} must be of type {type(setting.default).__name__}")
-    if setting.low is not None and setting.high is not None and not setting.low <= value <= setting.high:
-        raise ConfigError(f"{name} = {value!r} is out of range [{setting.low:g}, {setting.high:g}]")
-    return value
+# Those that may change while the node runs, as all constants of the stages may.
+LIVE = {"image_is_rectified", "reliability", "state_file", "publish_tf", "tf_parent", "tf_child", "max_data_age_s"}
+LIVE |= {"overlay_period_s", "capture_dir", "capture_frames"}
 
 
 @dataclass(frozen=True)
@@ -155,8 +122,6 @@ class Parameters:
         t, q = self["initial_translation_m"], self["initial_quaternion_xyzw"]
         if not np.any(q):
             return None
-        if len(t) != 3:
-            raise BadInputError(f"initial_translation_m = {list(t)} must have 3 elements")
         T = se3.from_parts(se3.rotation_from_quaternion(q), t)
         return Result(
             se3.as_transform(T, "the initial extrinsic of the parameters"),
@@ -173,12 +138,10 @@ class Parameters:
 
     def to_dict(self) -> dict[str, Any]:
         """Flat {name: value} of everything, as a parameter file has it."""
-        values = {
-            f"{stage}.{name}": list(value) if isinstance(value, tuple) else value
-            for stage, fields in self.config.to_dict().items()
-            for name, value in fields.items()
-        }
-        return {**self.settings, **values}
+        stages = self.config.to_dict().items()
+        values = {f"{stage}.{name}": value for stage, fields in stages for name, value in fields.items()}
+        everything = {**self.settings, **values}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in everything.items()}
 
 
 def check_files(args: Sequence[str]) -> None:
@@ -198,14 +161,12 @@ def declare(node: Node) -> Parameters:
     ConfigError names a value that is out of range, of another type, or given under both names.
     """
     _take_over_former_names(node)
-    for name, setting in SETTINGS.items():
-        _declare(node, name, setting.default, setting.doc, setting.low, setting.high, setting.choices, read_only=not setting.live)
+    for name, f in SETTINGS.items():
+        _declare(node, name, f, read_only=name not in LIVE)
     for stage, cls in stages().items():
         for f in dataclasses.fields(cls):
-            default = list(f.default) if isinstance(f.default, tuple) else f.default
-            meta = f.metadata
-            _declare(node, f"{stage}.{f.name}", default, meta["doc"], meta["low"], meta["high"], meta["choices"], read_only=False)
-    settings = {name: checked(name, _plain(node.get_parameter(name).value)) for name in SETTINGS}
+            _declare(node, f"{stage}.{f.name}", f)
+    settings = {name: checked(name, _plain(node.get_parameter(name).value), f) for name, f in SETTINGS.items()}
     values = {
         stage: {f.name: _plain(node.get_parameter(f"{stage}.{f.name}").value) for f in dataclasses.fields(cls)}
         for stage, cls in stages().items()
@@ -246,7 +207,7 @@ def on_change(parameters: Parameters, changed: list[Parameter]) -> tuple[SetPara
             if dot and stage in known:
                 new.setdefault(stage, {})[name] = _plain(p.value)
             elif p.name in SETTINGS:
-                settings[p.name] = checked(p.name, _plain(p.value))
+                settings[p.name] = checked(p.name, _plain(p.value), SETTINGS[p.name])
         config = update(parameters.config, new) if new else parameters.config
         Parameters(settings, config).check()
     except CalibrationError as error:
@@ -270,15 +231,16 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, array.array) else value  # rclpy hands lists over as array.array
 
 
-def _declare(node: Node, name: str, default: Any, doc: str, low: Any, high: Any, choices: Any, read_only: bool) -> None:
+def _declare(node: Node, name: str, f: dataclasses.Field[Any], read_only: bool = False) -> None:
     if node.has_parameter(name):
         return
+    default, low, high = list(f.default) if isinstance(f.default, tuple) else f.default, f.metadata["low"], f.metadata["high"]
     # Dynamic typing where a person writes 10 for 10.0, which rclpy would refuse; the configuration checks the type itself.
     dynamic = isinstance(default, (float, list))
-    descriptor = ParameterDescriptor(description=doc, read_only=read_only, dynamic_typing=dynamic)
+    descriptor = ParameterDescriptor(description=f.metadata["doc"], read_only=read_only, dynamic_typing=dynamic)
     bounded = low is not None and high is not None
-    if choices:
-        descriptor.additional_constraints = "one of " + ", ".join(choices)
+    if f.metadata["choices"]:
+        descriptor.additional_constraints = "one of " + ", ".join(f.metadata["choices"])
     if bounded and isinstance(default, list):  # ROS has no ranges for lists
         descriptor.additional_constraints = f"each in [{low:g}, {high:g}]"
     elif bounded and type(default) is float:

@@ -12,7 +12,7 @@ import threading
 import traceback
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 from calib_ros.errors import CalibrationError
 from calib_ros.runtime import return_freed_memory
@@ -21,22 +21,6 @@ WAKE_S = 0.5
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _ros_runs = threading.Event()
-
-
-class StoppableNode(Protocol):
-    """A rclpy node with threads of its own."""
-
-    def create_timer(self, timer_period_sec: float, callback: Callable[[], None], *, clock: Any) -> Any:
-        """As every node has it."""
-        ...
-
-    def stop(self) -> bool:
-        """End the threads; True if they ended."""
-        ...
-
-    def destroy_node(self) -> None:
-        """As every node has it."""
-        ...
 
 
 def calib_node(args: list[str] | None = None) -> int:
@@ -60,8 +44,11 @@ def _run(name: str, module: str, node: str, args: list[str] | None) -> int:
     return run(name, make, args)
 
 
-def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM: 0; 2 with one line, which begins with the name, if it cannot start."""
+def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> int:
+    """Run a node until SIGINT or SIGTERM: 0; 2 with one line, which begins with the name, if it cannot start.
+
+    make: a rclpy node with threads of its own, which its stop() ends; True if they ended.
+    """
     end_at_signals()
     import cv2
     import rclpy

@@ -48,7 +48,7 @@ class ExtrinsicPublisher:
             liveliness=LivelinessPolicy.AUTOMATIC,
             liveliness_lease_duration=Duration(seconds=self._valid_s),
         )
-        self._publisher = node.create_publisher(ExtrinsicMsg, "~/extrinsic", profile)
+        self.publisher = node.create_publisher(ExtrinsicMsg, "~/extrinsic", profile)
 
     def validity(self, extrinsic: Extrinsic) -> Validity:
         """Whether an extrinsic is to be used as of now."""
@@ -64,7 +64,7 @@ class ExtrinsicPublisher:
     def publish(self, extrinsic: Extrinsic, stamp: int) -> None:
         """stamp: ns, of the newest data the extrinsic was tested with."""
         self.stamp = stamp
-        self._publisher.publish(self.message(extrinsic))
+        self.publisher.publish(self.message(extrinsic))
 
     def message(self, extrinsic: Extrinsic) -> ExtrinsicMsg:
         """The message as of now."""
@@ -72,10 +72,6 @@ class ExtrinsicPublisher:
         if validity.usable:
             self._last_good = (extrinsic, self.stamp, time.monotonic() - validity.data_age_s)
         return extrinsic_message(extrinsic, self.stamp, validity)
-
-    def destroy(self) -> None:
-        """Who joins later does not get the last message any more."""
-        self._node.destroy_publisher(self._publisher)
 
     def last_good(self) -> ExtrinsicMsg | None:
         """The newest message that said usable, with the age it has by now; None before the first."""
@@ -94,19 +90,14 @@ class OverlayPublisher:
     """
 
     def __init__(self, node: Node, period_s: float) -> None:
-        self._node = node
-        self._publisher = node.create_publisher(Image, "~/overlay", 1)
+        self.publisher = node.create_publisher(Image, "~/overlay", 1)
         self.period_s = period_s
         self._last = 0.0
-
-    def destroy(self) -> None:
-        """No picture is published any more."""
-        self._node.destroy_publisher(self._publisher)
 
     def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
         """Draw a frame with the current extrinsic below the initial one; at_once: whatever the period."""
         due = at_once or time.monotonic() - self._last >= self.period_s
-        if recalibrator is None or frame is None or not due or self._publisher.get_subscription_count() == 0:
+        if recalibrator is None or frame is None or not due or self.publisher.get_subscription_count() == 0:
             return
         self._last = time.monotonic()
         extrinsic, initial = recalibrator.current, recalibrator.tracker.initial
@@ -121,7 +112,7 @@ class OverlayPublisher:
             lines=caption(extrinsic, len(recalibrator.buffer), initial.T_camera_lidar),
             status=extrinsic.result.status,
         )
-        self._publisher.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
+        self.publisher.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
 
 
 class ProcessedPublisher:
@@ -134,13 +125,9 @@ class ProcessedPublisher:
         self._node, self._pipeline = node, pipeline
         # Kept for whoever this node discovers late.
         kept = QoSProfile(depth=PROCESSED_KEPT, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._publisher = node.create_publisher(Header, "~/processed", kept)
+        self.publisher = node.create_publisher(Header, "~/processed", kept)
         self._received: deque[Header] = deque(maxlen=PROCESSED_KEPT)
         self._lock = threading.Lock()
-
-    def destroy(self) -> None:
-        """Nothing is published any more."""
-        self._node.destroy_publisher(self._publisher)
 
     def add(self, header: Header) -> None:
         """Of a message that the pipeline has been given."""
@@ -154,4 +141,4 @@ class ProcessedPublisher:
             if self._pipeline.taking_in or not self._node.context.ok():
                 return
             while self._received:
-                self._publisher.publish(self._received.popleft())
+                self.publisher.publish(self._received.popleft())

@@ -19,7 +19,7 @@ from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.bags import Capture
 from calib_ros.ros.conversions import extrinsic_message
 from calib_ros.ros.diagnostics import Health
-from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
+from calib_ros.ros.initial_extrinsic import InitialExtrinsic
 from calib_ros.ros.publishers import ExtrinsicPublisher
 
 
@@ -35,7 +35,7 @@ class Services:
         pipeline: Pipeline,
         initial: InitialExtrinsic,
         capture: Capture,
-        save: Callable[[Result], SaveOutcome],
+        save: Callable[[Result], tuple[bool, str]],
         publisher: ExtrinsicPublisher,
         health: Health,
     ) -> None:
@@ -127,15 +127,12 @@ class Services:
     def _save(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         recalibrator = self._pipeline.recalibrator
         last_good = recalibrator.tracker.last_good if recalibrator is not None else None
-        if last_good is None:
+        if recalibrator is None or last_good is None:
             response.message = "nothing to save: no estimate has been accepted yet"
-            return response
-        if recalibrator is not None and recalibrator.tracker.lost:
+        elif recalibrator.tracker.lost:
             response.message = "nothing saved: the calibration has moved; wait until it is found again, or call ~/calibrate"
-            return response
-        if recalibrator is not None and recalibrator.tracker.tentative:
+        elif recalibrator.tracker.tentative:
             response.message = f"nothing saved: {recalibrator.current.result.reason}"
-            return response
-        outcome = self._write(last_good)
-        response.success, response.message = outcome.saved, outcome.message
+        else:
+            response.success, response.message = self._write(last_good)
         return response

@@ -6,7 +6,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,15 +26,6 @@ OWN_TRANSFORMS = 16  # published transforms that are recognised when they are re
 WAIT_S = 2.0  # static transforms are latched: discovery of their publishers takes about a second
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@dataclass(frozen=True)
-class Edge:
-    """The edge of the tree that carries the extrinsic. parent: CAMERA or LIDAR, the other sensor being the child; with a child,
-    the name of its parent."""
-
-    parent: str
-    child: str = ""
 
 
 def _tf_message() -> Any:
@@ -59,7 +49,7 @@ class StaticTf:
         self._type = _tf_message()
         self._publisher: Any = None
         self._own: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
-        self._wanted: tuple[Result, Edge, int] | None = None  # the newest that was to be published
+        self._wanted: tuple[Result, str, str, int] | None = None  # the newest that was to be published
         self._published: TransformStamped | None = None  # what late joiners get
         self._correction = False  # of an edge that others publish
         self._lock = threading.RLock()  # a worker publishes, the executor switches and receives
@@ -108,20 +98,23 @@ class StaticTf:
         own = (camera_frame, lidar_frame)
         return {name: T for name, T in self._tree.frames(camera_frame).items() if name not in own}
 
-    def publish(self, result: Result, edge: Edge, stamp: int) -> None:
-        """Publish the extrinsic as an edge of the tree, if switched on; an edge that cannot carry it is reported instead."""
+    def publish(self, result: Result, parent: str, child: str, stamp: int) -> None:
+        """Publish the extrinsic as an edge of the tree, if switched on; an edge that cannot carry it is reported instead.
+
+        parent: CAMERA or LIDAR, the other sensor being the child; with a child, the name of its parent.
+        """
         with self._lock:
             if self._publisher is None:
                 return
-            self._wanted = (result, edge, stamp)
+            self._wanted = (result, parent, child, stamp)
             if time.monotonic() - self._since < WAIT_S:
                 return  # what others publish is not known yet; see check()
             try:
-                message = self._message(result, edge, stamp)
+                message = self._message(result, parent, child, stamp)
             except BadInputError as error:
                 self._withdraw(str(error))
                 return
-            self._correction = bool(edge.child)
+            self._correction = bool(child)
             self._own.append(message)
             self._published = message
             self._publisher.publish(self._type(transforms=[message]))
@@ -159,10 +152,9 @@ class StaticTf:
             self.switch(False)
             self.switch(True)
 
-    def _message(self, result: Result, edge: Edge, stamp: int) -> TransformStamped:
+    def _message(self, result: Result, parent: str, child: str, stamp: int) -> TransformStamped:
         """The transform of an edge. BadInputError if the child has another parent, or the edge does not join the sensors."""
         T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
-        parent, child = edge.parent, edge.child
         if not child:
             parent, child, T = (camera, lidar, T) if parent == CAMERA else (lidar, camera, se3.inverse(T))
         else:
@@ -213,10 +205,8 @@ def _same(a: TransformStamped, b: TransformStamped) -> bool:
     """Is a received transform one that was published?"""
     if (a.header.frame_id, a.child_frame_id) != (b.header.frame_id, b.child_frame_id):
         return False
-    p, q = a.transform, b.transform
-    first, second = ((m.translation.x, m.translation.y, m.translation.z, *_quaternion(m.rotation)) for m in (p, q))
+    first, second = (
+        [getattr(part, name) for part, names in ((m.translation, "xyz"), (m.rotation, "xyzw")) for name in names]
+        for m in (a.transform, b.transform)
+    )
     return bool(np.allclose(first, second, atol=1e-9))
-
-
-def _quaternion(rotation: Any) -> tuple[float, float, float, float]:
-    return rotation.x, rotation.y, rotation.z, rotation.w

@@ -13,22 +13,13 @@ from calib_ros_synthetic.drive import SyntheticDrive
 QUICK = {
     "search": {"rotation_deg": 0.0, "translation_m": 0.0},
     "semantics": {"segmentation": "none"},
-    "online": {
-        "min_keyframes": 2,
-        "buffer_size": 3,
-        "keyframe_interval_s": 0.05,
-        "similarity_threshold": 1.0,
-        "static_similarity": 1.0,
-    },
+    "online": {"min_keyframes": 2, "buffer_size": 3, "similarity_threshold": 1.0},
 }
 
 
 def config(**online: object) -> Config:
     """Without rest, unless it is asked for."""
-    return update(
-        Config.from_dict(QUICK),
-        {"online": {"rest_period_s": 0.0, "rest_spacing_s": 0.0, **online}, "tracker": {"confirmations": 0}},
-    )
+    return update(Config.from_dict(QUICK), {"online": {"rest_period_s": 0.0, **online}, "tracker": {"confirmations": 0}})
 
 
 class Driven:

@@ -177,7 +177,7 @@ def pipeline(run: Run, seed: int, count: int) -> None:
     events: list[Any] = []
     inputs = Inputs(decode, lambda image, cloud: ("camera", "lidar"), lambda *_: Result(nominal(0.0), INITIAL))
     few = {"starts": 64, "rounds": 1}
-    whole = Pipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), inputs, events.append)
+    whole = Pipeline(Config.from_dict({"search": few, "online": {"similarity_threshold": 1.0}}), inputs, events.append)
     whole.set_camera(CAMERA)
     SegmentationModels(SemanticsConfig())(
         good_frame(seed)

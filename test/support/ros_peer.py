@@ -106,7 +106,6 @@ class Peer:
     def __init__(self, image_type: Any = Image, node_type: Any = CalibNode, **parameters: Any) -> None:
         parameters.setdefault("semantics__segmentation", "none")  # the network takes 83 ms per keyframe
         parameters.setdefault("online__rest_period_s", 0.0)
-        parameters.setdefault("online__rest_spacing_s", 0.0)
         parameters.setdefault("online__max_load", 1.0)
         parameters.setdefault("max_data_age_s", 3600.0)
         self.context = Context()

@@ -72,7 +72,7 @@ def test_files_of_the_former_version_still_load() -> None:
     assert (result.status, result.frames_used) == ("converged", 6)
     np.testing.assert_allclose(result.T_camera_lidar, load(FORMER_VERSION / "result.json").T_camera_lidar, atol=1e-12)
     assert state.provenance is not None
-    assert (state.provenance.accepted, state.provenance.keyframes) == (4, 9)
+    assert (state.provenance["accepted"], state.provenance["keyframes"]) == (4, 9)
 
 
 def test_files_give_back_what_was_saved(tmp_path):

@@ -19,7 +19,7 @@ OTHER_CLOCK_S = 1.0  # between the newest stamps of both streams; drivers delive
 class PairingHealth:
     """Watches a synchronizer; `check` is to be called about once a second. Not thread-safe."""
 
-    def __init__(self, synchronizer: Synchronizer[object, object]) -> None:
+    def __init__(self, synchronizer: Synchronizer) -> None:
         self._synchronizer = synchronizer
         self._counts: deque[SynchronizerCounts] = deque(maxlen=WINDOW)
 

@@ -36,9 +36,7 @@ class Pairing:
 
     def __init__(self, config: Config, clouds_are_decoded: bool) -> None:
         online = config.online
-        self.synchronizer: Synchronizer[Any, Any] = Synchronizer(
-            online.pair_tolerance_s, online.pair_queue, None if clouds_are_decoded else 0
-        )
+        self.synchronizer = Synchronizer(online.pair_tolerance_s, online.pair_queue, None if clouds_are_decoded else 0)
         self.sweep = SweepOffset(config.motion)
         self._newest_image: Any = None  # messages to find out from when scans sweep the view, while that is not known
         self._newest_cloud: Any = None

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
+from bisect import insort
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
 from calib_ros.frame import NANOSECONDS
 from calib_ros.stamps import Rhythm, Stamps, nearest_index, nearest_pairs, pair_tolerance
 
-Image = TypeVar("Image")
-Cloud = TypeVar("Cloud")
 JUMP_BACK_S = 1.0  # stamps that run back further than this mean a new recording or a looping bag, not a late message
 
 
@@ -31,22 +30,17 @@ class SynchronizerCounts:
 @dataclass(eq=False)
 class _Stream:
     capacity: int
-    waiting: deque[tuple[int, object]] = field(default_factory=deque)
+    waiting: list[tuple[int, Any]] = field(default_factory=list)
     latest: int | None = None
     rhythm: Rhythm = field(default_factory=Rhythm)
 
-    def push(self, stamp: int, item: object) -> int:
+    def push(self, stamp: int, item: Any) -> int:
         """Insert in stamp order; returns how many old items were dropped."""
         self.rhythm.add(stamp)
         self.latest = stamp if self.latest is None else max(self.latest, stamp)
-        place = len(self.waiting)
-        while place and self.waiting[place - 1][0] > stamp:
-            place -= 1
-        self.waiting.insert(place, (stamp, item))
-        dropped = 0
-        while len(self.waiting) > self.capacity:
-            self.waiting.popleft()
-            dropped += 1
+        insort(self.waiting, (stamp, item), key=itemgetter(0))
+        dropped = max(len(self.waiting) - self.capacity, 0)
+        del self.waiting[:dropped]
         return dropped
 
     def earliest_next(self) -> int:
@@ -58,7 +52,7 @@ class _Stream:
         return np.array([stamp for stamp, _ in list(self.waiting)], np.int64)
 
 
-class Synchronizer(Generic[Image, Cloud]):
+class Synchronizer:
     """Keeps messages that wait for a partner, and returns each pair once, as soon as no nearer partner can come.
 
     tolerance_s: messages farther apart are never paired; 0 = as the periods of both streams allow, which also bound any other
@@ -78,7 +72,7 @@ class Synchronizer(Generic[Image, Cloud]):
         self.limit_s = tolerance_s
         self._images.capacity = self._clouds.capacity = capacity
 
-    def set_cloud_offset(self, cloud_offset: int) -> list[tuple[Image, Cloud]]:
+    def set_cloud_offset(self, cloud_offset: int) -> list[tuple[Any, Any]]:
         """Use another offset, ns, from now on; returns the pairs that are now final."""
         if cloud_offset == self.cloud_offset:
             return []
@@ -128,14 +122,14 @@ class Synchronizer(Generic[Image, Cloud]):
 
     # ---- messages -----------------------------------------------------------------------------------------------------
 
-    def add_image(self, stamp: int, image: Image) -> list[tuple[Image, Cloud]]:
+    def add_image(self, stamp: int, image: Any) -> list[tuple[Any, Any]]:
         """Add an image, stamp in ns; returns the pairs that are now final."""
         self._handle_jump(self._images, stamp)
         self.counts.images += 1
         self.counts.unpaired_images += self._images.push(stamp, image)
         return self._final_pairs()
 
-    def add_cloud(self, stamp: int, cloud: Cloud) -> list[tuple[Image, Cloud]]:
+    def add_cloud(self, stamp: int, cloud: Any) -> list[tuple[Any, Any]]:
         """Add a cloud, stamp in ns; returns the pairs that are now final."""
         self._handle_jump(self._clouds, stamp)
         self.counts.clouds += 1
@@ -152,25 +146,23 @@ class Synchronizer(Generic[Image, Cloud]):
     def _cloud_moments(self) -> Stamps:
         return self._clouds.stamps() + (self.cloud_offset or 0)
 
-    def _final_pairs(self) -> list[tuple[Image, Cloud]]:
+    def _final_pairs(self) -> list[tuple[Any, Any]]:
         """Remove and return the oldest pairs that are final, with all older messages, which can find no partner any more."""
         if self.cloud_offset is None:
             return []
         images, clouds = self._images.waiting, self._clouds.waiting
         at_image, at_cloud = self._images.stamps(), self._cloud_moments()
-        pairs: list[tuple[Image, Cloud]] = []
+        pairs: list[tuple[Any, Any]] = []
         settled_images = settled_clouds = 0
         for i, c in zip(*nearest_pairs(at_image, at_cloud, self.tolerance), strict=True):
             if self._nearer_may_come(int(at_image[i]), int(at_cloud[c])):
                 break
-            pairs.append((images[i][1], clouds[c][1]))  # type: ignore[arg-type]
+            pairs.append((images[i][1], clouds[c][1]))
             settled_images, settled_clouds = int(i) + 1, int(c) + 1
         self.counts.pairs += len(pairs)
         self.counts.unpaired_images += settled_images - len(pairs)
         self.counts.unpaired_clouds += settled_clouds - len(pairs)
-        for waiting, settled in ((images, settled_images), (clouds, settled_clouds)):
-            for _ in range(settled):
-                waiting.popleft()
+        del images[:settled_images], clouds[:settled_clouds]
         return pairs
 
     def _nearer_may_come(self, image_moment: int, cloud_moment: int) -> bool:

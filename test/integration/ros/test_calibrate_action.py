@@ -134,7 +134,7 @@ def test_the_node_answers_others_while_a_goal_is_under_way(peer):
     assert peer.get_extrinsic().extrinsic.status
     peer.until(lambda: len(peer.extrinsics) > published, "the heartbeat")
     assert peer.trigger("reset").success  # the estimate is void, but goes on
-    assert peer.pipeline.estimating
+    assert peer.pipeline._estimator.busy
     assert under_way.cancel()
     assert under_way.result()[0] == CANCELED
     peer.settle()

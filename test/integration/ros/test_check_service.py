@@ -135,7 +135,7 @@ def test_a_cause_is_named_while_the_node_goes_on(checked, monkeypatch):
     recalibrator = peer.recalibrator
     keyframes, published = recalibrator.keyframes_seen, len(peer.extrinsics)
     under_way = checked.ask(se3.inverse(checked.reference))
-    peer.until(lambda: peer.pipeline.estimating, "the check to begin")
+    peer.until(lambda: peer.pipeline._estimator.busy, "the check to begin")
     assert peer.get_extrinsic().extrinsic.status == "initial"
     peer.publish(checked.vehicle.frame(), settle=False)
     peer.until(lambda: recalibrator.keyframes_seen > keyframes and len(peer.extrinsics) > published, "that the node goes on")
@@ -175,7 +175,7 @@ def test_callers_that_ask_together_or_disappear_do_no_harm(checked):
     gone = peer.peer.create_client(Check, "/calib_ros/check")
     peer.call_async(gone, Check.Request())
     calls = [checked.ask() for _ in range(3)]
-    peer.until(lambda: peer.pipeline.estimating, "the check to begin")
+    peer.until(lambda: peer.pipeline._estimator.busy, "the check to begin")
     peer.peer.destroy_client(gone)
     peer.until(lambda: all(call.done() for call in calls), "all answers")
     assert {call.result().verdict for call in calls} == {PASS}
@@ -187,12 +187,12 @@ def test_a_node_that_stops_answers_and_ends(checked):
     """Last of all: the node is gone afterwards."""
     peer = checked.peer
     under_way = checked.ask(se3.inverse(checked.reference))
-    peer.until(lambda: peer.pipeline._deferred.running, "the check to begin")
+    peer.until(lambda: peer.pipeline._deferred._running, "the check to begin")
     peer.pipeline.stop()
     peer.until(under_way.done, "an answer")
     assert not under_way.result().success
     assert "stopping" in under_way.result().message
-    peer.until(lambda: not peer.pipeline.estimating, "the end of the check")
+    peer.until(lambda: not peer.pipeline._estimator.busy, "the end of the check")
 
 
 def test_messages_and_verdicts_have_the_same_names():

@@ -180,7 +180,7 @@ def test_a_node_at_work(street, drive, monkeypatch):
 
 def test_the_nodes_own_accounting_keeps_to_the_budget(street, drive):
     """Every frame is to be a keyframe, at 20 Hz: that would take more than a core."""
-    wanted = {"keyframe_spacing_s": 0.0, "similarity_threshold": 1.0, "static_similarity": 1.0, "min_keyframes": 3}
+    wanted = {"keyframe_spacing_s": 0.0, "similarity_threshold": 1.0, "min_keyframes": 3}
     options = {f"online__{name}": value for name, value in wanted.items()}
     with Peer(**start_parameters(drive.reference), online__max_load=MAX_LOAD, search__rotation_deg=0.0, **options) as peer:
         vehicle, pairs = Vehicle(peer, street, drive.reference), count(1)

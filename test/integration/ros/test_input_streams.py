@@ -117,7 +117,7 @@ def test_a_camera_that_is_stamped_late_is_found_with_the_mount():
     size = {"frames": 11, "width": 640, "height": 240, "rings": 32}
     drive = RenderedDrive(seed=3, **size, speed=8, stride=3, ride="weaving", image_late_ms=80.0)
     T = se3.perturb(drive.reference, [0.3, -0.2, 0.2], [0.02, 0, 0])
-    keyframes = {"min_keyframes": 5, "buffer_size": 12, "keyframe_interval_s": 0.2, "mode": "manual"}
+    keyframes = {"min_keyframes": 5, "buffer_size": 12, "similarity_threshold": 1.0, "mode": "manual"}
     options = {**QUICK, **{f"online__{name}": value for name, value in keyframes.items()}}
     with Peer(**start_parameters(T), **options, initial_from_tf=False) as peer:
         for k in range(len(drive)):

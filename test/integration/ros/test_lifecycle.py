@@ -134,7 +134,7 @@ def test_deactivation_ends_a_goal_and_shutdown_a_running_search(managed, street,
     assert managed.transit(Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert managed.state == FINALIZED
     assert managed.calibration is None
-    assert not pipeline.estimating
+    assert not pipeline._estimator.busy
     managed.until(lambda: "/calib_ros/get_extrinsic" not in managed.topics(), "that all services are gone")
     assert managed.state == FINALIZED  # it still answers: no answer was sent through a service that is gone
 

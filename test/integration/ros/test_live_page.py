@@ -66,7 +66,7 @@ def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(live, open_p
         press(browser, ENTER)
         shows(browser, "~/reset (")
         assert len(recalibrator.buffer) == 0
-        publisher = peer.calibration.overlay._publisher
+        publisher = peer.calibration.overlay.publisher
         until(publisher.get_subscription_count, "somebody looks")
         browser.get("about:blank")
         until(lambda: publisher.get_subscription_count() == 0, "nobody looks any more")

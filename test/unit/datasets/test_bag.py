@@ -294,7 +294,7 @@ def test_scans_pair_by_when_they_sweep_the_view_as_in_the_node(tmp_path, stamped
     bag = BagSource(write_bag(Listed(frames), tmp_path / "bag"))
     assert "12 pairs" in bag.describe()["frames"]
     assert f"{0 - 1000 * stamped_s:+.0f} ms" in bag.describe()["pairing"]
-    synchronizer: Synchronizer[int, int] = Synchronizer(0.0, 8, round(-stamped_s * 1e9))
+    synchronizer = Synchronizer(0.0, 8, round(-stamped_s * 1e9))
     online = []
     for made in frames:
         online += synchronizer.add_cloud(made.moment_of_cloud, made.moment_of_cloud)

@@ -21,7 +21,7 @@ CONFIG = update(
     QUICK,
     {
         "search": {"rotation_deg": 1.5, "translation_m": 0.15},
-        "online": {"min_keyframes": 4, "keyframe_interval_s": 0.05, "similarity_threshold": 1.0, "static_similarity": 1.0},
+        "online": {"min_keyframes": 4, "similarity_threshold": 1.0},
         "monitor": {"enabled": False},
         "tracker": {"confirmations": 5},
     },
@@ -153,7 +153,7 @@ def test_a_saved_offset_is_not_used_where_none_is_estimated(scene, changed):
 def test_a_reset_after_a_first_guess_forgets_the_offset_of_the_guess(scene):
     recalibrator = Recalibrator(scene.camera, nominal_start(), update(CONFIG, {"initial": {"method": "motion"}}))
     recalibrator.tracker = Tracker(replace(estimate(0.0, 0.06), status=INITIAL), None, recalibrator.config)
-    recalibrator._extrinsic_unknown = False
+    recalibrator.first_guess.end()
     recalibrator.reset()
     assert recalibrator.config.motion.time_offset_s == 0.0
-    assert recalibrator._extrinsic_unknown
+    assert recalibrator.first_guess.pending

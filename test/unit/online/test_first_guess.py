@@ -21,7 +21,7 @@ CONFIG = update(
     QUICK,
     {
         "initial": {"method": "motion"},
-        "online": {"min_keyframes": 4, "keyframe_interval_s": 0.8, "similarity_threshold": 1.0, "static_similarity": 1.0},
+        "online": {"min_keyframes": 4, "similarity_threshold": 1.0},
         "monitor": {"enabled": False},
     },
 )
@@ -66,7 +66,7 @@ def test_until_then_it_says_what_it_waits_for(drive, method):
     extrinsic = recalibrator.estimate()
     assert (extrinsic.result.status, extrinsic.usable) == (INSUFFICIENT, False)
     assert "waiting for 4 s of driving" in extrinsic.result.reason
-    assert recalibrator.needs_classes is (method == "auto")
+    assert recalibrator.first_guess.needs_classes is (method == "auto")
 
 
 def test_a_known_start_is_not_guessed(drive):

@@ -89,8 +89,10 @@ def test_pictures_that_differ_enough_are_keyframes_and_the_next_reference():
 @pytest.mark.parametrize("threshold", [0.92, 1.0])
 def test_nothing_above_the_static_similarity_is_a_keyframe(threshold):
     """Whatever the similarity threshold and the time."""
-    selector = KeyframeSelector(replace(CONFIG, similarity_threshold=threshold, static_similarity=0.9))
-    assert offer_all(selector, [flat((50, 0.5), (200, 0.5)), flat((50, 0.475), (200, 0.525))], period_s=100) == [True, False]
+    still, nearly, changed = (flat((50, 1.0)) for _ in range(3))
+    nearly[0, :8], changed[0, :20] = 200, 200  # 4 and 10 of the 2000 pixels that count: similarity 0.996 and 0.990
+    selector = KeyframeSelector(replace(CONFIG, similarity_threshold=threshold))
+    assert offer_all(selector, [still, nearly, changed], period_s=100) == [True, False, True]
 
 
 def played(selector: KeyframeSelector, pictures: list[np.ndarray], *steps: tuple[int, float]) -> list[bool]:
@@ -100,7 +102,7 @@ def played(selector: KeyframeSelector, pictures: list[np.ndarray], *steps: tuple
 
 def test_after_a_while_a_small_change_is_enough():
     pictures = brightening(0.025, 2)  # similarity 0.951: too alike, yet not the same
-    selector = KeyframeSelector(replace(CONFIG, keyframe_interval_s=1.0))
+    selector = KeyframeSelector(CONFIG)
     seen = played(selector, pictures, (0, 0.0), (1, 0.99), (1, 1.0), (0, 1.99), (0, 2.0))  # counted from the last keyframe
     assert seen == [True, False, True, False, True]
 

@@ -168,29 +168,3 @@ def test_a_meter_books_cpu_time_under_one_work_after_the_other() -> None:
     assert seconds[Work.KEYFRAMES] > 3 * seconds[Work.INTAKE] > 0
     assert seconds[Work.CLASSES] > 0
     assert seconds[Work.ESTIMATES] == 0
-
-
-def test_the_thread_that_receives_messages_counts_until_it_ends() -> None:
-    budget = LoadBudget(OnlineConfig())
-    began, go, done, end = (threading.Event() for _ in range(4))
-
-    def receive() -> None:
-        sum(range(3_000_000))  # before: does not count
-        budget.count_messages()
-        began.set()
-        go.wait()
-        sum(range(1_000_000))
-        done.set()
-        end.wait()
-
-    thread = threading.Thread(target=receive)
-    thread.start()
-    assert began.wait(60)
-    before = budget.counts().seconds[Work.MESSAGES]
-    go.set()
-    assert done.wait(60)
-    after = budget.counts().seconds[Work.MESSAGES]
-    end.set()
-    thread.join()
-    assert 0 <= before < after
-    assert budget.counts().seconds[Work.MESSAGES] >= after  # its clock is gone

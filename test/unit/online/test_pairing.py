@@ -69,35 +69,31 @@ def learnt(spinner: Spinner, T: np.ndarray = FORWARD, config: MotionConfig | Non
 
 @dataclass
 class Drive:
-    """Streams of a scanner and a camera, and the pairs that a synchronizer makes of them. Times in ms after T0.
+    """Streams of a scanner and a camera, 30 s, and the pairs that a synchronizer makes of them. Times in ms after T0.
 
     phase: of the camera, s after the scan's start; None: when the scanner faces its view. jitter: half width of the images'
-    moments, ms. lost: share of either stream's messages that is missing.
+    moments, ms.
     """
 
     spinner: Spinner
     camera_period: float = 0.1
     phase: float | None = None
     jitter: float = 5.0
-    lost: float = 0.0
-    seconds: float = 30.0
-    yaw_deg: float = 0.0
     tolerance_s: float = 0.0
-    seed: int = 0
 
-    def run(self, learn: bool = True) -> Drive:
-        rng = np.random.default_rng(self.seed)
-        spinner, swept = self.spinner, self.spinner.sweep_after_start(self.yaw_deg)
-        starts = 1000 * spinner.period * np.arange(int(self.seconds / spinner.period))
-        starts = (starts + rng.uniform(-self.jitter / 5, self.jitter / 5, len(starts)))[rng.random(len(starts)) >= self.lost]
-        images = 1000 * (self.camera_period * np.arange(int(self.seconds / self.camera_period)))
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(0)
+        spinner, swept = self.spinner, self.spinner.sweep_after_start(0.0)
+        starts = 1000 * spinner.period * np.arange(int(30 / spinner.period))
+        starts = starts + rng.uniform(-self.jitter / 5, self.jitter / 5, len(starts))
+        images = 1000 * (self.camera_period * np.arange(int(30 / self.camera_period)))
         images += 1000 * (swept if self.phase is None else self.phase)
-        images = np.sort(images + rng.uniform(-self.jitter, self.jitter, len(images)))[rng.random(len(images)) >= self.lost]
-        self.images, self.sweeps = images, starts + 1000 * swept
-        synchronizer: Synchronizer[float, float] = Synchronizer(self.tolerance_s, 8, None if learn else 0)
+        self.images = np.sort(images + rng.uniform(-self.jitter, self.jitter, len(images)))
+        self.sweeps = starts + 1000 * swept
+        self.synchronizer = Synchronizer(self.tolerance_s, 8, None)
         sweep = SweepOffset(MotionConfig())
         # Images arrive 20 ms after their moment; a scan when it is complete, and 10 ms later.
-        arrivals = [(t + 20, "image", t, t) for t in images.tolist()]
+        arrivals = [(t + 20, "image", t, t) for t in self.images.tolist()]
         arrivals += [
             (t + 1000 * spinner.period + 10, "cloud", t + 1000 * spinner.stamp_after_start(), t) for t in starts.tolist()
         ]
@@ -105,15 +101,13 @@ class Drive:
         for _, kind, stamp, item in sorted(arrivals):
             at = T0 + round(stamp * MS)
             if kind == "image":
-                self.pairs += synchronizer.add_image(at, item)
+                self.pairs += self.synchronizer.add_image(at, item)
                 continue
-            self.pairs += synchronizer.add_cloud(at, item + 1000 * swept)
-            if learn and sweep.ns is None:
-                sweep.add(spinner.cloud(), CAMERA, turned(self.yaw_deg))
+            self.pairs += self.synchronizer.add_cloud(at, item + 1000 * swept)
+            if sweep.ns is None:
+                sweep.add(spinner.cloud(), CAMERA, FORWARD)
                 assert sweep.ns is not None
-                self.pairs += synchronizer.set_cloud_offset(sweep.ns)
-        self.synchronizer = synchronizer
-        return self
+                self.pairs += self.synchronizer.set_cloud_offset(sweep.ns)
 
     @property
     def paired(self) -> float:
@@ -142,11 +136,6 @@ def test_the_sweep_is_found_for_every_stamping(stamped, offset, timed):
 def test_side_cameras_are_swept_earlier_or_later(yaw):
     spinner = Spinner("start")
     assert learnt(spinner, turned(yaw)) == pytest.approx(1000 * spinner.sweep_after_start(yaw), abs=2.6)
-
-
-def test_a_start_some_degrees_off_changes_the_moment_by_milliseconds():
-    for rotation in ([8.0, 0, 0], [0, 8.0, 0], [0, 0, -8.0], [5, 5, 5]):
-        assert learnt(Spinner("start"), se3.perturb(FORWARD, rotation, [0.2, 0, 0.2])) == pytest.approx(50.0, abs=5.0)
 
 
 @pytest.mark.parametrize(
@@ -205,45 +194,27 @@ def test_a_camera_that_looks_at_the_cut_keeps_one_side_of_it():
 
 
 @pytest.mark.parametrize("stamped", STAMPED)
-@pytest.mark.parametrize("camera_hz", [10, 15, 20, 30])
-@pytest.mark.parametrize("scan_hz", [5, 10, 20])
-def test_every_stamping_pairs_with_the_scan_that_swept_the_view(stamped, camera_hz, scan_hz):
-    spinner = Spinner(stamped, 1 / scan_hz)
-    drive = Drive(spinner, 1 / camera_hz, spinner.sweep_after_start(0.0)).run()
-    assert drive.paired >= 0.97
-    assert drive.wrong == 0.0
-
-
-@pytest.mark.parametrize("stamped", STAMPED)
 @pytest.mark.parametrize(
     ("options", "share"),
     [
+        *(({"period": 1 / scan, "camera_period": 1 / camera}, 0.97) for camera in (10, 15, 20, 30) for scan in (5, 10, 20)),
         # At phase 0 the scan before and the one after are equally near: where the choice changes sides, two messages stay alone.
         ({"phase": 0.0}, 0.8),
         *(({"phase": phase}, 0.97) for phase in (0.01, 0.025, 0.05, 0.075, 0.09)),
-        ({"spinner": 0.2, "camera_period": 0.2, "jitter": 15.0}, 0.95),
+        ({"period": 0.2, "camera_period": 0.2, "jitter": 15.0}, 0.95),
         ({"tolerance_s": 0.05}, 0.97),
     ],
     ids=str,
 )
-def test_any_phase_and_jitter_of_the_camera_pairs(stamped, options, share):
-    drive = Drive(**{**options, "spinner": Spinner(stamped, options.get("spinner", 0.1))}).run()
+def test_every_stamping_rate_and_phase_pairs_with_the_scan_that_swept_the_view(stamped, options, share):
+    drive = Drive(Spinner(stamped, options.get("period", 0.1)), **{k: v for k, v in options.items() if k != "period"})
     assert drive.paired >= share
     assert drive.wrong == 0.0
     assert PairingHealth(drive.synchronizer).check() == ""
 
 
-@pytest.mark.parametrize("lost", [0.05, 0.1, 0.3])
-def test_lost_messages_cost_their_own_pairs_only_and_every_stamping_gives_the_same(lost):
-    for seed in range(3):
-        drives = [Drive(Spinner(stamped), lost=lost, seed=seed).run() for stamped in STAMPED]
-        assert drives[0].pairs == drives[1].pairs == drives[2].pairs
-        assert len(drives[0].pairs) >= 0.93 * 300 * (1 - lost) ** 2
-        assert drives[0].wrong == 0.0
-
-
 def test_nothing_pairs_before_the_sweep_is_known():
-    synchronizer: Synchronizer[int, int] = Synchronizer(0.0, 8, None)
+    synchronizer = Synchronizer(0.0, 8, None)
     for k in range(20):
         assert synchronizer.add_image(T0 + 100 * k * MS, k) == []
         assert synchronizer.add_cloud(T0 + (100 * k - 60) * MS, k) == []
@@ -253,18 +224,6 @@ def test_nothing_pairs_before_the_sweep_is_known():
     assert synchronizer.set_cloud_offset(60 * MS) == []
 
 
-def test_a_clock_set_back_begins_anew_with_the_known_sweep():
-    synchronizer: Synchronizer[float, float] = Synchronizer(0.0, 8, 50 * MS)
-    for start in (0, -3_600_000, 0):
-        pairs: list[tuple[float, float]] = []
-        for k in range(50):
-            pairs += synchronizer.add_image(T0 + (start + 100 * k) * MS, k)
-            pairs += synchronizer.add_cloud(T0 + (start + 100 * k - 50) * MS, k)
-        assert [p for p in pairs if p[0] == p[1]] == pairs
-        assert len(pairs) >= 47
-    assert synchronizer.counts.jumps_back == 1
-
-
 # ---- what goes wrong --------------------------------------------------------------------------------------------------------
 
 
@@ -272,7 +231,7 @@ class Watched:
     """A synchronizer fed in real order, and what is said about it once a second of the data's time."""
 
     def __init__(self, tolerance_s: float = 0.0, capacity: int = 8) -> None:
-        self.synchronizer: Synchronizer[object, object] = Synchronizer(tolerance_s, capacity)
+        self.synchronizer = Synchronizer(tolerance_s, capacity)
         self.health = PairingHealth(self.synchronizer)
 
     def feed(self, images: np.ndarray, clouds: np.ndarray, image_delay: float = 0.0, image_clock: float = 0.0) -> list[str]:

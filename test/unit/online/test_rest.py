@@ -11,6 +11,7 @@ import pytest
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online import recalibrator as recalibrator_module
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import CONVERGED, MOVED, SUSPECT
 from calib_ros_synthetic.drive import SyntheticDrive
@@ -23,11 +24,8 @@ CONFIG = Config.from_dict(
         "motion": {"max_time_offset_s": 0.0},  # always the same street at the same speed, which says nothing of the clocks
         "online": {
             "min_keyframes": 3,
-            "rest_spacing_s": 0.0,
             "buffer_size": 6,
-            "keyframe_interval_s": 0.05,
             "similarity_threshold": 1.0,
-            "static_similarity": 1.0,
         },
     }
 )
@@ -44,12 +42,12 @@ class Parade:
         self.recalibrator = Recalibrator(frames[0].camera, start, update(CONFIG, changes))
         self.estimates: list[float] = []
         self.keyframes: list[float] = []
-        self.n = 0
+        self.n: float = 0  # frames, each GAP_S later
 
     def __call__(self, seconds: float, turned_deg: float = 0.0, drift_deg_s: float = 0.0) -> None:
         for _ in range(round(seconds / GAP_S)):
             turned_deg += drift_deg_s * GAP_S
-            self.show(turned(self.frames[self.n % len(self.frames)], turned_deg))
+            self.show(turned(self.frames[int(self.n) % len(self.frames)], turned_deg))
 
     def settle(self) -> None:
         """Until the last keyframes led to no estimate."""
@@ -57,11 +55,21 @@ class Parade:
             self(1)
             assert self.n < 60
 
-    def show(self, frame: Frame) -> None:
+    def stand(self, seconds: float, turned_deg: float, permit: bool = True) -> list[str]:
+        """The status after each of ten frames a second of one place."""
+        found = []
+        for _ in range(round(seconds / 0.1)):
+            self.n += 0.1 - 1
+            self.show(turned(self.frames[0], turned_deg), permit)
+            found.append(self.recalibrator.current.result.status)
+        return found
+
+    def show(self, frame: Frame, permit: bool = True) -> None:
         now = self.n * GAP_S
         self.n += 1
         stamp = round((1000 + now) * NANOSECONDS)
-        if self.recalibrator.ingest(dataclasses.replace(frame, stamp=stamp, cloud_stamp=stamp, compensated=True)):
+        frame = dataclasses.replace(frame, stamp=stamp, cloud_stamp=stamp, compensated=True)
+        if self.recalibrator.ingest(frame, permit=lambda: permit):
             self.keyframes.append(now)
         if self.recalibrator.ready():
             self.recalibrator.estimate()
@@ -83,13 +91,26 @@ def gaps(times: list[float]) -> list[float]:
     return [b - a for a, b in pairwise(times)]
 
 
+@pytest.fixture(autouse=True)
+def without_spacing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At rest as many keyframes as else, unless the test says otherwise."""
+    monkeypatch.setattr(recalibrator_module, "REST_SPACING_S", 0.0)
+
+
 @pytest.fixture
 def start(drive: SyntheticDrive) -> np.ndarray:
     return se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0])
 
 
-def test_without_rest_every_keyframe_leads_to_an_estimate(street: list[Frame], start: np.ndarray) -> None:
-    parade = Parade(street, start, online={"rest_period_s": 0.0})
+@pytest.mark.parametrize(
+    "changes",
+    [{"online": {"rest_period_s": 0.0}}, {"online": {"rest_period_s": 100.0}, "monitor": {"enabled": False}}],
+    ids=["no rest", "no monitor"],
+)
+def test_where_nothing_tells_that_keyframes_fit_each_leads_to_an_estimate(
+    street: list[Frame], start: np.ndarray, changes: dict[str, object]
+) -> None:
+    parade = Parade(street, start, **changes)
     parade(8)
     assert parade.estimates == parade.keyframes[2:]
 
@@ -110,9 +131,10 @@ def test_a_steady_extrinsic_is_estimated_seldom_and_the_same_recording_gives_the
 
 
 def test_at_rest_keyframes_are_taken_seldom_until_one_does_not_fit(
-    street: list[Frame], start: np.ndarray, drive: SyntheticDrive
+    street: list[Frame], start: np.ndarray, drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parade = Parade(street, start, online={"rest_spacing_s": 3.0})
+    monkeypatch.setattr(recalibrator_module, "REST_SPACING_S", 3.0)
+    parade = Parade(street, start)
     parade(18)
     seen, now, between = len(parade.keyframes), parade.n * GAP_S, gaps(parade.keyframes)
     steady = between.index(3.0)
@@ -187,49 +209,25 @@ def test_a_drift_is_followed(street: list[Frame], start: np.ndarray, drive: Synt
     assert parade.recalibrator.current.result.status == CONVERGED
 
 
-def test_without_the_monitor_nothing_tells_that_keyframes_fit(street: list[Frame], start: np.ndarray) -> None:
-    parade = Parade(street, start, online={"rest_period_s": 100.0}, monitor={"enabled": False})
-    parade(8)
-    assert parade.estimates == parade.keyframes[2:]
-
-
-def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(street: list[Frame], start: np.ndarray) -> None:
-    """The picture stays the same, so that there is no keyframe; looks at the frames tell it."""
+@pytest.fixture
+def standing(street: list[Frame], start: np.ndarray) -> Parade:
+    """At rest, in front of a picture that stays the same, so that there is no keyframe; looks at the frames go on."""
     parade = Parade(street, start, monitor={"frozen_images": 0})
     parade(8)
     parade.settle()
-    standing = street[parade.n % len(street)]
+    return parade
 
-    def stand(seconds: float, deg: float) -> list[str]:
-        found = []
-        for _ in range(round(seconds / 0.1)):
-            parade.n += 0.1 - 1  # frames come ten times a second now
-            parade.show(turned(standing, deg))
-            found.append(parade.recalibrator.current.result.status)
-        return found
 
-    assert set(stand(5, 0.0)) == {CONVERGED}
-    keyframes = len(parade.keyframes)
-    after = stand(3, 1.5)
+def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(standing: Parade) -> None:
+    assert set(standing.stand(5, 0.0)) == {CONVERGED}
+    keyframes = len(standing.keyframes)
+    after = standing.stand(3, 1.5)
     assert SUSPECT in after[:10]
     assert MOVED in after
-    assert len(parade.keyframes) <= keyframes + 1
+    assert len(standing.keyframes) <= keyframes + 1
 
 
-def test_a_look_that_struck_is_followed_by_a_test_once_the_load_allows_for_it(street: list[Frame], start: np.ndarray) -> None:
-    parade = Parade(street, start, monitor={"frozen_images": 0})
-    parade(8)
-    parade.settle()
-    recalibrator, standing = parade.recalibrator, street[parade.n % len(street)]
-
-    def show(seconds: float, deg: float, permit: bool) -> str:
-        for _ in range(round(seconds / 0.1)):
-            parade.n += 0.1
-            stamp = round((1000 + parade.n * GAP_S) * NANOSECONDS)
-            frame = dataclasses.replace(turned(standing, deg), stamp=stamp, cloud_stamp=stamp, compensated=True)
-            recalibrator.ingest(frame, permit=lambda: permit)
-        return recalibrator.current.result.status
-
-    assert show(6, 0.0, True) == CONVERGED
-    assert show(3, 1.5, False) == CONVERGED  # no CPU time is left
-    assert show(0.5, 1.5, True) == SUSPECT
+def test_a_look_that_struck_is_followed_by_a_test_once_the_load_allows_for_it(standing: Parade) -> None:
+    assert standing.stand(6, 0.0)[-1] == CONVERGED
+    assert standing.stand(3, 1.5, permit=False)[-1] == CONVERGED  # no CPU time is left
+    assert standing.stand(0.5, 1.5)[-1] == SUSPECT

@@ -91,13 +91,6 @@ def test_dusk_is_not_reported_as_blind():
     assert check(watch, dark(), k + 1) is BLIND
 
 
-def test_blind_frames_do_not_update_the_baseline_contrast():
-    watch = watched()
-    for k in range(3 * HISTORY):
-        assert check(watch, dark(k), 100 + k) is BLIND
-    assert check(watch, street(3), 999) is None
-
-
 @pytest.mark.parametrize("shape", [(240, 320), (60, 80), (240, 320, 3), (60, 80, 3)])
 def test_colour_and_grey_images_of_any_size_are_watched_alike(shape):
     watch = watched(shape=shape)
@@ -130,14 +123,6 @@ def test_a_frozen_image(config, first):
     assert faults == [FROZEN if first is not None and k >= first else None for k in range(8)]
     assert check(watch, street(41), 60) is None
     assert check(watch, street(41), 61) is None
-
-
-def test_one_changed_pixel_is_not_frozen():
-    """A good camera at rest in good light: every image is nearly the last, and alive."""
-    watch, still = watched(), street(40)
-    for k in range(20):
-        still[k, 5] ^= 1
-        assert check(watch, still.copy(), 40 + k) is None
 
 
 @pytest.mark.parametrize("lost", [slice(0), slice(None, None, 7)], ids=["no lost returns", "lost returns"])

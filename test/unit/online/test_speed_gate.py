@@ -74,21 +74,11 @@ def test_a_frames_twist_counts_where_nothing_is_measured(gate: SpeedGate, still:
     assert allowed() == (True, True)
 
 
-def test_the_recalibrator_takes_no_keyframe_above_the_limit(street: list[Frame], drive: SyntheticDrive) -> None:
-    gate = SpeedGate(OnlineConfig())
-    recalibrator = Recalibrator(drive.camera, drive.reference, Config(), speed_gate=gate)
-    gate.add_measurement(street[0].stamp, 50.0, 0.0)
-    assert not recalibrator.ingest(street[0])
-    gate.add_measurement(street[1].stamp, 20.0, 0.0)
-    assert recalibrator.ingest(street[1])
-    assert (recalibrator.keyframes_seen, gate.rejected) == (1, 1)
-
-
 def test_the_estimated_twist_counts_too() -> None:
     """Where no odometry tells, the motion estimated from scans does: the limit is below the drive's 3 m/s."""
     pytest.importorskip("small_gicp")
     drive = SyntheticDrive(seed=1, frames=4, rings=32, width=320, height=96, speed=3.0, stride=1)
-    options = {"online": {"max_speed": 2.0, "keyframe_spacing_s": 0.0, "similarity_threshold": 1.0, "static_similarity": 1.0}}
+    options = {"online": {"max_speed": 2.0, "keyframe_spacing_s": 0.0, "similarity_threshold": 1.0}}
     recalibrator = Recalibrator(drive.camera, drive.reference, Config.from_dict(options))
     taken = [recalibrator.ingest(dataclasses.replace(frame, twist=None)) for frame in (drive[i] for i in range(4))]
     assert isinstance(recalibrator.motion.last, Motion)

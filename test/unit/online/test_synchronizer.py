@@ -19,7 +19,7 @@ class Streams:
     """Feeds a synchronizer with stamps in ms and checks what must hold at any time."""
 
     def __init__(self, tolerance_s: float = 0.05, capacity: int = 8) -> None:
-        self.synchronizer: Synchronizer[float, float] = Synchronizer(tolerance_s, capacity)
+        self.synchronizer = Synchronizer(tolerance_s, capacity)
         self.pairs: Pairs = []
 
     def add(self, kind: str, ms: float) -> Pairs:
@@ -134,16 +134,6 @@ def test_random_streams_pair_nearly_as_well_as_in_hindsight(name):
     assert gaps / made < 1.03 * least / possible
 
 
-@pytest.mark.parametrize(("period", "delay"), [(100, 180), (33.3, 80)])
-def test_no_offset_between_the_sensors_loses_pairs(period, delay):
-    for offset in (0, 10, 20, 30, 40, 60, 70, 80, 90):
-        rng = np.random.default_rng(offset)
-        images, clouds = stream(rng, period), stream(rng, 100, offset)
-        pairs = Streams().run(images, clouds, 15, 15 + delay)
-        assert len(pairs) >= len(clouds) - 2
-        assert all(abs(image - cloud) == np.abs(images - cloud).min() for image, cloud in pairs)
-
-
 def test_a_jump_back_starts_anew():
     """A looping bag: both streams go back by a minute, one a little after the other."""
     s = Streams()
@@ -161,13 +151,6 @@ def test_small_steps_back_are_late_messages_not_jumps():
     for script, jumps in (("i1000 i100", 0), ("i-1", 1)):  # 0.9 s
         s(script)
         assert s.synchronizer.counts.jumps_back == jumps
-
-
-def test_a_stamp_far_in_the_future_costs_little():
-    s = Streams()
-    for k in range(10):
-        s(f"i{100 * k + (10**8 if k == 4 else 0)} c{100 * k}")
-    assert len(s.pairs) >= 7
 
 
 def test_the_queues_are_bounded_and_forget_the_oldest():
@@ -199,11 +182,3 @@ def test_gap_explains_missing_pairs():
         assert s.synchronizer.nearest_gap_s() == gap
     s.synchronizer.clear()
     assert (s.synchronizer.nearest_gap_s(), s.synchronizer.counts.images) == (None, 2)
-
-
-def test_single_stream_pairs_nothing_and_keeps_running():
-    s = Streams()
-    for k in range(1000):
-        s(f"c{100 * k}")
-    c = s.synchronizer.counts
-    assert (c.images, c.clouds, c.pairs, c.unpaired_clouds) == (0, 1000, 0, 992)

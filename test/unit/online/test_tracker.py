@@ -255,12 +255,10 @@ def test_rejected_estimate_changes_only_the_status(bad, status, says):
     assert re.search(says, after.result.reason)
 
 
-@pytest.mark.parametrize(
-    ("options", "deg", "status"), [({}, USUAL_DEG, REFUSED), ({}, 0.15, CONVERGED), ({"gate": 0.0}, USUAL_DEG, CONVERGED)]
-)
-def test_innovation_gate_depends_on_the_covariance(options, deg, status):
-    """0.28 deg away: not from an estimate that is sure, but from one that is not; nor where the gate is wider."""
-    assert played(settled(Config(tracker=TrackerConfig(**options))), estimate(turned(0.28), deg=deg)) == [status]
+@pytest.mark.parametrize(("deg", "status"), [(USUAL_DEG, REFUSED), (0.15, CONVERGED)])
+def test_innovation_gate_depends_on_the_covariance(deg, status):
+    """0.28 deg away: not from an estimate that is sure, but from one that is not."""
+    assert played(settled(), estimate(turned(0.28), deg=deg)) == [status]
 
 
 def test_requested_estimate_bypasses_the_gate():
@@ -327,16 +325,6 @@ def test_process_noise_accumulates_while_estimates_are_rejected():
     for seconds in (60.0, -1e6):  # then the clock is set back
         tracker.update(estimate(), seconds=seconds)
         assert tracker.spread[0, 0] - before == pytest.approx(2 * np.deg2rad(0.1) ** 2)
-
-
-def test_a_slow_drift_is_followed():
-    """0.5 deg in a minute, for five minutes. An estimate a second over 20 frames lags 10 s behind, and is off by its noise."""
-    tracker, rng = settled(), np.random.default_rng(3)
-    for second in range(300):
-        angle = 0.5 * second / 60
-        by = ((0, angle - 0.5 * 10 / 60 + rng.normal(0, USUAL_DEG), 0), tuple(rng.normal(0, USUAL_M, 3)))
-        assert tracker.update(estimate(by), share_new=1 / 20, seconds=1.0).result.status == CONVERGED
-        assert se3.rotation_error_deg(at(((0, angle, 0), (0, 0, 0))), tracker.T) < 0.3
 
 
 def test_fixed_axes_do_not_move():
@@ -541,36 +529,6 @@ def test_reset_goes_back_to_the_start(start):
     assert (now.accepted, now.normalised_innovation, now.monitor_message, tracker.settled) == (0, 0, "", False)
     assert (now.result.reason, tracker.monitored) == (before.result.reason, start.converged)
     assert np.array_equal(tracker.spread, spread)
-
-
-def test_only_converged_estimates_are_kept():
-    """Whatever comes, in any order."""
-    rng, tracker = np.random.default_rng(0), unknown()
-    for _ in range(400):
-        what = rng.integers(6)
-        if what == 0:
-            if tracker.monitored:
-                tracker.apply(assessment(list(Verdict)[rng.integers(len(Verdict))]))
-        elif what == 1:
-            blind(tracker, str(rng.choice(["", "dark"])))
-        else:
-            by = (tuple(rng.normal(0, 0.1, 3)), tuple(rng.normal(0, 0.02, 3)))
-            status = str(rng.choice([CONVERGED, CONVERGED, REFUSED]))
-            new = estimate(by, 0.1, [0.01, 0.01, float(rng.choice([0.01, 0.2]))], status)
-            before, kept, in_doubt = tracker.current, tracker.last_good, tracker.lost or tracker.suspect
-            asked = bool(rng.random() < 0.05)
-            after = tracker.update(new, rng.random(), rng.random(), asked)
-            if tracker.last_good is not kept:
-                assert (status, after.accepted) == (CONVERGED, before.accepted + 1)
-                assert (tracker.lost, tracker.suspect) == (False, False)
-                assert asked or not in_doubt or after.accepted > RECOVERING
-        good, C = tracker.last_good, tracker.filter.covariance
-        assert good is None or good.status == CONVERGED
-        assert np.linalg.eigvalsh(C).min() > 0
-        assert np.array_equal(C, C.T)
-        now = tracker.current.result.status
-        assert now in {CONVERGED, REFUSED, INSUFFICIENT, SUSPECT, MOVED, BLINDED, INITIAL}
-        assert now != CONVERGED or not (tracker.lost or tracker.suspect)
 
 
 # --- the filter -----------------------------------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ def test_the_recalibrator_moves_its_keyframes_to_the_convention(end_of_the_scan)
         QUICK,
         {
             "search": {"rotation_deg": 1.5, "translation_m": 0.15},
-            "online": {"min_keyframes": 4, "keyframe_interval_s": 0.05, "similarity_threshold": 1.0, "static_similarity": 1.0},
+            "online": {"min_keyframes": 4, "similarity_threshold": 1.0},
             "monitor": {"enabled": False},
         },
     )

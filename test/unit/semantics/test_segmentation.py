@@ -600,13 +600,13 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
 def test_a_first_guess_gets_classes_after_a_reset_and_where_it_is_asked_for_later(drive):
     asks = {"semantics": {"use": "in_doubt"}, **GUESSED}
     recalibrator = recalibrator_of(drive, nominal_start(), update(QUICK, asks))
-    assert recalibrator.needs_classes
-    recalibrator._extrinsic_unknown = recalibrator._in_doubt = False  # as after an estimate without doubt
+    assert recalibrator.first_guess.needs_classes
+    recalibrator.first_guess.pending = recalibrator._in_doubt = False  # as after an estimate without doubt
     assert not recalibrator.segments_keyframes
     recalibrator.reset()
-    assert (recalibrator.needs_classes, recalibrator.segments_keyframes) == (True, True)
+    assert (recalibrator.first_guess.needs_classes, recalibrator.segments_keyframes) == (True, True)
     recalibrator = recalibrator_of(drive, nominal_start(), QUICK)
     recalibrator.ingest(drive[0])
     recalibrator.configure(update(QUICK, asks))
-    assert recalibrator.needs_classes
+    assert recalibrator.first_guess.needs_classes
     assert len(recalibrator.buffer) == 0  # their points have classes near the nominal view only
