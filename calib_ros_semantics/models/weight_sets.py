@@ -1,7 +1,4 @@
-"""Which weights a network runs with: name, licence and fingerprint, so that whoever ships a vehicle can tell what is in it.
-
-Known before the network is needed: the node says so when it starts, long before the first image.
-"""
+"""Which weights a network runs with: name, licence and fingerprint, known before the network is needed."""
 
 from __future__ import annotations
 
@@ -19,8 +16,7 @@ SHOWN = 12  # digits of a SHA-256: enough to tell files apart, and to read aloud
 
 @dataclass(frozen=True)
 class WeightSet:
-    """The weights of a network. licence: as its file states it, empty = not at all, None = its file cannot be read here. sha256:
-    of the file, in hexadecimal."""
+    """The weights of a network. licence: as its file states it, empty = not at all, None = its file cannot be read here."""
 
     name: str
     licence: str | None
@@ -55,10 +51,10 @@ def weights_of(path: Path) -> WeightSet | None:
 @lru_cache(maxsize=16)
 def _read(path: Path, state: tuple[int, ...]) -> WeightSet:
     """weights_of, once as long as the file does not change. Raises OSError."""
-    data = np.memmap(path, np.uint8, "r").data  # encoders have hundreds of megabytes
+    digest = hashlib.sha256(np.memmap(path, np.uint8, "r").data)  # encoders have hundreds of megabytes
     own = metadata_of(path)
-    licence = None if own is None else own.get("license", "")
-    return WeightSet((own or {}).get("name") or path.stem, licence, hashlib.sha256(data).hexdigest())
+    name, licence = (path.stem, None) if own is None else (own.get("name") or path.stem, own.get("license", ""))
+    return WeightSet(name, licence, digest.hexdigest())
 
 
 def metadata_of(path: Path) -> dict[str, str] | None:

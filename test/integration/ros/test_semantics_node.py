@@ -70,8 +70,8 @@ def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:
         "missing": ({"image_classes": folder / "none.onnx"}, "semantics.image_classes is off: model", 1),
         "truncated": ({"image_classes": folder / "cut.onnx"}, "cannot be loaded", 1),
         "foreign": ({"image_classes": folder / "letter.onnx"}, "cannot be loaded", 1),
-        "a classifier": ({"image_classes": other(folder / "other.onnx")}, "looks like a classifier of whole pictures", 1),
-        "another kind": ({"segment_anything": good}, "looks like a network for classes of pixels", 1),
+        "a classifier": ({"image_classes": other(folder / "other.onnx")}, "none of its outputs is a map of classes", 1),
+        "another kind": ({"segment_anything": good}, "a network for classes of pixels is for semantics.image_classes", 1),
         "raising": ({"image_classes": failing(folder / "failing.onnx")}, "failing.onnx failed", MAX_FAILURES),
         "too slow": ({"image_classes": endless(folder / "endless.onnx"), "budget_s": 0.1}, "budget of 0.1 s", MAX_FAILURES),
     }

@@ -157,10 +157,11 @@ def test_classes_of_little_use_are_told(capsys, files, tmp_path):
 
 def test_other_networks_are_not_taken_for_segment_anything(capsys, files, tmp_path):
     classifier = segmentation(tmp_path / "mean.onnx", 19, outputs=[("mean", [1, 19])])
-    for path, kind in ((files / "net.onnx", "a network for classes of pixels"), (classifier, "a classifier of whole pictures")):
+    for path in (files / "net.onnx", classifier):
         code, _, err = run(capsys, SMALL, "--segment-anything", path, "--image-classes", "source")
         assert code == 2
-        assert f"this looks like {kind}" in err
+        assert "neither FastSAM nor the encoder" in err
+        assert "is for semantics.image_classes" in err
         assert "decoder" not in err
 
 
@@ -168,7 +169,7 @@ def test_unexpected_errors_are_one_line(capsys, files, monkeypatch):
     def surprising(*_: object) -> None:
         raise ValueError("two lines\nof somebody's library")
 
-    monkeypatch.setattr("calib_ros_semantics.models.image_classes.ImageClasses.segment", surprising)
+    monkeypatch.setattr("calib_ros_semantics.models.image_classes.ImageNetwork.__call__", surprising)
     code, out, err = run(capsys, SMALL, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
     assert (code, err) == (2, "calib-ros: semantics.image_classes: unexpected ValueError: two lines of somebody's library\n")
     found = parts(out)

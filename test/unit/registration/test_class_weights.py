@@ -9,7 +9,7 @@ from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import FrameSemantics, edge_weights
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights, importance
+from calib_ros_thesis.features import FEW_FRAMES_SHARE, frame_weights, importance
 
 C = SemanticClass
 
