@@ -30,8 +30,7 @@ FIRST_SIMPLEX_DEG = 1.6
 SYSTEMATIC_ERROR = np.array([np.deg2rad(0.1)] * 3 + [0.03] * 3)
 FIRST_ATTACHED = 2  # level of the attached form; on the coarser, edges of no direction lead degrees away on some scenes
 
-# Synthetic streets, 3 to 8 frames: where eq. 3.12 found the truth it differed by up to 0.65 deg / 12 cm, where it went astray
-# by 1.2 deg and more.
+# Synthetic streets, 3 to 8 frames: where eq. 3.12 found the truth, up to 0.65 deg / 12 cm, else 1.2 deg and more.
 DISAGREEMENT_DEG, DISAGREEMENT_M = 0.75, 0.15
 
 

@@ -62,10 +62,8 @@ class ClassOutput:
         at = 1 if is_pidnet else _best_output(model, maps)
         if at is None:
             sizes = ", ".join(f"{t.name} {'x'.join(map(str, s))}" for t, s in zip(model.outputs, shapes, strict=True))
-            raise model.error(
-                f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes}); known are "
-                f"{self._conventions}"
-            )
+            none = f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes})"
+            raise model.error(f"{none}; known are {self._conventions}")
         self._bounded(at, shapes[at])
         self._table = table_of(model, maps[at].classes, self._by_count, self._by_number)
         if not self._table.known - {SemanticClass.OTHER}:
@@ -113,7 +111,9 @@ class ClassOutput:
         try:
             if self.count is not None:
                 return self._table.classes(best_classes(values, size))
-            return resized(self._table.classes(_integers(values)), size)
+            if values.dtype == np.bool_ or not np.isfinite(values).all() or (values != np.rint(values)).any():
+                raise ModelError("it has one channel, but holds no class numbers: a network for a single class cannot be used")
+            return resized(self._table.classes(values.astype(np.int64)), size)  # some exports give floats
         except ModelError as error:
             raise self._model.error(f"output {self.name}: {error}") from None
 
@@ -185,13 +185,6 @@ def _is_part(cells: Sequence[int], size: Size) -> bool:
     if min(cells) < 1 or finer or max(cells) * MAX_STRIDE < max(size):
         return False
     return abs(cells[0] - size[0] * cells[1] / size[1]) <= 1 or abs(cells[1] - size[1] * cells[0] / size[0]) <= 1
-
-
-def _integers(values: NDArray[Any]) -> NDArray[np.int64]:
-    """Class numbers as integers; some exports give floats."""
-    if values.dtype == np.bool_ or not np.isfinite(values).all() or (values != np.rint(values)).any():
-        raise ModelError("it has one channel, but holds no class numbers: a network for a single class cannot be used")
-    return values.astype(np.int64)
 
 
 def _declared(model: OnnxModel, feeds: Mapping[str, Array]) -> list[tuple[int, ...]] | None:

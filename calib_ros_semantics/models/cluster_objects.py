@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -77,13 +77,9 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     return labels
 
 
-@dataclass(frozen=True)
-class ClusterShape:
-    """Measures of a cluster and the class they give.
-
-    length, width, bottom, top, distance: m. head: length of its uppermost HEAD_HEIGHT, m. scatter, level: median, as of Surfaces.
-    cut: whether its top is outside the field of view.
-    """
+class ClusterShape(NamedTuple):
+    """Measures of a cluster and the class they give. length, width, bottom, top, distance: m. head: length of its uppermost
+    HEAD_HEIGHT, m. scatter, level: median, as of Surfaces. cut: whether its top is outside the field of view."""
 
     length: float
     width: float

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -117,8 +116,7 @@ def find_poles(xyz: Floats) -> Poles:
     return Poles((of_point == 1) & ~on_plate, on_plate, of_point == 2)
 
 
-@dataclass(frozen=True, eq=False)
-class Slabs:
+class Slabs(NamedTuple):
     """Connected parts of horizontal slices: centre (m, 2) m, distance (m,) m, slice number (m,), length and width (m, 2)."""
 
     middle: Floats

@@ -101,11 +101,8 @@ class SegmentationModels:
         return ""
 
     def load(self) -> list[str]:
-        """Load all models now. Returns a line per model that does not run on the configured provider, or is switched off.
-
-        The built-in network is switched off where onnxruntime is missing: calibration works without it. Raises ModelError or
-        MissingDependencyError for a model of the user that cannot be loaded.
-        """
+        """Load all models now. Returns a line per model that does not run on the configured provider, or is switched off, as the
+        built-in network without onnxruntime. ModelError or MissingDependencyError for one of the user that cannot be loaded."""
         notes = []
         with self._lock:
             for slot in self.models:
@@ -258,10 +255,8 @@ def of_little_use(classes: Classes) -> str:
     nothing = count[UNLABELLED] + count[SemanticClass.OTHER]
     if not classes.size or 1 - nothing / classes.size >= MIN_USEFUL:
         return ""
-    return (
-        f"{100 * nothing / classes.size:.0f} % have a class that is of no use here; give 'labels:' in a YAML beside the model, "
-        "or take one for streets"
-    )
+    share = f"{100 * nothing / classes.size:.0f} % have a class that is of no use here"
+    return f"{share}; give 'labels:' in a YAML beside the model, or take one for streets"
 
 
 def error_line(error: Exception) -> str:

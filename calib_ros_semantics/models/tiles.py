@@ -6,7 +6,7 @@ On 10 KITTI frames a network of 384x384 gives 91 % of the pixels the class that 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,13 +23,10 @@ SMALLEST = np.float32(1e-6)
 SUM_TOLERANCE = 0.01  # of the sum of probabilities from 1
 
 
-@dataclass(frozen=True)
-class Tiling:
-    """How a picture goes into an input of fixed size, in a row or a column of tiles.
-
-    size: (height, width) that the picture is shrunk or enlarged to. tile: (height, width) of the input. corners: row and column
-    of the first pixel of each tile in the picture; negative where the picture does not fill the tile.
-    """
+class Tiling(NamedTuple):
+    """How a picture goes into an input of fixed size, in a row or a column of tiles. size: (height, width) that the picture is
+    shrunk or enlarged to. tile: (height, width) of the input. corners: row and column of the first pixel of each tile in the
+    picture; negative where the picture does not fill the tile."""
 
     size: Size
     tile: Size

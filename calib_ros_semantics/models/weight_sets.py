@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,7 @@ from calib_ros.config.semantics import BUILTIN
 SHOWN = 12  # digits of a SHA-256: enough to tell files apart, and to read aloud
 
 
-@dataclass(frozen=True)
-class WeightSet:
+class WeightSet(NamedTuple):
     """The weights of a network. licence: as its file states it, empty = not at all, None = its file cannot be read here."""
 
     name: str

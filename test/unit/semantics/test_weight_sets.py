@@ -53,11 +53,11 @@ def test_a_model_runs_with_what_its_file_held_when_it_was_loaded(tmp_path: Path)
     shutil.copy(of_package(), path)
     models = SegmentationModels(SemanticsConfig(image_classes=str(path), cloud_classes="geometric"))
     before = models.in_use()
-    assert before == [f"image_classes {weights_of(of_package()).text}", "cloud_classes geometric"]
+    assert before == [f"image_classes {weights_of(path).text}", "cloud_classes geometric"]
     assert models.load() == []
     segmentation(path, metadata={"name": "another"})
     assert models.in_use() == before
     path.unlink()
     assert models.in_use() == before
     builtin = SegmentationModels(SemanticsConfig(cloud_classes="source")).in_use()
-    assert builtin == [before[0], "cloud_classes source"]
+    assert builtin == [f"image_classes {weights_of(of_package()).text}", "cloud_classes source"]
