@@ -19,17 +19,8 @@ from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.io import make_folder
 from calib_ros.registration.classes import IMAGE, MASKS
-from calib_ros_semantics.models.onnx_model import Deadline
-from calib_ros_semantics.models.segmentation import (
-    ADVICE,
-    ModelSlot,
-    SegmentationModel,
-    SegmentationModels,
-    error_line,
-    judge,
-    load_model,
-    run_model,
-)
+from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel
+from calib_ros_semantics.models.segmentation import ADVICE, ModelSlot, SegmentationModels, error_line, judge, load_model
 
 RUNS = 3  # the first is slower: libraries and memory are made ready
 WIDTH = 110  # letters of a line; some exports have a dozen tensors
@@ -53,7 +44,9 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
         raise BadInputError(f"--frame {frame} is outside 0..{len(source) - 1} of this source")
     configured = SegmentationModels(config.semantics).models
     if not configured:
-        return Report([_none(config)], [], [])
+        off = config.semantics.segmentation == "none"
+        why = "no models: semantics.segmentation is none" if off else "no models are named: see the stage semantics of --config"
+        return Report([why], [], [])
     if out is not None:
         make_folder(out, "--out")
     shown = source[frame]
@@ -63,7 +56,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
     with progress_bar("models") as step:
         for k, model in enumerate(configured):
             try:
-                found, doubt = _tried(model.kind, model.path, shown, config, out)
+                found, doubt = _tried(model, shown, config.semantics, out)
                 lines += ["", *found]
                 doubtful += [f"semantics.{model.kind}, {model.path}: {doubt}"] * bool(doubt)
             except Exception as error:  # whatever somebody's model makes of the frame, the others are tried
@@ -73,45 +66,26 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
     return Report(lines, failed, doubtful)
 
 
-def _none(config: Config) -> str:
-    if config.semantics.segmentation == "none":
-        return "no models: semantics.segmentation is none"
-    return "no models are named: see the stage semantics of --config"
-
-
-def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) -> tuple[list[str], str]:
+def _tried(slot: ModelSlot, frame: Frame, config: SemanticsConfig, out: str | None) -> tuple[list[str], str]:
     """Lines about a model, and why its output cannot be right, or is of little use."""
-    before, began = _fresh_peak_mb(), time.perf_counter()
-    model = load_model(kind, path, config.semantics)
+    kind, before, began = slot.kind, _fresh_peak_mb(), time.perf_counter()
+    model = load_model(kind, slot.path, config)
     loaded = time.perf_counter() - began
-    seconds, answer = _runs(model, frame, config.semantics)
+    seconds, answer = _runs(model, frame, config)
     doubt, little = judge(model, answer)
-    borders = None
-    if kind == IMAGE:
-        answer, borders = answer
-    grown = _peak_mb() - before
-    threads = config.semantics.threads
-    own = ModelSlot(kind, path).weights
-    weights = [] if own is None else [f"  weights: {own.text}"]
+    answer, borders = answer if kind == IMAGE else (answer, None)
     lines = [
-        f"{kind}: {path}",
-        *weights,
-        *textwrap.wrap(model.describe(), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
+        f"{kind}: {slot.path}",
+        *([f"  weights: {slot.weights.text}"] if slot.weights else []),
+        *_wrapped(model.describe()),
         f"  loaded in {loaded:.2f} s; first run {seconds[0]:.2f} s, best of {len(seconds)} {min(seconds):.2f} s of the budget of "
-        f"{config.semantics.budget_s:g} s",
-        f"  {threads} thread{'s' * (threads > 1)}, at most {grown:.0f} MB of memory",
-        *textwrap.wrap(
-            _found(kind, answer, getattr(model, "needed", "")),
-            WIDTH,
-            initial_indent="  ",
-            subsequent_indent="    ",
-            break_on_hyphens=False,
-        ),
+        f"{config.budget_s:g} s",
+        f"  {config.threads} thread{'s' * (config.threads > 1)}, at most {_peak_mb() - before:.0f} MB of memory",
+        *_wrapped(_found(kind, answer, model.needed)),
     ]
     if borders is not None:
         lines.append(f"  borders of classes on {100 * _share(borders):.1f} % of the pixels")
-    # Some models of clouds have something to say about the scan.
-    lines += [f"  NOTE: {text}" for text in (model.fallback, getattr(model, "note", "")) if text]
+    lines += [f"  NOTE: {text}" for text in (model.fallback, model.note) if text]
     if out is not None:
         lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")
         if borders is not None:
@@ -119,12 +93,16 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
     return lines, doubt or little
 
 
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
+
+
 def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
     """Seconds of each run, fewer if they are long, and the output of the last one."""
     seconds: list[float] = []
     while len(seconds) < RUNS and sum(seconds) < config.budget_s:
         began = time.perf_counter()
-        answer = run_model(model, frame, Deadline(config.budget_s))
+        answer = model(frame, Deadline(config.budget_s))
         seconds.append(time.perf_counter() - began)
     return seconds, answer
 
@@ -137,9 +115,8 @@ def _found(kind: str, answer: Any, needed: str) -> str:
     count = np.bincount(answer.ravel(), minlength=256)
     names = {int(c): c.name.lower() for c in SemanticClass} | {UNLABELLED: "unknown"}
     shares = sorted(((n, names.get(c, str(c))) for c, n in enumerate(count) if n), reverse=True)
-    return ("pixels: " if kind == IMAGE else "points: ") + ", ".join(
-        f"{name} {100 * n / count.sum():.1f} %" for n, name in shares
-    )
+    listed = ", ".join(f"{name} {100 * n / count.sum():.1f} %" for n, name in shares)
+    return f"{'pixels' if kind == IMAGE else 'points'}: {listed}"
 
 
 def _share(edges: NDArray[np.float32]) -> float:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import reflectivity, require_returns
 from calib_ros.lidar.rings import ring_of_points
@@ -27,15 +26,10 @@ MAX_NEIGHBOUR_GAP = float(np.deg2rad(60.0))
 
 @dataclass(frozen=True, eq=False)
 class PointAttributes:
-    """Attributes of the filtered points of a scan (figure 3.6), independent of the extrinsic.
+    """Attributes of the filtered points of a scan (figure 3.6), far points first: near ones overwrite them in a projection.
 
-    Far points come first, so that near ones overwrite them in a projection.
-
-    Attributes
-    ----------
-    xyz : (n, 3) float32, m, LiDAR frame. depth : (n,) d of eq. 3.8, m. discontinuity : (n,) xi of eq. 3.10, m.
-    reflectivity : (n,) 0..1; zeros if the source has none.
-    ground : (n,) bool (algorithm 1). label : (n,) uint8, object (algorithm 2) or NO_OBJECT.
+    xyz: (n, 3) float32, m, LiDAR frame. depth: (n,) d of eq. 3.8, m. reflectivity: (n,) 0..1; zeros if the source has none.
+    discontinuity: (n,) xi of eq. 3.10, m. ground: (n,) bool (algorithm 1). label: (n,) uint8, object (algorithm 2) or NO_OBJECT.
     """
 
     xyz: Floats
@@ -58,16 +52,12 @@ class PointAttributes:
 
 
 def attributes(cloud: PointCloud, config: ThesisConfig, at_image: Floats | None = None) -> PointAttributes:
-    """Attributes of the points of a recorded cloud within the thresholds.
+    """Attributes of the points of a recorded cloud within the thresholds. TooFewFeaturesError for a scan with hardly any returns.
 
     at_image: (n, 3) deskewed points, None = as measured. Positions and depths are taken from them, everything else from the scan
-    as measured, whose rings are regular. Discontinuities are those of the whole scan. The ground is fitted before points are
-    filtered by height and reflectivity: without it, a horizontal slice through the objects would be taken for the ground.
-    Objects are clusters of the remaining points. Raises TooFewFeaturesError for a scan with hardly any returns.
+    as measured, whose rings are regular. Discontinuities are those of the whole scan, objects clusters of the remaining points.
     """
     require_returns(cloud)
-    if at_image is not None and at_image.shape != cloud.xyz.shape:
-        raise BadInputError(f"at_image has shape {at_image.shape}, but the cloud {cloud.xyz.shape}")
     finite = cloud.finite_mask()
     at_image = cloud.xyz[finite] if at_image is None else at_image[finite]
     cloud = cloud.finite()
@@ -76,21 +66,19 @@ def attributes(cloud: PointCloud, config: ThesisConfig, at_image: Floats | None 
     r = known if known is not None else np.zeros(len(cloud), np.float32)
     in_reach = np.flatnonzero(within_reach(cloud.xyz, config))
     passed = within_thresholds(cloud.xyz[in_reach], None if known is None else known[in_reach], config)
+    # Before heights are filtered: else a horizontal slice through the objects would be taken for the ground.
     ground = ground_points(cloud.xyz[in_reach], ground_plane(cloud.xyz[in_reach], config), config)[passed]
     keep = in_reach[passed]
     xyz, d = cloud.xyz[keep], depth(cloud.xyz[keep])
     label = object_labels(xyz, d, ground, config)
     xyz, d = at_image[keep], depth(at_image[keep])
-    order = np.argsort(-d, kind="stable")
-    whole = PointAttributes(xyz, d, r[keep], xi[keep], ground, label)
-    return whole.select(order)
+    return PointAttributes(xyz, d, r[keep], xi[keep], ground, label).select(np.argsort(-d, kind="stable"))
 
 
 def within_reach(xyz: Floats, config: ThesisConfig) -> Mask:
     """Points (n,) that pass the filters of depth and azimuth."""
-    return np.asarray(
-        by_range(xyz, config.min_depth, config.max_depth) & by_angle(xyz, config.azimuth_deg, config.azimuth_half_width_deg)
-    )
+    near = by_range(xyz, config.min_depth, config.max_depth)
+    return np.asarray(near & by_angle(xyz, config.azimuth_deg, config.azimuth_half_width_deg))
 
 
 def within_thresholds(xyz: Floats, r: Floats | None, config: ThesisConfig) -> Mask:
@@ -121,10 +109,7 @@ def by_reflectivity(reflectivity: Floats, low: float, high: float = 1.0) -> Mask
 
 
 def by_angle(xyz: Floats, center_deg: float, half_width_deg: float) -> Mask:
-    """Points whose azimuth lies within half_width_deg of center_deg (0 = the LiDAR's +x, counter-clockwise); (n,) bool.
-
-    A camera covers only part of a revolution; the window may cross 180 deg.
-    """
+    """Points whose azimuth lies within half_width_deg of center_deg (0 = the LiDAR's +x, counter-clockwise); (n,) bool."""
     if half_width_deg >= 180:
         return np.ones(len(xyz), bool)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
@@ -152,10 +137,9 @@ def object_labels(xyz: Floats, d: Floats, ground: NDArray[np.bool_], config: The
 
 
 def discontinuity(cloud: PointCloud) -> Floats:
-    """xi of every point, eq. 3.10, (n,) m: by how much the farther of its neighbours in the ring is behind it.
+    """xi of every point of a finite cloud, eq. 3.10, (n,) m: by how much the farther of its neighbours in the ring is behind it.
 
-    Source: thesis 3.4.3; Levinson and Thrun 2013. Neighbours are the returns next to it by azimuth; rings are closed if the
-    sensor covers the whole revolution. The cloud must be finite. A point alone in its ring has 0.
+    Source: thesis 3.4.3; Levinson and Thrun 2013. Neighbours are the returns next to it by azimuth, across a full revolution too.
     """
     xyz = cloud.xyz
     if len(xyz) == 0:
@@ -165,17 +149,15 @@ def discontinuity(cloud: PointCloud) -> Floats:
     ring = ring_of_points(cloud, azimuth, np.arcsin(xyz[:, 2] / np.maximum(q, 1e-6)))
     order = np.lexsort((azimuth, ring))
     ring, along = ring[order], q[order]
+    place = np.arange(len(ring))
     starts = np.flatnonzero(np.diff(ring, prepend=ring[0] - 1))
     ends = np.append(starts[1:], len(ring)) - 1
-    before, after = np.roll(along, 1), np.roll(along, -1)
-    before[starts], after[ends] = along[ends], along[starts]
+    last, following = place - 1, place + 1
+    last[starts], following[ends] = ends, starts
     turn = azimuth[order]
-    last, following = np.roll(turn, 1), np.roll(turn, -1)
-    last[starts], following[ends] = turn[ends], turn[starts]
-    gap_before, gap_after = _gap(turn, last), _gap(turn, following)
+    gap_before, gap_after = _gap(turn, turn[last]), _gap(turn, turn[following])
     limit = max(MAX_NEIGHBOUR_GAP, 3 * float(np.median(gap_after)))
-    before[gap_before > limit] = 0
-    after[gap_after > limit] = 0
+    before, after = np.where(gap_before > limit, 0, along[last]), np.where(gap_after > limit, 0, along[following])
     xi = np.empty(len(q), np.float32)
     xi[order] = np.maximum(np.maximum(before, after) - along, 0)
     return xi

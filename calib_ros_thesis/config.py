@@ -67,7 +67,15 @@ class ThesisConfig(Stage):
 
     def check_with(self, config: Config) -> None:
         """See Stage."""
-        self._check()
+        for low, high in THESIS_ORDER:
+            first, second = getattr(self, low), getattr(self, high)
+            if not first < second:
+                raise ConfigError(f"thesis.{low} = {first:g} must be less than thesis.{high} = {second:g}")
+        if not 1 <= len(self.smoothing) <= MAX_SMOOTHINGS:
+            raise ConfigError(
+                f"thesis.smoothing has {len(self.smoothing)} levels; give 1 to {MAX_SMOOTHINGS}, each is an optimisation of its "
+                "own; 0 = no smoothing"
+            )
         if config.refine.objective != "thesis":
             return
         if config.image.projection == "cylinder":
@@ -76,20 +84,6 @@ class ThesisConfig(Stage):
             raise ConfigError(
                 "refine.optimizer = levenberg_marquardt needs a gradient, which eq. 3.12 does not have; use nelder_mead or "
                 "barzilai_borwein, or thesis.dense_edges: once_per_level"
-            )
-
-    def _check(self) -> None:
-        for low, high in THESIS_ORDER:
-            if not getattr(self, low) < getattr(self, high):
-                raise ConfigError(
-                    f"thesis.{low} = {getattr(self, low):g} must be less than thesis.{high} = {getattr(self, high):g}"
-                )
-        if not self.smoothing:
-            raise ConfigError("thesis.smoothing must hold at least one level; 0 = no smoothing")
-        if len(self.smoothing) > MAX_SMOOTHINGS:
-            raise ConfigError(
-                f"thesis.smoothing has {len(self.smoothing)} levels; give at most {MAX_SMOOTHINGS}, "
-                "each is an optimisation of its own"
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.frame import PointCloud
+from calib_ros.frame import MAIN_CLASSES, UNLABELLED, PointCloud
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH, EdgeLevel, blurred_levels
 from calib_ros.image.enhance import prepare
 from calib_ros.registration.classes import OF_CLASSES, OF_MASKS
@@ -20,19 +21,16 @@ from calib_ros_thesis.maps import PointLevels
 
 Map = NDArray[np.float32]
 CLASS_EDGE_SHARE = 0.1  # of borders of classes, less than of masks: they follow outlines less closely
+FEW_FRAMES_SHARE = 0.05  # added to the share of main classes, so that frames without any keep a part of their weight
 
 
 @dataclass(frozen=True, eq=False)
 class ThesisFeatures:
     """What eq. 3.12 keeps of a frame, as `FrameFeatures.own`.
 
-    Attributes
-    ----------
-    camera : pinhole of the maps.
-    points : LiDAR frame, far ones first. map_levels : their levels in the maps.
-    image_edges : E^I (h, w) in 0..1, for every smoothing of ``thesis.smoothing``.
-    levels : the same edges at the resolutions of the edges' own score, (1, h, w) standardised.
-    importance : w_j of eq. 3.16; None where classes are not known, or frames are not weighted.
+    camera: pinhole of the maps. points: LiDAR frame, far ones first. map_levels: their levels in the maps. image_edges: E^I
+    (h, w) in 0..1, for every smoothing. levels: these at the resolutions of the edges' own score, (1, h, w) standardised.
+    importance: w_j of eq. 3.16; None where classes are not known, or frames are not weighted.
     """
 
     camera: Camera
@@ -53,10 +51,10 @@ def thesis_features(
     edges_of: str = OF_MASKS,
     importance: float | None = None,
 ) -> ThesisFeatures:
-    """Features of a frame. image: rectified (h, w[, 3]) of camera. semantic: edges (h, w) in 0..1 to blend in.
-    at_image: (n, 3) deskewed points of the cloud, None = as measured. edges_of: see FrameSemantics. importance: w_j.
+    """Features of a frame. TooFewFeaturesError if the scan is empty.
 
-    Raises TooFewFeaturesError if the scan is empty.
+    image: rectified (h, w[, 3]) of camera. semantic: edges (h, w) in 0..1 to blend in. at_image: (n, 3) deskewed points of the
+    cloud, None = as measured. edges_of: see FrameSemantics. importance: w_j.
     """
     thesis = thesis_of(config)
     points = attributes(cloud, thesis, at_image)
@@ -76,3 +74,19 @@ def thesis_features(
 def semantic_share(config: ThesisConfig, edges_of: str) -> float:
     """The share of semantic edges of that kind, see FrameSemantics, where they are blended with gradient edges."""
     return CLASS_EDGE_SHARE if edges_of == OF_CLASSES else config.semantic_share
+
+
+def importance(classes: NDArray[np.uint8]) -> float | None:
+    """w_j of eq. 3.16: the share of the main classes among the pixels (H, W) whose class is known; None if none is."""
+    count = np.bincount(classes.ravel(), minlength=256)
+    known = count.sum() - count[UNLABELLED]
+    return None if known == 0 else float(count[list(MAIN_CLASSES)].sum() / known)
+
+
+def frame_weights(shares: Sequence[float | None]) -> NDArray[np.float64]:
+    """w_j of several frames (n,), of mean 1. One whose classes are not known, as they come later than the frame, weighs 1."""
+    known = np.array([s for s in shares if s is not None])
+    if not len(known):
+        return np.ones(len(shares))
+    mean = float(known.mean()) + FEW_FRAMES_SHARE
+    return np.array([1.0 if s is None else (s + FEW_FRAMES_SHARE) / mean for s in shares])

@@ -44,12 +44,9 @@ def smoothed(edges: Map, sigma: float) -> Map:
 def edges(image: Grey, operator: str, full_step: float, low: float, high: float) -> Map:
     """Edge detector, algorithm 5: (H, W) float32 in 0..1.
 
-    operator: sobel, canny or mix, the mean of both. Sobel, algorithm 3, is the gradient magnitude, where a step of `full_step`
-    grey levels counts as 1: the thesis leaves the scale open, but without one the two halves of the mix have no ratio. Canny,
-    algorithm 4, gives thin edges, 0 or 1.
-
-    low, high: hysteresis thresholds of Canny as shares of a step of `full_step` grey levels: above high is an edge, below low is
-    not, in between is one if connected to an edge. The thesis calls maxVal the lower one by mistake (docs/departures.md).
+    operator: sobel (algorithm 3), canny (algorithm 4: 0 or 1) or mix, the mean of both. full_step: grey levels of a step that
+    counts as 1 for Sobel; the thesis leaves the scale open. low, high: hysteresis thresholds of Canny as shares of full_step:
+    above high is an edge, below low is not, in between is one if connected to an edge (docs/departures.md).
     """
     gx, gy = gradients(image)
     if operator == "canny":
@@ -57,17 +54,13 @@ def edges(image: Grey, operator: str, full_step: float, low: float, high: float)
     strength = share(magnitude(gx, gy), full_step)
     if operator == "sobel":
         return strength
-    if operator == "mix":
-        return np.asarray(0.5 * strength + 0.5 * _canny(gx, gy, full_step, low, high), np.float32)
-    raise ValueError(f"edge operator '{operator}' must be one of {', '.join(OPERATORS)}")
+    return np.asarray(0.5 * strength + 0.5 * _canny(gx, gy, full_step, low, high), np.float32)
 
 
 def gradients(image: Grey) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
     """Grey levels (H, W), uint8 or int16 below 8192 -> G_x, G_y (H, W) of the Sobel kernels, eq. 3.9. Border: mirrored."""
-    return (
-        np.asarray(cv2.Sobel(image, cv2.CV_16S, 1, 0), np.int16),
-        np.asarray(cv2.Sobel(image, cv2.CV_16S, 0, 1), np.int16),
-    )
+    gx, gy = (np.asarray(cv2.Sobel(image, cv2.CV_16S, dx, 1 - dx), np.int16) for dx in (1, 0))
+    return gx, gy
 
 
 def magnitude(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> Map:

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from calib_ros_thesis.cloud import PointAttributes
 from calib_ros_thesis.config import ThesisConfig
-from calib_ros_thesis.image import SOBEL_GAIN, magnitude, share
+from calib_ros_thesis.image import SOBEL_GAIN, Grey, magnitude, share
 from calib_ros_thesis.image import edges as operator_edges
 
 Levels = NDArray[np.int16]
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.intp]
-Grey = NDArray[np.uint8] | NDArray[np.int16]
 EMPTY = 0
 DEPTH_UNITS = 100.0  # levels per metre
 REFLECTIVITY_UNITS = 1000.0  # levels of full scale; 1 is added, since 0 is EMPTY
@@ -37,10 +36,7 @@ REACH = 2 + 2 * (SMALL // 2) + MIDDLE // 2 + LARGE // 2 + BLUR // 2  # px; of a 
 
 @dataclass(frozen=True, eq=False)
 class PointLevels:
-    """Attributes of points (n,) as integer levels of the maps; EMPTY for points that are not in the map.
-
-    depth: of points above ground; the ground is large and has no edges (thesis 3.3.2). label: object.
-    """
+    """Attributes of points (n,) as integer levels of the maps; EMPTY for what is not in the map: depth of the ground (3.3.2)."""
 
     depth: Levels
     reflectivity: Levels
@@ -141,10 +137,8 @@ def complete(sparse: Levels) -> Levels:
 
 
 def close_gaps(labels: NDArray[np.uint8], size: int, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-    """Morphological closing (h, w) by a square of `size` px, odd or even; into `out` if given.
-
-    cv2.morphologyEx does not mirror the square for the erosion, so that even sizes would move the map by a pixel.
-    """
+    """Morphological closing (h, w) by a square of `size` px, odd or even; into `out` if given."""
+    # cv2.morphologyEx does not mirror the square for the erosion, so that even sizes would move the map by a pixel.
     square, mirrored = _square(size), (size - 1 - size // 2,) * 2
     dilated = cv2.dilate(labels, square, dst=out)
     return np.asarray(cv2.erode(dilated, square, dst=out, anchor=mirrored), np.uint8)
@@ -158,8 +152,7 @@ class FastEdgeMaps:
     """E^L at the pixels of the points only, computed in the part of the image that has points, for images of one size (px)."""
 
     def __init__(self, height: int, width: int, config: ThesisConfig) -> None:
-        self.height, self.width, self.config = height, width, config
-        size = height * width
+        self.height, self.width, self.config, size = height, width, config, height * width
         self._sparse, self._gx, self._gy = (np.empty(size, np.int16) for _ in range(3))
         self._labels, self._closed, self._canny = (np.empty(size, np.uint8) for _ in range(3))
         self._complete = DensityCompletion(size)

@@ -19,9 +19,8 @@ from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import PointScore, Score
 from calib_ros.registration.search.optimizers import barzilai_borwein, nelder_mead
 from calib_ros_thesis.config import thesis_of
-from calib_ros_thesis.features import ThesisFeatures, thesis_features
-from calib_ros_thesis.frame_weights import frame_weights
-from calib_ros_thesis.frame_weights import importance as share_of_main_classes
+from calib_ros_thesis.features import ThesisFeatures, frame_weights, thesis_features
+from calib_ros_thesis.features import importance as share_of_main_classes
 from calib_ros_thesis.score import ThesisScore
 
 Matrix = NDArray[np.float64]
@@ -31,16 +30,15 @@ FIRST_SIMPLEX_DEG = 1.6
 SYSTEMATIC_ERROR = np.array([np.deg2rad(0.1)] * 3 + [0.03] * 3)
 FIRST_ATTACHED = 2  # level of the attached form; on the coarser, edges of no direction lead degrees away on some scenes
 
-# Synthetic streets, 3 to 8 frames: where eq. 3.12 found the truth it differed by up to 0.65 deg / 12 cm, where it went astray
-# by 1.2 deg and more.
+# Synthetic streets, 3 to 8 frames: where eq. 3.12 found the truth, up to 0.65 deg / 12 cm, else 1.2 deg and more.
 DISAGREEMENT_DEG, DISAGREEMENT_M = 0.75, 0.15
 
 
 class ThesisObjective:
-    """Eq. 3.12 over frames as an Objective, an `ObjectiveKind`. The edges search, and test whether LiDAR and image match at all.
+    """Eq. 3.12 over frames as an Objective, an `ObjectiveKind`. TooFewFeaturesError when hardly a point is near the image.
 
-    edges: of frames whose features hold ThesisFeatures. T_prior: (4, 4). weights: w_j of eq. 3.16; None = by the frames' classes,
-    where these are known. Raises TooFewFeaturesError when hardly a point is near the image.
+    edges: of frames whose features hold ThesisFeatures; they search, and test whether LiDAR and image match. T_prior: (4, 4).
+    weights: w_j of eq. 3.16; None = by the frames' classes, where these are known.
     """
 
     pinholes_only = needs_classes = True
@@ -73,8 +71,7 @@ class ThesisObjective:
             edges = None if both is None else np.asarray(np.minimum(both.sum(axis=0), 1), np.float32)
             if semantics.classes is not None and config.semantics.frame_weights:
                 importance = share_of_main_classes(extractor.working(semantics.classes, nearest=True))
-        at_image = deskewed_points(frame, config.motion)
-        kind = OF_MASKS if semantics is None else semantics.edges_of
+        at_image, kind = deskewed_points(frame, config.motion), OF_MASKS if semantics is None else semantics.edges_of
         return thesis_features(frame.cloud, image, features.camera, config, edges, at_image, kind, importance)
 
     def value(self, T: Matrix) -> float:
@@ -98,8 +95,7 @@ class ThesisObjective:
         return T
 
     def refine(self, T: Matrix, progress: Progress = SILENT) -> Matrix:
-        """As optimise, on the last smoothing or the finest level. T itself if edges attached anew score less there: else a
-        calibration that has been found would be refused time and again."""
+        """As optimise, on the last smoothing or the finest level. T itself if edges attached anew score less there."""
         if self.exact:
             return self._smoothing(-1, T, progress)
         found = self._attached_level(-1, T, FIRST_STEP_DEG / 16)
@@ -117,8 +113,7 @@ class ThesisObjective:
 
     def _smoothing(self, level: int, T: Matrix, progress: Progress) -> Matrix:
         """The optimum of eq. 3.12 on one smoothing, by simplex or by gradients."""
-        own, optimizer = thesis_of(self.config), self.config.refine.optimizer
-        evaluations = own.evaluations
+        evaluations, optimizer = thesis_of(self.config).evaluations, self.config.refine.optimizer
         score = _Reporting(self.score.at(level), evaluations, progress.of("refinement"))
         step, limits = FIRST_SIMPLEX_DEG / 2 ** (level % self.score.n_levels), self.constraints.limits
         if optimizer == "barzilai_borwein":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +34,9 @@ MAX_DISCONTINUITY = 3.0  # m; at which eq. 3.10 saturates: from a car to the wal
 class ThesisScore:
     """J of eq. 3.12, summed over frames by eq. 3.16, at the smoothings of ``thesis.smoothing``.
 
-    Equal to RegistrationMaps to rounding: only pixels with a projected point count in eq. 3.12, so that the maps D and W are not
-    needed and E^L is computed at these pixels only (FastEdgeMaps).
-
+    Equal to RegistrationMaps to rounding: only pixels with a projected point count, so that E^L is computed at these alone.
     features: of one camera. T_prior: (4, 4); points it projects far outside the image are left out. weights: w_j of eq. 3.16,
-    (n_frames,), scaled to sum 1; None = equal. Raises TooFewFeaturesError for fewer than MIN_POINTS points,
-    BadInputError for weights that do not fit.
+    (n_frames,), scaled to sum 1; None = equal. TooFewFeaturesError for fewer than MIN_POINTS points, BadInputError for weights.
     """
 
     def __init__(
@@ -46,8 +44,8 @@ class ThesisScore:
     ):
         if not features:
             raise TooFewFeaturesError("no frame to score; give at least one")
-        self.features, self.config, self.camera = features, config, features[0].camera
-        self.n_frames, self.n_levels = len(features), len(thesis_of(config).smoothing)
+        self.features, self.thesis, self.camera = features, thesis_of(config), features[0].camera
+        self.n_frames, self.n_levels = len(features), len(self.thesis.smoothing)
         self.frame_weights = _frame_weights(weights, len(features))
         self._frames = [self._kept(f, T_prior) for f in features]
         found = sum(len(f.xyz) for f in self._frames)
@@ -56,13 +54,12 @@ class ThesisScore:
                 f"only {found} points near the image in {len(features)} frames (need {MIN_POINTS}); "
                 "check the initial extrinsic and the thresholds of the stage thesis"
             )
-        thesis = thesis_of(config)
-        self._maps, self._normalize = FastEdgeMaps(self.camera.height, self.camera.width, thesis), thesis.normalize
+        self._maps = FastEdgeMaps(self.camera.height, self.camera.width, self.thesis)
 
     def _kept(self, features: ThesisFeatures, T_prior: Matrix) -> _FramePoints:
         keep = near_image(features.points.xyz, T_prior, self.camera, MARGIN)
-        points, thesis = features.points.select(keep), thesis_of(self.config)
-        matched = points.weight(thesis.min_depth) * normalized_discontinuity(points.discontinuity)
+        points = features.points.select(keep)
+        matched = points.weight(self.thesis.min_depth) * normalized_discontinuity(points.discontinuity)
         return _FramePoints(points.xyz, matched, features.map_levels.select(keep))
 
     def leave_out(self, frames: NDArray[np.intp]) -> None:
@@ -89,7 +86,7 @@ class ThesisScore:
         for j, features in enumerate(self.features):
             pixels, _, edges = self.shown(j, T)
             J = float(np.sum(edges * features.image_edges[level].ravel()[pixels], dtype=np.float64))
-            mass = float(np.sum(edges, dtype=np.float64)) if self._normalize else 1.0
+            mass = float(np.sum(edges, dtype=np.float64)) if self.thesis.normalize else 1.0
             scores[j] = J / max(mass, 1e-12)
         return scores
 
@@ -98,10 +95,9 @@ class ThesisScore:
         return Atlas([f.levels for f in self.features], self.camera)
 
     def attached(self, T: Matrix) -> PointScore:
-        """The approximation "dense edges once per level": W D + E^L at T, attached to the visible points.
+        """The approximation "dense edges once per level": W D + E^L at T, attached to the visible points. It is differentiable.
 
-        Points hidden at T stay hidden, edges do not move along an object as the view changes, and edge maps are interpolated,
-        standardised and at all resolutions of image.edges.SIGMAS. It is differentiable, and as cheap as the fast score.
+        Points hidden at T stay hidden; edge maps are interpolated, standardised and at all resolutions of image.edges.SIGMAS.
         """
         xyz, weight, frame = [], [], []
         for j, own in enumerate(self._frames):
@@ -138,8 +134,7 @@ class ThesisLevelScore:
         return float(self.score.frame_weights @ self.score.frame_scores(T, self.level))
 
 
-@dataclass(frozen=True, eq=False)
-class _FramePoints:
+class _FramePoints(NamedTuple):
     """Points of a frame near the image. matched: their W D."""
 
     xyz: Map
@@ -156,10 +151,7 @@ def _frame_weights(weights: Sequence[float] | None, n: int) -> Matrix:
 
 @dataclass(frozen=True, eq=False)
 class RegistrationMaps:
-    """All maps (h, w) of a frame at an extrinsic: D^L and W^L of 3.4.4, E^L and the maps before it, E^I.
-
-    Eq. 3.12 written out: for reading, pictures, and as the reference of the fast form.
-    """
+    """All maps (h, w) of a frame at an extrinsic: D^L and W^L of 3.4.4, E^L and the maps before it, E^I. Eq. 3.12 written out."""
 
     discontinuity: Map
     weight: Map

@@ -49,10 +49,9 @@ from calib_ros_evaluation.steps.page import make_steps
 from calib_ros_evaluation.steps.pictures import RegisteredFrame, loss_curves, tiles
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
 from calib_ros_semantics.class_pictures import LEVEL, VERTICAL, above_names, sizes
-from calib_ros_semantics.models.masks import Mask, Masks, mask_edges
+from calib_ros_semantics.models.masks import Mask, mask_edges
 from calib_ros_thesis.config import thesis_of
-from calib_ros_thesis.features import ThesisFeatures
-from calib_ros_thesis.frame_weights import importance
+from calib_ros_thesis.features import ThesisFeatures, importance
 from calib_ros_thesis.image import OPERATORS, gradient_edges
 from calib_ros_thesis.score import ThesisScore
 
@@ -113,10 +112,8 @@ class Street:
             regions = cv2.connectedComponents((classes == c).astype(np.uint8), connectivity=8)[1]
             areas = np.bincount(regions.ravel())
             masks += [Mask.of(regions == k) for k in range(1, len(areas)) if areas[k] >= 100]
-        found = Masks.of(classes.shape, [m for m in masks if m is not None])
-        return RegisteredFrame.of(
-            self.frame, self.T, self.config, FrameSemantics(mask_edges(found), classes, self.frame.cloud.label)
-        )
+        edges = mask_edges([m for m in masks if m is not None], classes.shape)
+        return RegisteredFrame.of(self.frame, self.T, self.config, FrameSemantics(edges, classes, self.frame.cloud.label))
 
     @cached_property
     def semantic_pictures(self) -> dict[str, Image]:

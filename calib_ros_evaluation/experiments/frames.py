@@ -20,7 +20,7 @@ from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.scores import label
 from calib_ros_evaluation.experiments.setup import WorkerCache
 from calib_ros_semantics.models.segmentation import SegmentationModels
-from calib_ros_thesis.frame_weights import importance
+from calib_ros_thesis.features import importance
 
 Matrix = NDArray[np.float64]
 SET = 3  # frames averaged, as in figure 4.16

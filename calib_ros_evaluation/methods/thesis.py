@@ -15,7 +15,7 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.method import Extracting, Outcome, Watched, search_limits, typical_step_deg
 from calib_ros_thesis.config import thesis_of
-from calib_ros_thesis.frame_weights import frame_weights
+from calib_ros_thesis.features import frame_weights
 from calib_ros_thesis.score import ThesisLevelScore, ThesisScore
 
 Matrix = NDArray[np.float64]

@@ -20,7 +20,7 @@ from calib_ros_semantics.class_pictures import classes_on_image, cloud_from_abov
 from calib_ros_semantics.first_guess.guess import first_guess
 from calib_ros_semantics.models.class_borders import WEIGHTS
 from calib_ros_thesis.config import thesis_of
-from calib_ros_thesis.frame_weights import importance
+from calib_ros_thesis.features import importance
 from calib_ros_thesis.image import gradient_edges
 
 SECTION = "3.5"

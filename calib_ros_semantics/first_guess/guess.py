@@ -1,7 +1,6 @@
 """The first guess (thesis 3.5): hypotheses of the extrinsic from the classes of points and pixels, without any prior.
 
-Hypotheses come from pairs of objects, whose centroids give poses by PnP (figure 3.20), and from a sweep over all yaws. They are
-ranked and optimised on the class maps; the registration is then tried from the best of them.
+They come from pairs of objects, whose centroids give poses by PnP (figure 3.20), and from a sweep over all yaws.
 """
 
 from __future__ import annotations
@@ -16,6 +15,8 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.frame import MAIN_CLASSES
+from calib_ros.lidar.segmentation import cluster
 from calib_ros.registration.classes import Hypothesis
 from calib_ros.registration.initial_guess import allowed, poses, rotation_distance_deg
 from calib_ros.registration.score.point_score import PointScore
@@ -29,7 +30,6 @@ from calib_ros_semantics.first_guess.score import (
     select_views,
 )
 from calib_ros_semantics.first_guess.view import ClassView
-from calib_ros_semantics.models.instances import cloud_instances, image_instances
 
 Matrix = NDArray[np.float64]
 
@@ -42,7 +42,9 @@ STARTS, FOLLOWED = 40, 15  # of all hypotheses, those optimised on the coarsest 
 SAME_DEG = (6.0, 2.0, 1.0)  # hypotheses nearer than this are one: at first, after the coarsest level, at the end
 OTHER_WAY_DEG = 2 * AROUND_DEG  # nearer hypotheses are places of one direction
 
-# Pairs of objects.
+# Objects: connected regions of pixels, clusters of points.
+CLUSTER_EPS = 0.8  # m; points of an object are nearer to each other, parked cars are not
+CLUSTER_MIN_POINTS = 4  # of a scan downsampled to 0.4 deg: a person at 30 m has about 10
 MIN_AREA_DEG2 = 0.1  # smaller regions of the image are too far away to be clusters of the cloud
 OFF_DEG = 3.0  # of the objects of an image, half meet a cluster so near at the true extrinsic, 65 % within 5 (12 drives)
 PEAKS, DRAWS, KEPT = 8, 40, 3  # yaws tried, samples of each, and of their poses those that go on
@@ -50,10 +52,9 @@ SAMPLE = 4  # pairs solved at a time; three give up to four poses
 
 
 def first_guess(views: Sequence[ClassView], config: GuessConfig | None = None, seed: int = 0) -> list[Hypothesis]:
-    """Hypotheses of the extrinsic that all views have in common, best first; at least one.
+    """Hypotheses of the extrinsic that all views have in common, best first; at least one. config limits tilt and distance.
 
-    Nothing is known of the yaw; tilt and distance are limited by config. Deterministic for a seed. BadInputError for views of
-    different cameras; TooFewFeaturesError if they show too little in common, or nothing of it meets.
+    BadInputError for views of different cameras; TooFewFeaturesError if they show too little in common, or nothing of it meets.
     """
     config = config or GuessConfig()
     if not views:
@@ -145,23 +146,22 @@ class Pairs:
 
 
 def possible_pairs(views: Sequence[ClassView], config: GuessConfig) -> Pairs:
-    """All pairs of a class that some allowed extrinsic brings together; objects cut by the image's border are left out."""
+    """All pairs of a class that some allowed extrinsic brings together."""
     owners, rays, pixels, points = [], [np.empty((0, 3))], [np.empty((0, 2))], [np.empty((0, 3))]
     objects = 0
     for view in views:
         K, scale = view.camera.K, view.scale
         per_pixel = float(np.rad2deg(scale / K[0, 0])) ** 2
-        image = image_instances(view.classes, max(round(MIN_AREA_DEG2 / per_pixel), 4))
-        cloud = cloud_instances(view.xyz, view.label)
-        whole = np.flatnonzero(~image.cut)
-        i, j = np.nonzero(image.cls[whole, None] == cloud.cls[None])
-        pixel = (image.centroid[whole] + 0.5) * scale - 0.5
+        of_image, middle = image_objects(view.classes, max(round(MIN_AREA_DEG2 / per_pixel), 4))
+        of_cloud, centroid = cloud_objects(view.xyz, view.label)
+        i, j = np.nonzero(of_image[:, None] == of_cloud[None])
+        pixel = (middle + 0.5) * scale - 0.5
         ray = np.c_[(pixel - K[:2, 2]) / (K[0, 0], K[1, 1]), np.ones(len(pixel))]
         owners.append(objects + i)
         rays.append((ray / np.linalg.norm(ray, axis=1, keepdims=True))[i])
         pixels.append(pixel[i])
-        points.append(cloud.centroid[j])
-        objects += len(whole)
+        points.append(centroid[j])
+        objects += len(pixel)
     number, ray, pixel, point = np.concatenate(owners), np.concatenate(rays), np.concatenate(pixels), np.concatenate(points)
     distance = np.maximum(np.linalg.norm(point, axis=1), 1e-6)
     parallax = np.arcsin(np.minimum(config.distance_m / distance, 1.0))
@@ -169,6 +169,39 @@ def possible_pairs(views: Sequence[ClassView], config: GuessConfig) -> Pairs:
     keep = rise <= np.deg2rad(config.tilt_deg + OFF_DEG) + parallax
     yaw = np.arctan2(point[:, 1], point[:, 0]) + np.arctan2(ray[:, 0], ray[:, 2])
     return Pairs(number[keep], objects, ray[keep], pixel[keep], point[keep], yaw[keep], parallax[keep])
+
+
+def image_objects(classes: NDArray[np.uint8], min_area: int) -> tuple[NDArray[np.uint8], Matrix]:
+    """Class (k,) and centroid (k, 2) px of connected regions (8 neighbours) of the main classes in classes (h, w).
+
+    Those smaller than min_area px or cut by the image's border are left out.
+    """
+    height, width = classes.shape
+    cls, centroid = [], [np.empty((0, 2))]
+    for c in MAIN_CLASSES:
+        _, _, stats, middle = cv2.connectedComponentsWithStats((classes == c).astype(np.uint8), connectivity=8)
+        left, top, wide, high, area = stats.T
+        whole = (area >= min_area) & (left > 0) & (top > 0) & (left + wide < width) & (top + high < height)
+        whole[0] = False  # the background
+        cls += [c] * int(whole.sum())
+        centroid.append(middle[whole])
+    return np.array(cls, np.uint8), np.concatenate(centroid)
+
+
+def cloud_objects(xyz: NDArray[np.float32], label: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Matrix]:
+    """Class (k,) and centroid (k, 3) m of the clusters of points (n, 3) of the main classes by DBSCAN. label: (n,).
+
+    The points should be uniform in angle, like pixels: a mean of all points of a scan is biased to where its rings are dense.
+    """
+    cls, centroid = [], [np.empty((0, 3))]
+    for c in MAIN_CLASSES:
+        own = xyz[label == c]
+        member = cluster(own, CLUSTER_EPS, CLUSTER_MIN_POINTS)
+        count = np.bincount(member[member >= 0])
+        sums = [np.bincount(member[member >= 0], own[member >= 0, k], len(count)) for k in range(3)]
+        cls += [c] * len(count)
+        centroid.append(np.stack(sums, axis=1) / count[:, None])
+    return np.array(cls, np.uint8), np.concatenate(centroid)
 
 
 def centroid_poses(pairs: Pairs, K: Matrix, config: GuessConfig, seed: int) -> Matrix:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import GuessConfig
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.frame import SemanticClass
 from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.initial_guess import allowed, near_lidar, rotation_distance_deg
@@ -69,13 +68,12 @@ def select_views(views: Sequence[ClassView]) -> list[ClassView]:
 
 
 def label_score(views: Sequence[ClassView]) -> PointScore:
-    """The score of all classes that some view shows on both sides. TooFewFeaturesError if they are too few, or hardly any point
-    is of them."""
+    """The score of all classes that some view shows on both sides. TooFewFeaturesError if these or their points are too few."""
     common = sorted(set[int]().union(*(view.matched for view in views)))
     n_points = sum(int(np.isin(view.label, common).sum()) for view in views)
     if len(common) >= MIN_CLASSES and n_points >= MIN_POINTS:
         return class_score(views, common)
-    names = ", ".join(SemanticClass(c).name.lower() for c in common) or "none"
+    names = ", ".join(C(c).name.lower() for c in common) or "none"
     raise TooFewFeaturesError(
         f"a first guess needs {MIN_CLASSES} classes and {MIN_POINTS} points that images and clouds have in common; "
         f"{len(views)} frames have {n_points} points of {names} (of {', '.join(c.name.lower() for c in MATCHED)})"
@@ -241,8 +239,8 @@ def _points(view: ClassView, classes: Sequence[int], frame: int) -> ScoredPoints
 
 def _levels(view: ClassView, classes: Sequence[int]) -> list[EdgeLevel]:
     """Maps of a view, one per class, on every level."""
-    known = view.classes < len(SemanticClass)
-    share = np.bincount(view.classes[known], minlength=len(SemanticClass)) / max(int(known.sum()), 1)
+    known = view.classes < len(C)
+    share = np.bincount(view.classes[known], minlength=len(C)) / max(int(known.sum()), 1)
     present = np.flatnonzero(share)
     evidence = (confusion_matrix()[:, present] / np.maximum(share[present], RAREST))[list(classes)].astype(np.float32)
     height, width = known.shape
@@ -255,9 +253,8 @@ def _levels(view: ClassView, classes: Sequence[int]) -> list[EdgeLevel]:
         p = np.stack(parts) if parts else np.zeros((0, *labelled.shape), np.float32)
         ratio = np.log((1 - CONFUSED) * np.tensordot(evidence, p, axes=1) + CONFUSED)
         mean = (ratio * (labelled + 1e-6)).sum(axis=(1, 2)) / float((labelled + 1e-6).sum())
-        levels.append(
-            EdgeLevel.of((labelled * (ratio - mean[:, None, None])).astype(np.float32), view.scale * shrink, blur * view.scale)
-        )
+        maps = (labelled * (ratio - mean[:, None, None])).astype(np.float32)
+        levels.append(EdgeLevel.of(maps, view.scale * shrink, blur * view.scale))
     return levels
 
 

@@ -1,7 +1,4 @@
-"""Semantic edges without masks: the borders of classes, weighted by the probabilities on both sides (thesis 3.4.2).
-
-They are split by direction like the boundaries of masks, see masks.mask_edges.
-"""
+"""Semantic edges without masks: the borders of classes, weighted by the probabilities on both sides (thesis 3.4.2)."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros_semantics.models.labels import Classes
-from calib_ros_semantics.models.tiles import is_softmax
+from calib_ros_semantics.models.tiles import is_softmax, softmax
 
 Map = NDArray[np.float32]
 C = SemanticClass
@@ -30,22 +27,18 @@ CELL_RATIO = (0.75, 1.25)  # planes with a number of cells in this range are not
 # Sobel's kernels of 7 cells are those of 3 cells after a binomial blur of 1 cell, which smooths the stairs of a border.
 APERTURE, KERNEL_GAIN = 7, 64 * 32  # KERNEL_GAIN makes the slope of a ramp of 1 per cell 1
 STEP_SLOPE = 5 / 16  # slope beside a step from 0 to 1 between two cells, blurred so
-IMAGE_BORDER = 4  # px; the border of the image is not a border of classes
+IMAGE_BORDER = 4  # px; the border of the image is none of a class or a mask
 EPSILON = np.float32(1e-6)
 
 
 def borders_of_scores(scores: NDArray[Any], meaning: Classes, size: tuple[int, int]) -> Map:
     """Borders (2, H, W) at a size (height, width) from the scores (C, h, w) of a network, before or after its softmax.
 
-    meaning: SemanticClass (C,) of each of its classes. Cells cover equal parts of the image, as in class_output.best_classes.
-    NaN scores have no border.
+    meaning: SemanticClass (C,) of each of its classes. NaN scores have no border.
     """
     found = np.stack([_fitted(np.ascontiguousarray(plane, np.float32), size) for plane in scores])
     if not is_softmax(scores):
-        with np.errstate(invalid="ignore"):  # an infinite score leaves NaN
-            found -= found.max(axis=0)
-        np.exp(found, out=found)
-        found /= found.sum(axis=0)
+        softmax(found)
     return class_borders({int(c): found[meaning == c].sum(axis=0) for c in np.unique(meaning)}, size)
 
 
@@ -58,9 +51,8 @@ def borders_of_classes(classes: Classes) -> Map:
 def class_borders(planes: Mapping[int, Map], size: tuple[int, int]) -> Map:
     """Borders (2, H, W) float32 in 0..1 of probabilities (h, w) by SemanticClass, at a size (height, width).
 
-    [0] horizontal gradients (vertical lines), [1] vertical ones: for the slope m of a class's probability, relative to a full
-    step, and its weight w: w m cos^2 and w m sin^2 of its direction; the maximum over all classes. Slopes towards UNLABELLED are
-    not borders.
+    [0] horizontal gradients (vertical lines), [1] vertical ones: w m cos^2 and w m sin^2 of the direction of a class's slope m,
+    relative to a full step, by its weight w; the maximum over all classes. Slopes towards UNLABELLED are not borders.
     """
     shape = next(iter(planes.values())).shape
     borders = np.zeros((2, *shape), np.float32)
@@ -82,24 +74,20 @@ def class_borders(planes: Mapping[int, Map], size: tuple[int, int]) -> Map:
     if shape != size:
         resized = [cv2.resize(border, size[::-1], interpolation=cv2.INTER_LINEAR) for border in borders]
         borders = np.asarray(resized, np.float32)
-    for edge in (
-        borders[:, :IMAGE_BORDER],
-        borders[:, -IMAGE_BORDER:],
-        borders[:, :, :IMAGE_BORDER],
-        borders[:, :, -IMAGE_BORDER:],
-    ):
-        edge[:] = 0
+    clear_border(borders)
     return borders
+
+
+def clear_border(edges: Map) -> None:
+    """Set edges (..., H, W) near the border of the image to 0: what ends there mostly goes on beyond it."""
+    for ends in (np.s_[:IMAGE_BORDER], np.s_[-IMAGE_BORDER:]):
+        edges[..., ends, :] = edges[..., ends] = 0
 
 
 def _squares(plane: Map) -> list[Map]:
     """Squared slopes (h, w) to the right and downwards, relative to a full step."""
-    slopes = [
-        cv2.Sobel(
-            plane, cv2.CV_32F, dx, 1 - dx, ksize=APERTURE, scale=1 / (KERNEL_GAIN * STEP_SLOPE), borderType=cv2.BORDER_REPLICATE
-        )
-        for dx in (1, 0)
-    ]
+    scale, border = 1 / (KERNEL_GAIN * STEP_SLOPE), cv2.BORDER_REPLICATE
+    slopes = (cv2.Sobel(plane, cv2.CV_32F, dx, 1 - dx, ksize=APERTURE, scale=scale, borderType=border) for dx in (1, 0))
     return [np.asarray(slope * slope, np.float32) for slope in slopes]
 
 

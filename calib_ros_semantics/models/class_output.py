@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,18 +22,12 @@ MAX_OUTPUT_BYTES = 1_000_000_000
 MAX_UPSAMPLING = 4  # cells of the output per pixel of the input; networks that upsample inside do so by 2 or 4
 
 
-# The output of a network that holds classes: which it is, and reading it.
 class ClassOutput:
-    """The output of a network that holds classes, and the meaning of its class numbers.
+    """The output of a network that holds classes, and the meaning of its class numbers. ModelError if there is none.
 
-    example: inputs by name and their (height, width); `settle` runs the network on them if the file does not declare the sizes
-    of its outputs. by_count, by_number: see `labels.table_of`. conventions: known outputs, for the error. Raises ModelError if no
-    output holds classes.
-
-    Attributes
-    ----------
-    count : number of classes; None = the output holds class numbers. name : of the output; empty until settled.
-    is_pidnet : whether the network has the three outputs of PIDNet.
+    example: inputs by name and their (height, width), to run the network on if its file does not declare sizes of outputs.
+    by_count, by_number: see `labels.table_of`. conventions: known outputs, for the error. count: of classes; None = the output
+    holds class numbers. name: of the output; empty until settled. is_pidnet: whether the network has the three of PIDNet.
     """
 
     def __init__(
@@ -47,7 +40,7 @@ class ClassOutput:
     ) -> None:
         requested = model.sidecar.output
         if requested and requested not in [t.name for t in model.outputs]:
-            raise model.error(f"there is no output '{requested}', which {model.path.with_suffix('.yaml')} asks for")
+            raise model.error(f"there is no output '{requested}', which {model.yaml} asks for")
         self._model, self._feeds, self._size = model, *example
         self._by_count, self._by_number, self._conventions = by_count, by_number, conventions
         self.count: int | None = None
@@ -69,18 +62,16 @@ class ClassOutput:
         at = 1 if is_pidnet else _best_output(model, maps)
         if at is None:
             sizes = ", ".join(f"{t.name} {'x'.join(map(str, s))}" for t, s in zip(model.outputs, shapes, strict=True))
-            raise model.error(
-                f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes}); known are "
-                f"{self._conventions}"
-            )
+            none = f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes})"
+            raise model.error(f"{none}; known are {self._conventions}")
         self._bounded(at, shapes[at])
-        self._table = table_of(model, maps[at].count, self._by_count, self._by_number)
+        self._table = table_of(model, maps[at].classes, self._by_count, self._by_number)
         if not self._table.known - {SemanticClass.OTHER}:
             raise model.error(
                 "none of its classes is of use here: they are all other things, or unknown; name them by 'labels:' in "
-                f"{model.path.with_suffix('.yaml')}, or take a network for streets"
+                f"{model.yaml}, or take a network for streets"
             )
-        self.count, self.name, self.is_pidnet = maps[at].count, model.outputs[at].name, is_pidnet
+        self.count, self.name, self.is_pidnet = maps[at].classes, model.outputs[at].name, is_pidnet
 
     def _bounded(self, at: int, shape: tuple[int, ...]) -> None:
         """ModelError for an output that takes too much memory, with the size of the input at which it would not."""
@@ -107,13 +98,10 @@ class ClassOutput:
         return f"{self.name}: class numbers" + (f", assumed to be {guess} without labels: in its YAML" if guess else "")
 
     def values(self, feeds: Mapping[str, Array], deadline: Deadline, size: Size) -> Array:
-        """Scores (C, h, w), or class numbers (h, w) without a count, for inputs of a size (height, width), once settled.
-
-        Raises ModelError, BudgetError.
-        """
+        """Scores (C, h, w), or class numbers (h, w) without a count, for inputs of a size (height, width), once settled."""
         found = self._model.run(feeds, deadline, [self.name])[0]
         layout = layout_of(found.shape, size)
-        if layout is None or layout.count != self.count:
+        if layout is None or layout.classes != self.count:
             raise self._model.error(f"its output {self.name} has become {'x'.join(map(str, found.shape))}")
         values = found.reshape(layout.shape)
         return values if layout.axis is None else np.moveaxis(values, layout.axis, 0)
@@ -123,7 +111,9 @@ class ClassOutput:
         try:
             if self.count is not None:
                 return self._table.classes(best_classes(values, size))
-            return resized(self._table.classes(_integers(values)), size)
+            if values.dtype == np.bool_ or not np.isfinite(values).all() or (values != np.rint(values)).any():
+                raise ModelError("it has one channel, but holds no class numbers: a network for a single class cannot be used")
+            return resized(self._table.classes(values.astype(np.int64)), size)  # some exports give floats
         except ModelError as error:
             raise self._model.error(f"output {self.name}: {error}") from None
 
@@ -137,23 +127,21 @@ class ClassOutput:
         return self._table.classes(np.arange(self.count or 0))
 
 
-@dataclass(frozen=True)
-class ClassMapLayout:
+class ClassMapLayout(NamedTuple):
     """Layout of classes in an array: shape without leading ones, axis of the scores (None = class numbers)."""
 
     shape: tuple[int, ...]
     axis: int | None
 
     @property
-    def count(self) -> int | None:
+    def classes(self) -> int | None:
         """Number of classes, if known."""
         return None if self.axis is None else self.shape[self.axis]
 
     @property
-    def cells(self) -> Size:
-        """Rows and columns."""
-        rows, columns = (n for k, n in enumerate(self.shape) if k != self.axis)
-        return rows, columns
+    def columns(self) -> int:
+        """Number of columns."""
+        return [n for k, n in enumerate(self.shape) if k != self.axis][1]
 
 
 def layout_of(shape: Sequence[int], size: Size) -> ClassMapLayout | None:
@@ -176,10 +164,8 @@ def layout_of(shape: Sequence[int], size: Size) -> ClassMapLayout | None:
 
 
 def best_classes(scores: NDArray[Any], size: Size) -> NDArray[np.int16]:
-    """Class (H, W) of the highest of scores (C, h, w), which are interpolated to the size first; -1 where all are NaN.
-
-    Cells cover equal parts of the image, as in networks that do not align corners.
-    """
+    """Class (H, W) of the highest of scores (C, h, w), which are interpolated to the size first; -1 where all are NaN."""
+    # Cells cover equal parts of the image, as in networks that do not align corners.
     highest, winner = np.full(size, -np.inf, np.float32), np.full(size, -1, np.int16)
     for number, score in enumerate(scores):
         plane = np.ascontiguousarray(score, np.float32)
@@ -195,21 +181,10 @@ def best_classes(scores: NDArray[Any], size: Size) -> NDArray[np.int16]:
 
 def _is_part(cells: Sequence[int], size: Size) -> bool:
     """Whether rows and columns are those of the input, or of a coarser or finer grid over it."""
-    if (
-        min(cells) < 1
-        or cells[0] > MAX_UPSAMPLING * size[0]
-        or cells[1] > MAX_UPSAMPLING * size[1]
-        or max(cells) * MAX_STRIDE < max(size)
-    ):
+    finer = any(n > MAX_UPSAMPLING * own for n, own in zip(cells, size, strict=True))
+    if min(cells) < 1 or finer or max(cells) * MAX_STRIDE < max(size):
         return False
     return abs(cells[0] - size[0] * cells[1] / size[1]) <= 1 or abs(cells[1] - size[1] * cells[0] / size[0]) <= 1
-
-
-def _integers(values: NDArray[Any]) -> NDArray[np.int64]:
-    """Class numbers as integers; some exports give floats."""
-    if values.dtype == np.bool_ or not np.isfinite(values).all() or (values != np.rint(values)).any():
-        raise ModelError("it has one channel, but holds no class numbers: a network for a single class cannot be used")
-    return values.astype(np.int64)
 
 
 def _declared(model: OnnxModel, feeds: Mapping[str, Array]) -> list[tuple[int, ...]] | None:
@@ -231,18 +206,15 @@ def _best_output(model: OnnxModel, maps: Mapping[int, ClassMapLayout]) -> int | 
     if model.sidecar.output:
         at = [t.name for t in model.outputs].index(model.sidecar.output)
         return at if at in maps else None
-    scores = [k for k, layout in maps.items() if layout.count is not None]
+    scores = [k for k, layout in maps.items() if layout.classes is not None]
     integers = [k for k in maps if np.issubdtype(model.outputs[k].dtype, np.integer)]
     return next(iter(scores or integers or maps), None)
 
 
 def _is_pidnet(model: OnnxModel, maps: Mapping[int, ClassMapLayout], size: Size) -> bool:
-    """Whether three outputs are those of PIDNet: two alike, at an eighth of the input's size unless enlarged, and boundaries.
-
-    The middle one holds the classes.
-    """
-    if len(model.outputs) != 3 or not {0, 1} <= set(maps) or maps[0].count is None or maps[0].shape != maps[1].shape:
+    """Whether three outputs are those of PIDNet: two alike, at an eighth of the input unless enlarged, and boundaries."""
+    if len(model.outputs) != 3 or not {0, 1} <= set(maps) or maps[0].classes is None or maps[0].shape != maps[1].shape:
         return False
-    in_eighths = abs(size[1] / maps[1].cells[1] - 8) < 1
-    boundaries = 2 in maps and maps[2].count is None
+    in_eighths = abs(size[1] / maps[1].columns - 8) < 1
+    boundaries = 2 in maps and maps[2].classes is None
     return in_eighths or boundaries or model.sidecar.family.lower() == "pidnet"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,9 @@ from calib_ros.lidar.range_image import reflectivity
 from calib_ros.lidar.rings import azimuth_step, ring_of_points
 from calib_ros_semantics.models import labels
 from calib_ros_semantics.models.class_output import ClassOutput
-from calib_ros_semantics.models.label_files import LabelScans
+from calib_ros_semantics.models.label_files import LabelScans, SourceClasses
 from calib_ros_semantics.models.labels import SQUEEZESEG, Classes
-from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, Tensor
+from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, SegmentationModel, Tensor
 
 Statistics = Mapping[str, tuple[float, float]]  # mean and standard deviation of each channel
 CONVENTIONS = (
@@ -45,18 +46,15 @@ VOTED_CLASSES = 10  # SemanticClasses that may get votes
 CHANNELS = ("range", "x", "y", "z", "remission", "mask")
 SYNONYMS = {"depth": "range", "intensity": "remission", "reflectivity": "remission"}
 RANGE_FIRST, XYZ_FIRST = CHANNELS, ("x", "y", "z", "remission", "range", "mask")
-MASK_STATISTICS = (0.0, 1.0)
 # Of SemanticKITTI, as lidar-bonnetal publishes it; SqueezeSeg has the same.
-BONNETAL: Statistics = dict(
-    zip(CHANNELS, ((12.12, 12.32), (10.88, 11.47), (0.23, 6.91), (-1.04, 0.86), (0.21, 0.16), MASK_STATISTICS), strict=True)
-)
-CENET: Statistics = dict(
-    zip(
-        CHANNELS,
-        ((11.71279, 10.24), (-0.1023471, 12.295865), (0.4952, 9.4287), (-1.0545, 0.8643), (0.2877, 0.1450), MASK_STATISTICS),
-        strict=True,
-    )
-)
+BONNETAL: Statistics = {
+    **{"range": (12.12, 12.32), "x": (10.88, 11.47), "y": (0.23, 6.91), "z": (-1.04, 0.86), "remission": (0.21, 0.16)},
+    "mask": (0.0, 1.0),
+}
+CENET: Statistics = {
+    **{"range": (11.71279, 10.24), "x": (-0.1023471, 12.295865), "y": (0.4952, 9.4287), "z": (-1.0545, 0.8643)},
+    **{"remission": (0.2877, 0.1450), "mask": (0.0, 1.0)},
+}
 FAMILIES: dict[str, tuple[tuple[str, ...], Statistics]] = {
     **dict.fromkeys(("bonnetal", "rangenet", "squeezesegv3", "salsanext", "3d-mininet"), (RANGE_FIRST, BONNETAL)),
     "cenet": (RANGE_FIRST, CENET),
@@ -64,67 +62,37 @@ FAMILIES: dict[str, tuple[tuple[str, ...], Statistics]] = {
 }
 
 
-class CloudClasses:
-    """Frame -> SemanticClass of each point of its cloud (n,) uint8, UNLABELLED where unknown or without a return.
+def point_model(path: str, config: SemanticsConfig) -> SegmentationModel:
+    """The model that gives SemanticClass of each point (n,) uint8, UNLABELLED where unknown or without a return.
 
     path: ONNX file of a network for range images, folder of .label files, or "source" for the labels of the dataset. Raises
     ModelError if unusable.
     """
+    if path == SOURCE or Path(path).is_dir():
+        return GivenPoints(SourceClasses("points") if path == SOURCE else LabelScans(path))
+    return CloudNetwork(path, config)
 
-    def __init__(self, path: str, config: SemanticsConfig) -> None:
-        self._source: CloudNetwork | LabelScans | SourceLabels
-        if path == SOURCE:
-            self._source = SourceLabels()
-        elif Path(path).is_dir():
-            self._source = LabelScans(path)
-        else:
-            self._source = CloudNetwork(path, config)
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
-        """Classes of a frame. Raises ModelError without classes for it, BudgetError when the time is up."""
+class GivenPoints(SegmentationModel):
+    """Classes of points that a folder or the source provides."""
+
+    def __init__(self, read: SourceClasses | LabelScans) -> None:
+        self._read = read
+
+    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Classes:
         deadline.check()
-        return np.where(frame.cloud.finite_mask(), self._source(frame, deadline), np.uint8(UNLABELLED))
+        return np.where(frame.cloud.finite_mask(), self._read(frame), np.uint8(UNLABELLED))
 
     def describe(self) -> str:
-        """Kind, input and classes, as text."""
-        return self._source.describe()
-
-    @property
-    def known(self) -> frozenset[int] | None:
-        """SemanticClasses that the network tells apart, once it has run; None for classes that are given."""
-        return self._source.known if isinstance(self._source, CloudNetwork) else None
-
-    @property
-    def fallback(self) -> str:
-        """Why the network does not run on the configured provider; empty if it does."""
-        return self._source.model.fallback if isinstance(self._source, CloudNetwork) else ""
-
-    @property
-    def note(self) -> str:
-        """How the last scan differs from those the network was made for; empty if it fits."""
-        return self._source.note if isinstance(self._source, CloudNetwork) else ""
+        return self._read.text
 
 
-class SourceLabels:
-    """Classes of the points that the dataset provides."""
-
-    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
-        if frame.cloud.label is None:
-            raise ModelError(
-                "cloud_classes = source, but this source has no classes of points; use geometric, a network or a folder of "
-                ".label files"
-            )
-        return frame.cloud.label
-
-    def describe(self) -> str:
-        return "classes of points of the source"
-
-
-class CloudNetwork:
+class CloudNetwork(SegmentationModel):
     """An ONNX network for classes of the pixels of a range image. ModelError if it fits no known convention."""
 
     def __init__(self, path: str, config: SemanticsConfig) -> None:
-        self.model, self.note = OnnxModel(path, config), ""
+        self.model = OnnxModel(path, config)
+        self.fallback = self.model.fallback
         self._input = CloudInput(self.model)
         numbers = labels.NUMBERS_OF_CLOUDS
         if self._input.family in ("squeezeseg", "squeezesegv2"):  # its four numbers also fit SemanticKITTI
@@ -132,7 +100,8 @@ class CloudNetwork:
         self._output = ClassOutput(self.model, self._input.example(), labels.OF_CLOUDS, numbers, CONVENTIONS)
         self._input.settle(self._output.count)
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Classes:
+        deadline.check()
         returns = frame.cloud.finite_mask()
         if int(returns.sum()) < MIN_POINTS:
             raise ModelError(f"the cloud has {int(returns.sum())} usable points; check that the LiDAR is not covered")
@@ -141,27 +110,20 @@ class CloudNetwork:
         feeds, view, self.note = self._input.feed(frame.cloud.select(returns))
         size = view.index.shape
         pixels = self._output.classes(self._output.values(feeds, deadline, size), size)
+        self.known = self._output.known
         found = np.full(len(frame.cloud), UNLABELLED, np.uint8)
         found[returns] = classes_of_points(view, pixels)
         return found
-
-    @property
-    def known(self) -> frozenset[int]:
-        """The classes that it tells apart, once it has run."""
-        return self._output.known
 
     def describe(self) -> str:
         return f"{self._input.family}: {self._input.text} -> {self._output.text}, on {self.model.provider}"
 
 
 class CloudInput:
-    """The range image input of a network, in some exports with a mask of its pixels: channels, normalisation, size, layout.
-
-    Raises ModelError if unusable or its YAML contradicts it.
-    """
+    """The range image input of a network, in some exports with a mask of its pixels. ModelError if unusable."""
 
     def __init__(self, model: OnnxModel) -> None:
-        self._model, sidecar = model, model.sidecar
+        self._model = model
         masks = [t for t in model.inputs if len(model.inputs) == 2 and _is_mask(t)]
         images = [t for t in model.inputs if t not in masks and len(t.shape) in (0, 3, 4)]
         if len(images) != 1 or len(model.inputs) != 1 + len(masks):
@@ -175,12 +137,9 @@ class CloudInput:
             raise model.error("it takes several scans at once; export it for one")
         self._axis, count = self._layout(self._image)
         self._channels = channels_of(model, count, None, bool(masks))
-        own = [n for k, n in enumerate(self._image.shape) if k != self._axis][-2:] or [None, None]
-        declared = sidecar.size or (None, None)
-        if any(n is not None and m is not None and n != m for n, m in zip(own, declared, strict=True)):
-            raise model.error(f"it does not run at the height and width {list(declared)} that 'size:' says")
-        self._rows, self._columns = own[0] or declared[0] or ROWS, own[1] or declared[1]
-        self._fov = sidecar.fov_deg or DEFAULT_FOV_DEG
+        rows, self._columns = model.size_of(self._image, self._axis)
+        self._rows = rows or ROWS
+        self._fov = model.sidecar.fov_deg or DEFAULT_FOV_DEG
 
     @property
     def family(self) -> str:
@@ -197,11 +156,7 @@ class CloudInput:
         columns = self._columns or " or ".join(map(str, WIDTHS))
         text = f"{self._rows}x{columns} {' '.join(self._channels.names)}, {self._fov[1]:+g} to {self._fov[0]:+g} deg"
         mean, std = (", ".join(f"{v:.4g}" for v in values) for values in (self._channels.mean, self._channels.std))
-        text += f", fed as (v - [{mean}]) / [{std}] of m and reflectivity 0..1, empty pixels 0"
-        if self._channels.assumed:
-            return f"{text} (of bonnetal, assumed; say family: cenet, or mean and std, for others)"
-        source = "as its YAML says" if self._channels.declared else f"of {self.family}, assumed; its YAML may say otherwise"
-        return f"{text} ({source})"
+        return f"{text}, fed as (v - [{mean}]) / [{std}] of m and reflectivity 0..1, empty pixels 0 ({self._channels.source})"
 
     def example(self) -> tuple[dict[str, Array], tuple[int, int]]:
         """Inputs of an empty scan, and their height and width, to try a network with."""
@@ -215,7 +170,7 @@ class CloudInput:
         distance = np.linalg.norm(cloud.xyz, axis=1)
         elevation = np.arctan2(cloud.xyz[:, 2], np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1]))
         density = _columns_per_turn(cloud, elevation)
-        columns = self._columns or min(WIDTHS, key=lambda width: abs(np.log(width / (density * turn / 360))))
+        columns = self._columns or _nearest_width(density * turn / 360)
         light = reflectivity(cloud.intensity)
         notes = self._notes(columns * 360 / turn, density, elevation, light is not None)
         view = range_view(cloud.xyz, (self._rows, columns), self._fov, turn)
@@ -240,11 +195,12 @@ class CloudInput:
         return feeds
 
     def _notes(self, columns: float, density: float, elevation: NDArray[np.floating], has_light: bool) -> list[str]:
-        notes, best = [], min(WIDTHS, key=lambda width: abs(np.log(width / density)))
+        notes = []
         if not 1 / MAX_STRETCH < columns / density < MAX_STRETCH:
             notes.append(
                 f"{self._model.path.name} takes {columns:.0f} columns per turn, but the scan has {density:.0f}; expect worse "
-                f"classes; export it for {best}, or if its columns cover a part of the turn, declare it as 'azimuth_deg:'"
+                f"classes; export it for {_nearest_width(density)}, or if its columns cover a part of the turn, declare it as "
+                "'azimuth_deg:'"
             )
         high, low = np.deg2rad(self._fov)
         outside = float(np.mean((elevation > high) | (elevation < low)))
@@ -271,7 +227,7 @@ class CloudInput:
             return first, counts[0]
         raise self._model.error(
             f"{tensor.name} has no axis of {' or '.join(map(str, counts))} channels ({', '.join(CHANNELS)}); name them as "
-            f"'channels:' in {self._model.path.with_suffix('.yaml')}"
+            f"'channels:' in {self._model.yaml}"
         )
 
 
@@ -281,32 +237,30 @@ def _is_mask(tensor: Tensor) -> bool:
     return "mask" in tensor.name.lower() or 1 in channels or len(tensor.shape) == 2
 
 
+def _nearest_width(columns: float) -> int:
+    return min(WIDTHS, key=lambda width: abs(np.log(width / columns)))
+
+
 def _columns_per_turn(cloud: PointCloud, elevation: NDArray[np.floating]) -> float:
     """Measurements of a ring per revolution, estimated from the points."""
     azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
     return 2 * np.pi / azimuth_step(ring_of_points(cloud, azimuth, elevation), azimuth)
 
 
-@dataclass(frozen=True, eq=False)
-class Channels:
-    """Channels of a range image: names in order; mean, std (c,) float32, subtracted and divided by.
-
-    declared: mean and std are those of its YAML. assumed: they are not, and the network has several outputs like CENet, whose
-    statistics differ.
-    """
+class Channels(NamedTuple):
+    """Channels of a range image: names in order; mean, std (c,) float32, subtracted and divided by. source: of these, as text."""
 
     family: str
     names: tuple[str, ...]
     mean: NDArray[np.float32]
     std: NDArray[np.float32]
-    assumed: bool
-    declared: bool
+    source: str
 
 
 def channels_of(model: OnnxModel, count: int, classes: int | None, has_mask: bool) -> Channels:
-    """Channels of a network with `count` of them: of its YAML, else of its family.
+    """Channels of a network with `count` of them: of its YAML, else of its family. ModelError for a YAML that does not fit.
 
-    classes: number of scores, None = unknown. has_mask: the mask is an input of its own. ModelError for a YAML that does not fit.
+    classes: number of scores, None = unknown. has_mask: the mask is an input of its own.
     """
     sidecar = model.sidecar
     given = () if isinstance(sidecar.channels, str) else sidecar.channels
@@ -322,11 +276,13 @@ def channels_of(model: OnnxModel, count: int, classes: int | None, has_mask: boo
         if values and len(values) != len(names):
             raise model.error(f"'{name}:' must have {len(names)} numbers, one for each channel")
     mean, std = (tuple(statistics[name][k] for name in names) for k in (0, 1))
-    declared = sidecar.family or (sidecar.mean and sidecar.std)
-    assumed = not declared and family == "bonnetal" and len(model.outputs) > 1
+    source = f"of {family}, assumed; its YAML may say otherwise"
+    if sidecar.mean and sidecar.std:
+        source = "as its YAML says"
+    elif not sidecar.family and family == "bonnetal" and len(model.outputs) > 1:  # as CENet has them, whose statistics differ
+        source = "of bonnetal, assumed; say family: cenet, or mean and std, for others"
     mean, std = sidecar.mean or mean, sidecar.std or std
-    own = bool(sidecar.mean and sidecar.std)
-    return Channels(family, names, np.array(mean, np.float32), np.array(std, np.float32), assumed, own)
+    return Channels(family, names, np.array(mean, np.float32), np.array(std, np.float32), source)
 
 
 def _family(model: OnnxModel, classes: int | None, has_mask: bool) -> str:
@@ -393,10 +349,9 @@ def range_view(
 
 
 def classes_of_points(view: RangeView, classes: Classes) -> Classes:
-    """SemanticClass (n,) of the points from those of the pixels (H, W).
+    """SemanticClass (n,) of the points from those of the pixels (H, W), each of which shows its nearest point.
 
-    A pixel shows its nearest point. Points far behind it get the class most frequent in the neighbourhood at their own range,
-    weighted by nearness in range; UNLABELLED where there is none.
+    Points far behind it get the class most frequent in the neighbourhood at their own range, UNLABELLED where there is none.
     """
     out = classes[view.row, view.column]
     ranges, near = view.ranges, np.maximum(np.float32(SAME_RANGE), np.float32(SAME_RANGE_SHARE) * view.range)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -48,7 +48,7 @@ COLUMN_CELL = 0.4  # m; edge of the columns whose height excludes what is too ta
 MAX_COLUMN_GAP, MAX_COLUMN_GAP_SHARE = (
     0.6,
     0.03,
-)  # m and share of the range, empty below a crown or cable; rings: up to 2 deg apart
+)  # m, share of the range, empty below a crown or cable; rings: up to 2 deg
 MAX_HIDDEN = 0.7  # m; hidden lower part of a column, by the body of a car before its cabin and roof
 PLAN = np.array([1, 1, 0], np.float32)
 
@@ -68,7 +68,7 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     kinds = np.full(len(parts), UNLABELLED, np.uint8)
     for k, part in enumerate(parts):
         if len(part) >= MIN_OBJECT_POINTS:
-            kinds[k] = cluster_shape(xyz[part], shape.select(part), cut[part]).kind
+            kinds[k] = cluster_shape(xyz[part], Surfaces(*(values[part] for values in shape)), cut[part]).kind
     for v in np.nonzero(kinds == SemanticClass.VEHICLE)[0]:
         inside = _within_car(xyz[low], xyz[parts[v]])
         share = np.bincount(number[inside], minlength=len(parts)) / np.bincount(number)
@@ -77,13 +77,9 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     return labels
 
 
-@dataclass(frozen=True)
-class ClusterShape:
-    """Measures of a cluster and the class they give.
-
-    length, width, bottom, top, distance: m. head: length of its uppermost HEAD_HEIGHT, m. scatter, level: median, as of Surfaces.
-    cut: whether its top is outside the field of view.
-    """
+class ClusterShape(NamedTuple):
+    """Measures of a cluster and the class they give. length, width, bottom, top, distance: m. head: length of its uppermost
+    HEAD_HEIGHT, m. scatter, level: median, as of Surfaces. cut: whether its top is outside the field of view."""
 
     length: float
     width: float
@@ -111,12 +107,8 @@ class ClusterShape:
     def _is_vehicle(self) -> bool:
         whole = self.width >= MIN_WHOLE_DEPTH
         boxy = self.head > MAX_HEAD_RATIO * self.length and not (whole and self.length >= SIDE_LENGTH[0])
-        if (
-            boxy
-            or self.level > MAX_VEHICLE_LEVEL
-            or not MIN_END <= self.length <= MAX_VEHICLE_LENGTH
-            or self.width > MAX_VEHICLE_WIDTH
-        ):
+        sized = MIN_END <= self.length <= MAX_VEHICLE_LENGTH and self.width <= MAX_VEHICLE_WIDTH
+        if boxy or self.level > MAX_VEHICLE_LEVEL or not sized:
             return False
         if whole and self.top <= CAR_TOP and self.scatter < min(MAX_SCATTER + SCATTER_PER_M * self.distance, MAX_FAR_SCATTER):
             return self.top >= (MIN_BONNET if self.length >= SIDE_LENGTH[0] else MIN_ROOF)
@@ -150,11 +142,9 @@ def cluster_shape(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_]) -> Clust
 
 
 def _within_car(xyz: Floats, visible: Floats) -> NDArray[np.bool_]:
-    """Which of the points (n, 3) lie where the rest of a car must be whose points `visible` (m, 3) are known.
-
-    Windows return nothing, so that roof and bonnet are separate from the side. They lie within the rectangle around the visible
-    points, extended away from the sensor to the width, or length, of a car.
-    """
+    """Which of the points (n, 3) lie where the rest of a car must be whose points `visible` (m, 3) are known."""
+    # Windows return nothing, so that roof and bonnet are apart from the side: within the rectangle around the visible points,
+    # extended away from the sensor to the width, or length, of a car.
     (x, y), (a, b), turn = cv2.minAreaRect(np.ascontiguousarray(visible[:, :2]))
     along = np.deg2rad(turn) + (0.0 if a >= b else 0.5 * np.pi)
     length, width = max(a, b), min(a, b)

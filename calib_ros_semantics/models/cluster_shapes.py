@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -49,18 +49,12 @@ MIN_BRIGHT_SHARE = 0.4  # of the points on and around a plate: a wall has bright
 SIGN_SURROUNDINGS = 0.4  # m
 
 
-@dataclass(frozen=True, eq=False)
-class Surfaces:
+class Surfaces(NamedTuple):
     """Surface shape around each point. scatter: (n,) surface variation, 0 = flat or straight, up to 1/3 = isotropic; NaN with too
-    few neighbours. level: (n,) 0 = vertical surface, 1 = horizontal.
-    """
+    few neighbours. level: (n,) 0 = vertical surface, 1 = horizontal."""
 
     scatter: Floats
     level: Floats
-
-    def select(self, chosen: NDArray[np.intp]) -> Surfaces:
-        """The shapes of these points."""
-        return Surfaces(self.scatter[chosen], self.level[chosen])
 
 
 def surface_shape(xyz: Floats) -> Surfaces:
@@ -68,8 +62,6 @@ def surface_shape(xyz: Floats) -> Surfaces:
 
     The scatter is averaged over the neighbours: foliage is flat in places, but not all around.
     """
-    if len(xyz) == 0:
-        return Surfaces(np.empty(0, np.float32), np.empty(0, np.float32))
     member, n = cell_numbers(xyz, (SURFACE_CELL, SURFACE_CELL, SURFACE_CELL))
     middle = group_means(xyz, member, n)
     far, near = KDTree(middle).query(middle, NEIGHBOURS, distance_upper_bound=MAX_NEIGHBOUR_DISTANCE)
@@ -84,8 +76,7 @@ def surface_shape(xyz: Floats) -> Surfaces:
     return Surfaces(scatter[member].astype(np.float32), np.abs(vectors[:, 2, 0])[member].astype(np.float32))
 
 
-@dataclass(frozen=True, eq=False)
-class Poles:
+class Poles(NamedTuple):
     """Masks (n,) of points on poles, on plates of poles, and on trunks below a crown."""
 
     pole: NDArray[np.bool_]
@@ -109,12 +100,8 @@ def find_poles(xyz: Floats) -> Poles:
     part = connected_parts(tree.query_pairs(SLICE_GAP, output_type="ndarray"), n)
     slabs = _slabs(xyz, part[cell], layer, part)
     thin = slabs.size[:, 0] <= MAX_POLE_WIDTH
-    plate = (
-        ~thin
-        & (slabs.size[:, 0] >= PLATE_WIDTH[0])
-        & (slabs.size[:, 0] <= PLATE_WIDTH[1])
-        & (slabs.size[:, 1] <= MAX_PLATE_DEPTH)
-    )
+    width, depth = slabs.size.T
+    plate = ~thin & (width >= PLATE_WIDTH[0]) & (width <= PLATE_WIDTH[1]) & (depth <= MAX_PLATE_DEPTH)
     plate &= slabs.slice * SLICE >= MIN_PLATE_HEIGHT
     alone = np.nonzero(thin | plate)[0]
     alone = alone[_is_isolated(slabs, alone, tree, np.bincount(part))]
@@ -129,8 +116,7 @@ def find_poles(xyz: Floats) -> Poles:
     return Poles((of_point == 1) & ~on_plate, on_plate, of_point == 2)
 
 
-@dataclass(frozen=True, eq=False)
-class Slabs:
+class Slabs(NamedTuple):
     """Connected parts of horizontal slices: centre (m, 2) m, distance (m,) m, slice number (m,), length and width (m, 2)."""
 
     middle: Floats
@@ -207,11 +193,8 @@ def _is_wall_column(
         off = slabs.middle[thin] - foot
         along = np.abs(off @ foot) / distance
         across = np.abs(off[:, 0] * foot[1] - off[:, 1] * foot[0]) / distance
-        near = (
-            (along > COLUMN_DISTANCE[0])
-            & (along < COLUMN_DISTANCE[1])
-            & (across < COLUMN_OFFSET + COLUMN_OFFSET_SHARE * distance)
-        )
+        near = (along > COLUMN_DISTANCE[0]) & (along < COLUMN_DISTANCE[1])
+        near &= across < COLUMN_OFFSET + COLUMN_OFFSET_SHARE * distance
         level = slabs.slice[thin][near]
         line[k] = np.isin(slabs.slice[own], level).sum() >= WALL_SLICES
     return line

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import SemanticsConfig
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
-from calib_ros_semantics.models.masks import NMS_IOU, SPECK_PARTS, Mask, Masks, sample_logits, without_duplicates, without_specks
-from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel
-from calib_ros_semantics.models.sam_models import DEFAULT_SIDE, Normalisation, normalisation_of, to_rgb
+from calib_ros_semantics.models.masks import NMS_IOU, Mask, found_mask, sample_logits, without_duplicates
+from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel
+from calib_ros_semantics.models.sam_models import DEFAULT_SIDE, declared_family, to_rgb
 
 Floats = NDArray[np.float32]
 BORDER_GREY = 114.0  # grey level around the letterboxed image
@@ -27,10 +25,12 @@ MIN_OTHER_COLUMNS = 5  # beside the coefficients: box and confidence of one clas
 
 
 class FastSam:
-    """FastSAM as a Segmenter: detections (1, c, n) and prototypes (1, p, h, w). Raises ModelError for other tensors."""
+    """FastSAM: detections (1, c, n) and prototypes (1, p, h, w). Raises ModelError for other tensors."""
 
-    def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
-        self.model, self.config = model, config
+    needed = f"a confidence of {MIN_CONFIDENCE:g}"
+
+    def __init__(self, model: OnnxModel) -> None:
+        self.model, self.fallback = model, model.fallback
         shapes = [t.shape for t in model.inputs]
         detections, maps = ([t.name for t in model.outputs if len(t.shape) == rank] for rank in (3, 4))
         if len(shapes) != 1 or len(shapes[0]) != 4 or not detections or not maps:
@@ -41,16 +41,15 @@ class FastSam:
         if _says_nms(model.metadata):
             raise _nms_inside(model)
         self._outputs = [declared or detections[0], *maps]
-        self._normalised = normalisation_of(model, Normalisation(1 / 255))
+        self._normalised = Normalisation.of(model, Normalisation(1 / 255))
         self._size = model.sidecar.size or (shapes[0][2] or DEFAULT_SIDE, shapes[0][3] or DEFAULT_SIDE)
 
     def describe(self) -> str:
         """Input size and tensors, as text."""
         height, width = self._size
-        fed = self._normalised.text(self.model)
-        return f"FastSAM, {width}x{height} RGB, fed as {fed}, on {self.model.provider}; {self.model.tensors}"
+        return f"FastSAM, {width}x{height} RGB, fed as {self._normalised.text}, on {self.model.provider}; {self.model.tensors}"
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
+    def __call__(self, frame: Frame, deadline: Deadline) -> list[Mask]:
         """Masks of a frame's image. Raises ModelError, BudgetError."""
         size = frame.image.shape[0], frame.image.shape[1]
         tensor, factor, corner = self._letterboxed(frame.image)
@@ -67,19 +66,17 @@ class FastSam:
         for k in _suppress_boxes(boxes, score):
             deadline.check()
             sampled, place = sample_logits(np.tensordot(coefficients[k], prototypes, 1), to_prototypes, boxes[k], size)
-            mask = Mask.of(without_specks(sampled > 0, max(size) / SPECK_PARTS), place)
-            if mask is not None:
-                masks.append(replace(mask, score=min(float(score[k]), 1.0)))
-        return Masks(size, tuple(without_duplicates(masks, NMS_IOU)))
+            masks += found_mask(sampled > 0, size, place, float(score[k]))
+        return without_duplicates(masks, NMS_IOU)
 
     def _letterboxed(self, image: NDArray[np.uint8]) -> tuple[Floats, Floats, Floats]:
         """The input (1, 3, H, W), and the place of the image in it: scale (2,) and corner (2,), x and y."""
-        size, own = image.shape[:2], self.model.sidecar
+        size = image.shape[:2]
         factor = min(self._size[0] / size[0], self._size[1] / size[1])
-        height, width = max(round(size[0] * factor), 1), max(round(size[1] * factor), 1)
+        height, width = (max(round(n * factor), 1) for n in size)
         top, left = (self._size[0] - height) // 2, (self._size[1] - width) // 2
         picture = np.full((*self._size, 3), BORDER_GREY, np.float32)
-        picture[top : top + height, left : left + width] = to_rgb(image, (height, width), own.channels == "bgr")
+        picture[top : top + height, left : left + width] = to_rgb(image, (height, width), self.model.sidecar.channels == "bgr")
         scale = np.array([width / size[1], height / size[0]], np.float32)
         return self._normalised(picture).transpose(2, 0, 1)[None], scale, np.array([left, top], np.float32)
 
@@ -106,9 +103,8 @@ class FastSam:
 
 def is_fast_sam(model: OnnxModel, alone: bool) -> bool:
     """Whether a graph is FastSAM. alone: it is configured without a decoder."""
-    if model.sidecar.family:
-        return model.sidecar.family.lower().replace("_", "").replace("-", "") == "fastsam"
-    return alone and {3, 4} <= {len(t.shape) for t in model.outputs}
+    family = declared_family(model)
+    return family == "fastsam" if family else alone and {3, 4} <= {len(t.shape) for t in model.outputs}
 
 
 def _suppress_boxes(boxes: Floats, score: Floats) -> list[int]:

@@ -1,8 +1,7 @@
 """Classes of points by the shape of surfaces and clusters, for LiDARs without a network.
 
-Ground by height; poles, signs, vehicles, cyclists and people by size and shape; the rest is vegetation where it is rough, and a
-building where it is flat, upright and high. Shape does not separate a cyclist from ahead or behind from a person, a lorry from a
-building, and a slender trunk whose crown is not visible from a pole.
+Shape does not separate a cyclist from ahead or behind from a person, a lorry from a building, and a slender trunk whose crown is
+not visible from a pole.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from calib_ros.lidar.range_image import MIN_POINTS, reflectivity
 from calib_ros.lidar.segmentation import Plane, fit_ground
 from calib_ros_semantics.models.cluster_objects import find_objects
 from calib_ros_semantics.models.cluster_shapes import Surfaces, find_poles, find_signs, surface_shape
-from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel
 
 Floats = NDArray[np.float32]
 Classes = NDArray[np.uint8]
@@ -49,12 +48,10 @@ BELOW_FACTOR = 2.0  # it may lie so many times as far below: nothing is there bu
 PRIOR_WEIGHT = 1e-3  # of the current ground in the average, which fills cells without near ones
 
 
-class ClusterClasses:
-    """`cluster_classes` as a SegmentationModel."""
+class ClusterClasses(SegmentationModel):
+    """`cluster_classes` as a model."""
 
-    fallback = ""  # it has no provider
-
-    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Classes:
         """Classes (n,) of the points of a frame's cloud. Raises BudgetError if the time is up already."""
         deadline.check()
         return cluster_classes(frame.cloud)
@@ -101,11 +98,8 @@ def _classes_above_ground(xyz: Floats, light: Floats | None, cut: NDArray[np.boo
 
 
 def _cut_off(xyz: Floats) -> NDArray[np.bool_]:
-    """Mask (n,) of points at the upper edge of the field of view, whose objects may be taller. xyz: (n, 3) as measured.
-
-    The edge is given by the highest returns at the same distance and beyond: the lasers of many scanners are some decimetres
-    above or below the origin, which raises the edge at close range.
-    """
+    """Mask (n,) of points at the upper edge of the field of view, whose objects may be taller. xyz: (n, 3) as measured."""
+    # By the highest returns at the same distance and beyond: lasers above or below the origin raise the edge at close range.
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
     elevation = np.arctan2(xyz[:, 2], distance)
     shell = np.digitize(distance, EDGE_SHELLS)
@@ -125,18 +119,14 @@ def buildings_and_vegetation(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_
     cut: (n,) points at the upper edge of the field of view; their surfaces count as high.
     """
     labels = np.full(len(xyz), UNLABELLED, np.uint8)
-    if len(xyz) == 0:
-        return labels
     known = np.isfinite(shape.scatter)
     cell = np.floor(xyz[:, :2] / BACKDROP_CELL).astype(np.intp)
     cell -= cell.min(axis=0)
     columns, rows = cell.max(axis=0) + 1
     place = cell[:, 1] * columns + cell[:, 0]
     of_wall = known & (shape.scatter <= MAX_WALL_SCATTER)
-    total, flat = (
-        cv2.GaussianBlur(votes.astype(np.float32).reshape(rows, columns), (0, 0), VOTE_REACH / BACKDROP_CELL)
-        for votes in (np.bincount(place, counted, rows * columns) for counted in (known, of_wall))
-    )
+    votes = (np.bincount(place, counted, rows * columns).astype(np.float32) for counted in (known, of_wall))
+    total, flat = (cv2.GaussianBlur(v.reshape(rows, columns), (0, 0), VOTE_REACH / BACKDROP_CELL) for v in votes)
     top = np.zeros(rows * columns, np.float32)
     np.maximum.at(top, place, np.where(cut, np.float32(np.inf), xyz[:, 2]))
     top = cv2.dilate(top.reshape(rows, columns), np.ones((3, 3), np.uint8)).ravel()
@@ -149,14 +139,10 @@ def buildings_and_vegetation(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_
 def heights(xyz: Floats, seed: int = 0) -> Floats | None:
     """Points (n, 3) m in the LiDAR frame -> (n, 3): x and y horizontal, z the height above the local ground; None without ground.
 
-    The ground is the plane of algorithm 1, corrected by the lowest point of each cell: its residual is averaged over smaller and
-    smaller neighbourhoods, and cells too high to be ground are left out each time.
+    The ground is the plane of algorithm 1, corrected by the lowest points of cells, averaged over ever smaller neighbourhoods.
     """
-    if len(xyz) == 0:
-        return None
-    plane = fit_ground(
-        xyz[:: (len(xyz) // GROUND_SAMPLE) | 1], GROUND_THRESHOLD, GROUND_ITERATIONS, MAX_TILT_DEG, MIN_GROUND_SHARE, seed
-    )
+    few = xyz[:: (len(xyz) // GROUND_SAMPLE) | 1]
+    plane = fit_ground(few, GROUND_THRESHOLD, GROUND_ITERATIONS, MAX_TILT_DEG, MIN_GROUND_SHARE, seed)
     if plane is None:
         return None
     flat = np.asarray(xyz @ _levelling_rotation(plane).T.astype(np.float32), np.float32)

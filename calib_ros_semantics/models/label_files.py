@@ -1,4 +1,4 @@
-"""Classes read from files: label images, and .label files of scans."""
+"""Classes that are given: by label images, by .label files of scans, or by the source."""
 
 from __future__ import annotations
 
@@ -14,32 +14,44 @@ from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.messages.pictures import PNG, decode_picture
 from calib_ros_semantics.models.labels import CITYSCAPES_RAW, SEMANTIC_KITTI_RAW, Classes, Names, resized, table_of_folder
-from calib_ros_semantics.models.onnx_model import Deadline
 
 SAME_SHAPE = 0.01  # tolerance of the aspect ratio: labels are often made on reduced images
 PALETTE_TYPE, GREY_TYPE = 3, 0  # colour types of PNG
 BYTES_OF_LABEL = 4
 
 
-class LabelFolder:
-    """A folder with a file NAME + suffix per frame; its labels.yaml may declare the class names.
+class SourceClasses:
+    """Classes of "pixels" or "points" that the dataset provides."""
 
-    Raises ModelError without such files, or for a wrong labels.yaml.
-    """
+    def __init__(self, of: str) -> None:
+        self._of = of
+        self.text = f"classes of {of} of the source"
+
+    def __call__(self, frame: Frame) -> Classes:
+        """Classes of a frame; ModelError without them."""
+        option, found, instead = (
+            ("image_classes", frame.classes, "name a network or a folder of label pictures")
+            if self._of == "pixels"
+            else ("cloud_classes", frame.cloud.label, "use geometric, a network or a folder of .label files")
+        )
+        if found is None:
+            raise ModelError(f"{option} = source, but this source has no classes of {self._of}; {instead}")
+        return found
+
+
+class LabelFolder:
+    """A folder with a file NAME + suffix per frame; its labels.yaml may declare the class names. ModelError if unusable."""
 
     def __init__(self, folder: str | Path, suffix: str, default: Names, kind: str) -> None:
         self.folder, self._suffix, self._kind = Path(folder), suffix, kind
         try:
-            self.count = sum(1 for path in self.folder.iterdir() if path.suffix == suffix)
+            count = sum(1 for path in self.folder.iterdir() if path.suffix == suffix)
         except OSError as error:
             raise ModelError(f"folder {folder} cannot be read ({error.strerror}); check its permissions") from None
-        if not self.count:
+        if not count:
             raise ModelError(f"folder {folder} holds no {kind} *{suffix}, one for each frame; correct the path")
         self._table = table_of_folder(self.folder, default)
-
-    def describe(self) -> str:
-        """Number and kind of the files, as text."""
-        return f"folder of {self.count} {self._kind} *{self._suffix}"
+        self.text = f"folder of {count} {kind} *{suffix}"
 
     def _read(self, name: str) -> tuple[Path, NDArray[np.uint8]]:
         path = self.folder / f"{name}{self._suffix}"
@@ -63,7 +75,7 @@ class LabelPictures(LabelFolder):
     def __init__(self, folder: str | Path) -> None:
         super().__init__(folder, ".png", CITYSCAPES_RAW, "label pictures")
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+    def __call__(self, frame: Frame) -> Classes:
         """Classes (H, W) at the size of the image. Raises ModelError without a label image that fits the frame."""
         path, data = self._read(frame.name)
         numbers = _numbers(data)
@@ -84,7 +96,7 @@ class LabelScans(LabelFolder):
     def __init__(self, folder: str | Path) -> None:
         super().__init__(folder, ".label", SEMANTIC_KITTI_RAW, "label files")
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+    def __call__(self, frame: Frame) -> Classes:
         """Classes (n,) of the points of the frame's cloud. Raises ModelError without a file that fits the frame."""
         path, data = self._read(frame.name)
         if len(data) != BYTES_OF_LABEL * len(frame.cloud):
@@ -96,10 +108,8 @@ class LabelScans(LabelFolder):
 
 
 def _numbers(data: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """The numbers stored in a PNG of grey levels or with a palette, the pixels of others; None if it is not complete.
-
-    OpenCV returns the colours of a palette, and stretches grey levels of fewer than 8 bits to 0..255.
-    """
+    """The numbers stored in a PNG of grey levels or with a palette, the pixels of others; None if it is not complete."""
+    # OpenCV returns the colours of a palette, and stretches grey levels of fewer than 8 bits to 0..255.
     file = data.tobytes()
     if file[:8] != PNG or len(file) < 33 or file[25] not in (PALETTE_TYPE, GREY_TYPE):
         return decode_picture(data)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from calib_ros import io
 from calib_ros.errors import ModelError
 from calib_ros.frame import UNLABELLED, SemanticClass
-from calib_ros_semantics.models.onnx_model import OnnxModel, Sidecar
+from calib_ros_semantics.models.onnx_model import OnnxModel
+from calib_ros_semantics.models.sidecar import MAX_NUMBERS, Sidecar
 
 C = SemanticClass
 Classes = NDArray[np.uint8]
@@ -124,7 +125,6 @@ DATASETS: dict[str, Names] = {
     "squeezeseg": SQUEEZESEG,
 }
 METADATA_KEYS = ("names", "labels", "classes", "class_names", "id2label", "CLASSES")  # under which exporters write class names
-MAX_NUMBERS = 65536  # of a lookup table
 IGNORED = (-1, 255)  # numbers of pixels without a class
 
 
@@ -152,11 +152,7 @@ class LabelTable:
 
 
 class GuessedTable(LabelTable):
-    """The table of the first of several datasets that has all numbers met so far.
-
-    Numbers accumulate over frames: a dataset that was ruled out does not return with a frame that happens to fit, and after a
-    number that no dataset has, which means that all frames were misread, every later call is an error too.
-    """
+    """The table of the first of several datasets that has all numbers met so far, in whatever frame."""
 
     def __init__(self, datasets: Mapping[str, Names]) -> None:
         self._datasets = dict(datasets)
@@ -166,7 +162,7 @@ class GuessedTable(LabelTable):
     def classes(self, numbers: NDArray[Any]) -> Classes:
         """As LabelTable.classes; ModelError if no dataset has all numbers met so far."""
         self._seen = np.union1d(self._seen, np.setdiff1d(numbers, IGNORED))
-        fitting = (name for name, names in self._datasets.items() if np.isin(self._seen, _numbers_of(names)).all())
+        fitting = (name for name, names in self._datasets.items() if np.isin(self._seen, list(_by_number(names))).all())
         name = next(fitting, None)
         if name is None:
             raise ModelError(
@@ -183,15 +179,15 @@ class GuessedTable(LabelTable):
 
 
 def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names], by_number: Mapping[str, Names]) -> LabelTable:
-    """The class table of a network: of its YAML, else of its metadata, else of a known dataset.
+    """The class table of a network: of its YAML, else of its metadata, else of a known dataset. ModelError if there is none.
 
     count: scores per pixel; None = the network gives class numbers. by_count: names for known counts. by_number: candidates for
-    class numbers, by dataset. ModelError if the classes remain unknown.
+    class numbers, by dataset.
     """
-    yaml = model.path.with_suffix(".yaml")
+    yaml = model.yaml
     names = declared_names(model.sidecar, yaml)
     if names is not None:
-        if count is not None and not _fits(names, count):
+        if count is not None and (max(names) >= count if isinstance(names, Mapping) else len(names) != count):
             raise model.error(f"{yaml.name} names {len(names)} classes by 'labels:', but the network gives scores of {count}")
         return _table(yaml, names)
     own = _metadata_names(model.metadata)
@@ -200,11 +196,8 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
     if count is None:
         return GuessedTable(by_number)
     if count not in by_count:
-        known = ", ".join(map(str, sorted(by_count)))
-        raise model.error(
-            f"it gives scores of {count} classes, which are of no known dataset (these have {known}); name them by 'labels:' in "
-            f"{yaml}"
-        )
+        none = f"which are of no known dataset (these have {', '.join(map(str, sorted(by_count)))})"
+        raise model.error(f"it gives scores of {count} classes, {none}; name them by 'labels:' in {yaml}")
     return LabelTable(by_count[count])
 
 
@@ -240,10 +233,14 @@ def class_of(name: str) -> int:
 
 def lookup(names: Names) -> Classes:
     """Table (65536,) uint8 from class number to SemanticClass; UNLABELLED for numbers without a name."""
-    table = np.full(65536, UNLABELLED, np.uint8)
-    for number, name in names.items() if isinstance(names, Mapping) else enumerate(names):
+    table = np.full(MAX_NUMBERS, UNLABELLED, np.uint8)
+    for number, name in _by_number(names).items():
         table[number] = class_of(name)
     return table
+
+
+def _by_number(names: Names) -> Mapping[int, str]:
+    return names if isinstance(names, Mapping) else dict(enumerate(names))
 
 
 def resized(classes: Classes, size: tuple[int, int]) -> Classes:
@@ -260,14 +257,6 @@ def _table(path: Path, names: Names) -> LabelTable:
         raise ModelError(f"{path}: {error}") from None
 
 
-def _fits(names: Names, count: int) -> bool:
-    return max(names, default=0) < count if isinstance(names, Mapping) else len(names) == count
-
-
-def _numbers_of(names: Names) -> list[int]:
-    return list(names) if isinstance(names, Mapping) else list(range(len(names)))
-
-
 def _metadata_names(metadata: Mapping[str, str]) -> dict[int, str] | None:
     """Names by number in the metadata, as a list or mapping in the syntax of Python or JSON; None if there are none."""
     for key in METADATA_KEYS:
@@ -277,7 +266,7 @@ def _metadata_names(metadata: Mapping[str, str]) -> dict[int, str] | None:
             names = {int(number): _plain(str(name)) for number, name in pairs}
         except (yaml.YAMLError, ValueError, TypeError, RecursionError):  # anything else is no list of classes
             continue
-        if names and min(names) >= 0 and max(names) < 65536:
+        if names and min(names) >= 0 and max(names) < MAX_NUMBERS:
             return names
     return None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.messages.pictures import decode_picture
+from calib_ros_semantics.models.class_borders import clear_border
 from calib_ros_semantics.models.onnx_model import Deadline
 
 Pixels = NDArray[np.bool_]
 Floats = NDArray[np.float32]
+Size = tuple[int, int]
 # As the authors of Segment Anything set them: predicted IoU, stability, and IoU of boxes above which only the best mask is kept.
 MIN_IOU, MIN_STABILITY, NMS_IOU = 0.88, 0.95, 0.7
 STABILITY_SHIFT = 1.0  # of the threshold of logits
@@ -29,24 +31,21 @@ BLUR = 1.0  # px; of a mask before its gradient is taken. A stronger blur loses 
 # the shares of the two directions are off by 0.3, with 2 px by 0.2, with 3 px by 0.08.
 DIRECTION_BLUR = 3.0
 BLUR_MARGIN = 5  # px; reach of a blurred boundary
-IMAGE_BORDER = 4  # px; masks that end this near to the border of the image mostly continue beyond it
 FULL_STEP = 0.31  # gradient beside a straight boundary between two pixels after BLUR
 RIDGE_TOLERANCE = np.float32(0.95)  # the two pixels beside a boundary are one ridge, however their gradients are rounded
 
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """The pixels of an object, stored within its box: a hundred masks of a large image would not fit in memory otherwise.
+    """The pixels of an object within its box: a hundred masks of a large image would not fit in memory otherwise.
 
-    left, top: first pixel of the box. inside: (h, w) bool, not empty. score: 0..1, quality predicted by the model. stability:
-    0..1, IoU of the masks at a higher and a lower threshold; 1 if unknown.
+    left, top: first pixel of the box. inside: (h, w) bool, not empty. score: 0..1, quality predicted by the model.
     """
 
     left: int
     top: int
     inside: Pixels
     score: float = 1.0
-    stability: float = 1.0
 
     @staticmethod
     def of(picture: Pixels, corner: tuple[int, int] = (0, 0)) -> Mask | None:
@@ -61,8 +60,7 @@ class Mask:
     @property
     def box(self) -> tuple[int, int, int, int]:
         """Left, top, right, bottom; the last two are exclusive."""
-        height, width = self.inside.shape
-        return self.left, self.top, self.left + width, self.top + height
+        return self.left, self.top, self.left + self.inside.shape[1], self.top + self.inside.shape[0]
 
     @cached_property
     def area(self) -> int:
@@ -75,47 +73,16 @@ class Mask:
         height, width = self.inside.shape
         return 0 <= x < width and 0 <= y < height and bool(self.inside[y, x])
 
-    def common(self, other: Mask) -> int:
-        """Number of pixels in both."""
+    def iou(self, other: Mask) -> float:
+        """Pixels in both as a share of those in any."""
         left, top, right, bottom = self.box
         left2, top2, right2, bottom2 = other.box
         x, y, x2, y2 = max(left, left2), max(top, top2), min(right, right2), min(bottom, bottom2)
         if x >= x2 or y >= y2:
-            return 0
+            return 0.0
         own = self.inside[y - top : y2 - top, x - left : x2 - left]
-        return int(np.count_nonzero(own & other.inside[y - top2 : y2 - top2, x - left2 : x2 - left2]))
-
-
-@dataclass(frozen=True, eq=False)
-class Masks:
-    """Masks of an image of `size` (height, width). They may overlap, nest, and leave pixels uncovered."""
-
-    size: tuple[int, int]
-    masks: tuple[Mask, ...]
-
-    @staticmethod
-    def of(size: tuple[int, int], masks: Iterable[Mask | None]) -> Masks:
-        """Without masks that are None."""
-        return Masks(size, tuple(mask for mask in masks if mask is not None))
-
-    def __len__(self) -> int:
-        return len(self.masks)
-
-    @property
-    def score(self) -> NDArray[np.float32]:
-        """Scores (k,) of the masks."""
-        return np.array([mask.score for mask in self.masks], np.float32)
-
-    def picture(self, number: int) -> Pixels:
-        """A mask at the size of the image, (H, W) bool."""
-        mask, out = self.masks[number], np.zeros(self.size, bool)
-        left, top, right, bottom = mask.box
-        out[top:bottom, left:right] = mask.inside
-        return out
-
-
-# A source of masks at the size of a frame's image. Raises ModelError, and BudgetError when the time is up.
-Segmenter = Callable[[Frame, Deadline], Masks]
+        common = int(np.count_nonzero(own & other.inside[y - top2 : y2 - top2, x - left2 : x2 - left2]))
+        return common / (self.area + other.area - common)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,21 +95,18 @@ class Proposals:
 
     logits: Floats
     score: Floats
-    size: tuple[int, int]
+    size: Size
     content: tuple[float, float]
     soft: bool = True
 
 
-def accepted_masks(proposals: Proposals, min_score: float = MIN_IOU, min_stability: float = MIN_STABILITY) -> list[Mask]:
-    """Masks of sufficient score and stability, at the size of the image, without specks.
-
-    Stability (Kirillov et al. 2023, appendix B): IoU of the masks at thresholds STABILITY_SHIFT higher and lower.
-    """
+def accepted_masks(proposals: Proposals) -> list[Mask]:
+    """Masks of sufficient score and stability (Kirillov et al. 2023, appendix B), at the size of the image, without specks."""
     rows, columns = (math.ceil(n - 1e-6) for n in proposals.content)
     size, out = proposals.size, []
     fy, fx = (inner / whole for inner, whole in zip(proposals.content, size, strict=True))
     to_logits = np.array([[fx, 0, 0.5 * fx - 0.5], [0, fy, 0.5 * fy - 0.5]])
-    for k in np.flatnonzero(proposals.score >= min_score):
+    for k in np.flatnonzero(proposals.score >= MIN_IOU):
         logits = proposals.logits[k]
         candidate = logits[:rows, :columns] > (-STABILITY_SHIFT if proposals.soft else 0)
         if not candidate.any():
@@ -151,17 +115,22 @@ def accepted_masks(proposals: Proposals, min_score: float = MIN_IOU, min_stabili
         # Between pixels of the logits a mask reaches at most to the next pixel.
         box = (across[0] - 0.5) / fx, (down[0] - 0.5) / fy, (across[-1] + 1.5) / fx, (down[-1] + 1.5) / fy
         sampled, corner = sample_logits(logits, to_logits, box, size)
-        stability = 1.0
         if proposals.soft:
-            stability = np.count_nonzero(sampled > STABILITY_SHIFT) / max(int(np.count_nonzero(sampled > -STABILITY_SHIFT)), 1)
-        mask = Mask.of(without_specks(sampled > 0, max(size) / SPECK_PARTS), corner) if stability >= min_stability else None
-        if mask is not None:
-            out.append(replace(mask, score=min(float(proposals.score[k]), 1.0), stability=float(stability)))
+            larger = max(int(np.count_nonzero(sampled > -STABILITY_SHIFT)), 1)
+            if np.count_nonzero(sampled > STABILITY_SHIFT) / larger < MIN_STABILITY:
+                continue
+        out += found_mask(sampled > 0, size, corner, float(proposals.score[k]))
     return out
 
 
+def found_mask(inside: Pixels, size: Size, corner: tuple[int, int], score: float = 1.0) -> list[Mask]:
+    """The mask of pixels (h, w) from a corner of an image (H, W) on, without specks; none if nothing is left."""
+    mask = Mask.of(without_specks(inside, max(size) / SPECK_PARTS), corner)
+    return [] if mask is None else [replace(mask, score=min(score, 1.0))]
+
+
 def sample_logits(
-    logits: Floats, to_logits: NDArray[np.float64], box: Sequence[float], size: tuple[int, int]
+    logits: Floats, to_logits: NDArray[np.float64], box: Sequence[float], size: Size
 ) -> tuple[Floats, tuple[int, int]]:
     """Logits (h, w) sampled bilinearly at the pixels of an image (H, W) within a box, and column and row of the first pixel.
 
@@ -208,54 +177,40 @@ def without_duplicates(masks: Sequence[Mask], max_iou: float) -> list[Mask]:
         least = np.where(of_boxes > max_iou, min(MIN_SHARED, max_iou), max_iou)  # IoU of duplicates
         smaller, larger = np.minimum(areas[kept], areas[k]), np.maximum(areas[kept], areas[k])
         possible = np.minimum(smaller, shared) > least * larger
-        if not any(_iou(mask, ordered[kept[n]]) > least[n] for n in np.flatnonzero(possible)):
+        if not any(mask.iou(ordered[kept[n]]) > least[n] for n in np.flatnonzero(possible)):
             kept.append(k)
     return [ordered[k] for k in kept]
 
 
-def _iou(one: Mask, other: Mask) -> float:
-    common = one.common(other)
-    return common / (one.area + other.area - common)
-
-
-# Masks that were made beforehand: a folder of pictures for each frame.
 class MaskFolder:
-    """Masks made beforehand: `folder/NAME/*.png` of frame NAME, grey at the size of its image, bright inside. A Segmenter.
+    """Masks made beforehand: `folder/NAME/*.png` of frame NAME, grey at the size of its image, bright inside."""
 
-    Raises ModelError without the folder.
-    """
+    fallback, needed = "", "a file in the folder"
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        if not self.folder.is_dir():
-            raise ModelError(f"masks {folder}: there is no such folder; correct semantics.segment_anything")
 
     def describe(self) -> str:
         """Where the masks are read from, as text."""
         return f"ready masks {self.folder}/NAME/*.png"
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
-        """Masks of a frame in the order of the file names, without specks and without dark pictures.
-
-        Raises ModelError, naming the folder that is missing or the picture that is unreadable or of another size, BudgetError.
-        """
+    def __call__(self, frame: Frame, deadline: Deadline) -> list[Mask]:
+        """Masks of a frame in the order of the file names, without specks and dark pictures. Raises ModelError, BudgetError."""
         if not frame.name:
             raise ModelError(f"masks {self.folder}: this frame has no name to find its folder by; use a model instead")
         own = self.folder / frame.name
         paths = sorted(own.glob("*.png"))
         if not paths:
-            raise ModelError(
-                f"masks: there is no {own}/*.png; a frame's folder has its name, as "
-                "calib-ros replay prints it (the number of a KITTI frame, 000042)"
-            )
+            found_by = "as calib-ros replay prints it (the number of a KITTI frame, 000042)"
+            raise ModelError(f"masks: there is no {own}/*.png; a frame's folder has its name, {found_by}")
         masks = []
         for path in paths:
             deadline.check()
-            masks.append(_read(path, frame.image.shape[:2]))
-        return Masks.of(frame.image.shape[:2], masks)
+            masks += _read(path, (frame.image.shape[0], frame.image.shape[1]))
+        return masks
 
 
-def _read(path: Path, size: tuple[int, ...]) -> Mask | None:
+def _read(path: Path, size: Size) -> list[Mask]:
     try:
         picture = decode_picture(np.fromfile(path, np.uint8))
     except OSError as error:
@@ -265,26 +220,24 @@ def _read(path: Path, size: tuple[int, ...]) -> Mask | None:
     if picture.ndim == 3:
         picture = picture[:, :, :3].max(axis=2)
     if picture.shape != size:
-        raise ModelError(
-            f"mask {path} is {picture.shape[1]}x{picture.shape[0]}, but the image is {size[1]}x{size[0]}; "
-            "make the masks of the image as recorded"
-        )
+        sizes = f"{picture.shape[1]}x{picture.shape[0]}, but the image is {size[1]}x{size[0]}"
+        raise ModelError(f"mask {path} is {sizes}; make the masks of the image as recorded")
     mask = Mask.of(picture > picture.max() // 2)  # masks may be of 0 and 1 or of 0 and 255
-    return None if mask is None else Mask.of(without_specks(mask.inside, max(size) / SPECK_PARTS), (mask.left, mask.top))
+    return [] if mask is None else found_mask(mask.inside, size, (mask.left, mask.top))
 
 
-def mask_edges(masks: Masks) -> Floats:
+def mask_edges(masks: Sequence[Mask], size: Size) -> Floats:
     """Boundaries of masks (2, H, W) float32 in 0..1: [0] horizontal gradients (vertical lines), [1] vertical ones.
 
-    Their sum is the strength: the score of the mask, at most 1 where several masks meet. A boundary common to several masks is as
-    thin as that of one, though they disagree by a pixel or two: the gradients are summed before ridges are extracted. The
-    strength is split into E cos^2 and E sin^2 of the direction of the normal, averaged over the neighbourhood by the structure
-    tensor (Bigun and Granlund 1987). The end of a mask at the border of the image is not an edge.
+    size: (H, W) of the image. Masks may overlap, nest, and leave pixels uncovered.
+
+    Their sum is the strength: the score of the mask, at most 1 where several masks meet; gradients are summed before ridges are
+    extracted, so that a common boundary is thin. It is split into E cos^2 and E sin^2 of the direction of the normal, averaged by
+    the structure tensor (Bigun and Granlund 1987). The end of a mask at the border of the image is not an edge.
     """
-    height, width = masks.size
-    total, xx, yy, xy = (np.zeros((height, width), np.float32) for _ in range(4))
-    for mask in masks.masks:
-        place, gx, gy = _gradients(mask, masks.size)
+    total, xx, yy, xy = (np.zeros(size, np.float32) for _ in range(4))
+    for mask in masks:
+        place, gx, gy = _gradients(mask, size)
         gx, gy = gx * np.float32(mask.score), gy * np.float32(mask.score)
         squares = gx * gx, gy * gy
         total[place] += np.sqrt(squares[0] + squares[1])
@@ -295,21 +248,16 @@ def mask_edges(masks: Masks) -> Floats:
     difference = xx - yy
     cosine = difference / (np.sqrt(difference * difference + 4 * xy * xy) + np.float32(1e-12))  # of twice the normal's angle
     strength = np.where(_is_ridge(total, cosine, xy), np.minimum(total / np.float32(FULL_STEP), 1), np.float32(0))
-    for border in (strength[:IMAGE_BORDER], strength[-IMAGE_BORDER:], strength[:, :IMAGE_BORDER], strength[:, -IMAGE_BORDER:]):
-        border[:] = 0
+    clear_border(strength)
     horizontal = strength * (1 + cosine) / 2
     return np.stack([horizontal, strength - horizontal]).astype(np.float32, copy=False)
 
 
-def _gradients(mask: Mask, size: tuple[int, int]) -> tuple[tuple[slice, slice], Floats, Floats]:
+def _gradients(mask: Mask, size: Size) -> tuple[tuple[slice, slice], Floats, Floats]:
     """Rows and columns around a mask, and the gradients of the blurred mask there."""
     left, top, right, bottom = mask.box
-    x, y, x2, y2 = (
-        max(left - BLUR_MARGIN, 0),
-        max(top - BLUR_MARGIN, 0),
-        min(right + BLUR_MARGIN, size[1]),
-        min(bottom + BLUR_MARGIN, size[0]),
-    )
+    x, y = max(left - BLUR_MARGIN, 0), max(top - BLUR_MARGIN, 0)
+    x2, y2 = min(right + BLUR_MARGIN, size[1]), min(bottom + BLUR_MARGIN, size[0])
     soft = np.zeros((y2 - y, x2 - x), np.float32)
     soft[top - y : bottom - y, left - x : right - x] = mask.inside
     # A mask that touches the border of the image continues beyond it.

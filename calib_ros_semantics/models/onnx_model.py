@@ -1,27 +1,23 @@
-"""An ONNX file as a function of arrays: loading it, its inputs and outputs, running it within a time limit.
-
-The meaning of the tensors is up to the modules that use it: segment_anything, image_classes and cloud_classes.
-"""
+"""An ONNX file as a function of arrays: loading it, its inputs and outputs, running it within a time limit."""
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from calib_ros import io
 from calib_ros.config import SemanticsConfig
-from calib_ros.errors import BadInputError, BudgetError, MissingDependencyError, ModelError
+from calib_ros.errors import BudgetError, MissingDependencyError, ModelError
+from calib_ros.frame import Frame
+from calib_ros_semantics.models.sidecar import Sidecar
 
 Array = NDArray[Any]
 GREY_LEVELS = 2.0  # mean or std above this refer to 0..255, not to 0..1
@@ -31,34 +27,30 @@ PROVIDERS = {
     "cuda": ["CUDAExecutionProvider", "CPUExecutionProvider"],
     "tensorrt": ["TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"],
 }
-TYPES = {
-    "tensor(float)": np.float32,
-    "tensor(float16)": np.float16,
-    "tensor(double)": np.float64,
-    "tensor(uint8)": np.uint8,
-    "tensor(int8)": np.int8,
-    "tensor(uint16)": np.uint16,
-    "tensor(int16)": np.int16,
-    "tensor(int32)": np.int32,
-    "tensor(int64)": np.int64,
-    "tensor(bool)": np.bool_,
+TYPES: dict[str, type[np.generic]] = {
+    **{"float": np.float32, "float16": np.float16, "double": np.float64, "bool": np.bool_},
+    **{t.__name__: t for t in (np.uint8, np.int8, np.uint16, np.int16, np.int32, np.int64)},
 }
 # Messages of new and of older versions of onnxruntime.
 MISSING_DATA = re.compile(r"(?:External data path does not exist: |No such file or directory )[\[\"]+([^\"\]]+)")
 OPSET = re.compile(r"\bopset\b|\bIR version\b", re.IGNORECASE)
-SIZES = (8, 8192)  # px; smallest and largest side of an input
-EXPECTED = {
-    "family": "a name",
-    "mean": "a list of numbers",
-    "std": "a list of numbers above 0",
-    "scale": "a number above 0",
-    "channels": "rgb, bgr or a list of names",
-    "size": f"[height, width], each {SIZES[0]} to {SIZES[1]} px",
-    "labels": "a list of class names, a mapping from numbers to names, or the name of a dataset",
-    "fov_deg": "[highest, lowest]",
-    "azimuth_deg": "an angle above 0, up to 360",
-    "output": "a name",
-}  # values of the entries of a Sidecar, for its errors
+
+
+class SegmentationModel:
+    """A loaded model, of whatever kind: what there is to say of it."""
+
+    fallback = ""  # why it does not run on the configured provider
+    note = ""  # how the last scan differs from those that it was made for
+    needed = ""  # what a mask needs to count
+    known: frozenset[int] | None = None  # SemanticClasses that a network tells apart, once it has run
+
+    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Any:
+        """Its part of FrameSemantics; of pixels PixelClasses, with borders if requested. Raises ModelError, BudgetError."""
+        raise NotImplementedError
+
+    def describe(self) -> str:
+        """Kind, inputs and outputs, as text."""
+        raise NotImplementedError
 
 
 class OnnxModel:
@@ -69,6 +61,11 @@ class OnnxModel:
         self._session, self.fallback = _session(self.path, config)
         self.inputs = [_tensor(self.path, t) for t in self._session.get_inputs()]
         self.outputs = [_tensor(self.path, t) for t in self._session.get_outputs()]
+
+    @property
+    def yaml(self) -> Path:
+        """Where its description is, or would be."""
+        return self.path.with_suffix(".yaml")
 
     @property
     def provider(self) -> str:
@@ -86,13 +83,8 @@ class OnnxModel:
         inputs, outputs = (", ".join(map(str, tensors)) for tensors in (self.inputs, self.outputs))
         return f"inputs: {inputs}; outputs: {outputs}"
 
-    def run(
-        self, feeds: Mapping[str, Array], deadline: Deadline | None = None, outputs: Sequence[str] | None = None
-    ) -> list[Array]:
-        """Outputs, or those named in `outputs`, for input arrays by name, which are converted to the types of the inputs.
-
-        Raises BudgetError when the time is up, ModelError when the network fails.
-        """
+    def run(self, feeds: Mapping[str, Array], deadline: Deadline, outputs: Sequence[str] | None = None) -> list[Array]:
+        """Outputs, or those named in `outputs`, for input arrays by name, which are converted. Raises BudgetError, ModelError."""
         types = {t.name: t.dtype for t in self.inputs}
         given = {name: np.ascontiguousarray(value, types[name]) for name, value in feeds.items()}
         names = list(outputs) if outputs is not None else [t.name for t in self.outputs]
@@ -102,17 +94,22 @@ class OnnxModel:
         options.log_severity_level = 4  # errors are raised instead
         options.only_execute_path_to_fetches = True  # skips a decoder's large masks where its small ones are used
         try:
-            if deadline is None:
-                return [np.asarray(out) for out in self._session.run(names, given, options)]
             deadline.check()
             with deadline.enforced(options):
                 return [np.asarray(out) for out in self._session.run(names, given, options)]
         except BudgetError:
             raise
         except Exception as error:  # onnxruntime's exceptions have no common base below Exception
-            if deadline is not None and deadline.over:
-                deadline.check()
+            deadline.check()
             raise ModelError(f"{self.path} failed: {error_text(error)}; it has {self.tensors}") from None
+
+    def size_of(self, tensor: Tensor, axis: int) -> tuple[int | None, int | None]:
+        """Height and width of an input by graph and YAML, None = unknown. axis: of the channels. ModelError if the two differ."""
+        own = [n for k, n in enumerate(tensor.shape) if k != axis][-2:] or [None, None]
+        given = self.sidecar.size or (None, None)
+        if any(None not in (n, m) and n != m for n, m in zip(own, given, strict=True)):
+            raise self.error(f"it does not run at the height and width {list(given)} that 'size:' says")
+        return own[0] or given[0], own[1] or given[1]
 
     def error(self, problem: str) -> ModelError:
         """A ModelError with the file, the problem and the tensors found."""
@@ -133,38 +130,45 @@ class Tensor:
 
 
 @dataclass(frozen=True)
-class Sidecar:
-    """The YAML beside a model: what its tensors do not say. Empty or None entries are inferred.
+class Normalisation:
+    """(pixels * scale - mean) / std of grey levels 0..255. mean, std: one number, or one per channel. declared: by a YAML."""
 
-    Attributes
-    ----------
-    family : overrides the family inferred from the tensors. output : name of the output to use.
-    scale : factor on grey levels 0..255, such as 1/255. mean, std : per channel, after scale.
-    channels : rgb or bgr; of range images the channel names in order.
-    size : (height, width) to run at.
-    labels : class names by number, or the name of a dataset.
-    fov_deg : highest and lowest elevation of a range image. azimuth_deg : angle its columns cover, straight ahead in the middle.
-    """
-
-    family: str = ""
-    mean: tuple[float, ...] = ()
-    std: tuple[float, ...] = ()
-    scale: float | None = None
-    channels: str | tuple[str, ...] = ""
-    size: tuple[int, int] | None = None
-    labels: str | tuple[str, ...] | dict[int, str] = ""
-    fov_deg: tuple[float, float] | None = None
-    azimuth_deg: float = 360.0
-    output: str = ""
+    scale: float
+    mean: tuple[float, ...] = (0.0,)
+    std: tuple[float, ...] = (1.0,)
+    declared: bool = False
 
     @staticmethod
-    def beside(path: str | Path) -> Sidecar:
-        """The YAML of a model's file; empty if there is none. ModelError names a wrong entry."""
-        for suffix in (".yaml", ".yml"):
-            own = Path(path).with_suffix(suffix)
-            if own.is_file():
-                return _read(own)
-        return Sidecar()
+    def of(model: OnnxModel, usual: Normalisation, channels: int = 3) -> Normalisation:
+        """The normalisation of the YAML beside a model, else the usual one of RGB. ModelError if its numbers do not fit."""
+        own = model.sidecar
+        if not isinstance(own.channels, str):
+            raise model.error("'channels:' of the YAML beside it must be rgb or bgr")
+        for name, values in (("mean", own.mean), ("std", own.std)):
+            if len(values) not in (0, 1, channels):
+                raise model.error(f"'{name}:' of the YAML beside it must have 1 or {channels} numbers")
+        mean, std, scale = own.mean or (0.0,), own.std or (1.0,), own.scale
+        if scale is None:
+            if not own.mean and not own.std:
+                return replace(usual, mean=usual.mean[::-1], std=usual.std[::-1]) if own.channels == "bgr" else usual
+            scale = 1.0 if max(map(abs, mean + std)) > GREY_LEVELS else 1 / 255
+        return Normalisation(scale, mean, std, declared=True)
+
+    def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Normalised pixels (h, w, channels)."""
+        mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
+        result: NDArray[Any] = (pixels * np.float32(self.scale) - mean) / std
+        return result
+
+    @property
+    def text(self) -> str:
+        """How grey levels become the input, and whether somebody said so."""
+        means, stds = ([f"{v:.4g}" for v in values] for values in (self.mean, self.std))
+        times = "v" if self.scale == 1 else "v / 255" if abs(self.scale * 255 - 1) < 1e-3 else f"v * {self.scale:.4g}"
+        shifted = times if set(means) == {"0"} else f"({times} - [{', '.join(means)}])"
+        whole = shifted if set(stds) == {"1"} else f"{shifted} / [{', '.join(stds)}]"
+        source = "as its YAML says" if self.declared else "assumed; its YAML may say otherwise"
+        return f"{whole} of grey levels v in 0..255 ({source})"
 
 
 class Deadline:
@@ -204,15 +208,6 @@ class Deadline:
         finally:
             done.set()
             watcher.join()
-
-
-def formula(scale: float, mean: Iterable[float], std: Iterable[float], declared: bool) -> str:
-    """How grey levels 0..255 become the input of a network, and whether somebody said so, as text."""
-    means, stds = ([f"{v:.4g}" for v in values] for values in (mean, std))
-    times = "v" if scale == 1 else "v / 255" if abs(scale * 255 - 1) < 1e-3 else f"v * {scale:.4g}"
-    shifted = times if set(means) == {"0"} else f"({times} - [{', '.join(means)}])"
-    whole = shifted if set(stds) == {"1"} else f"{shifted} / [{', '.join(stds)}]"
-    return f"{whole} of grey levels v in 0..255 ({'as its YAML says' if declared else 'assumed; its YAML may say otherwise'})"
 
 
 def error_text(error: BaseException) -> str:
@@ -278,59 +273,8 @@ def _provider_name(providers: Sequence[str]) -> str:
 
 
 def _tensor(path: Path, node: Any) -> Tensor:
-    if node.type not in TYPES:
+    kind = node.type.removeprefix("tensor(").removesuffix(")")
+    if kind not in TYPES:
         raise ModelError(f"model {path}: tensor {node.name} is of type {node.type}, which no known convention has")
     sizes = tuple(n if isinstance(n, int) and n > 0 else None for n in node.shape or ())
-    return Tensor(node.name, sizes, TYPES[node.type])
-
-
-def _read(path: Path) -> Sidecar:
-    names = [f.name for f in dataclasses.fields(Sidecar)]
-    try:
-        data = io.load(io.read_text(path, "description of a model", "a small YAML"))
-    except BadInputError as error:
-        raise ModelError(str(error)) from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ModelError(f"{path} is not valid YAML{io.what_is_wrong(error)}; it may hold {', '.join(names)}") from None
-    if data is None:
-        return Sidecar()
-    if not isinstance(data, dict):
-        raise ModelError(f"{path} must hold names and values; known are {', '.join(names)}")
-    for name in data:
-        if name not in names:
-            raise ModelError(f"{path}: unknown entry '{name}'; known are {', '.join(names)}")
-    return Sidecar(**{name: _validated(path, name, value) for name, value in data.items() if value is not None})
-
-
-def _validated(path: Path, name: str, value: Any) -> Any:
-    fits = False
-    if name in ("family", "output"):
-        fits = isinstance(value, str)
-    elif name == "scale":
-        fits = _is_number(value) and value > 0
-    elif name == "azimuth_deg":
-        fits = _is_number(value) and 0 < value <= 360
-    elif name in ("mean", "std", "size", "fov_deg"):
-        fits = isinstance(value, list) and len(value) > 0 and all(_is_number(v) for v in value)
-        fits = fits and (name != "std" or min(value) > 0)
-        fits = fits and (
-            name != "size" or (len(value) == 2 and all(isinstance(v, int) and SIZES[0] <= v <= SIZES[1] for v in value))
-        )
-        fits = fits and (name != "fov_deg" or (len(value) == 2 and -90 <= value[1] < value[0] <= 90))
-    elif name == "channels":
-        fits = value in ("rgb", "bgr") or (isinstance(value, list) and all(isinstance(v, str) for v in value))
-    elif isinstance(value, dict):
-        fits = all(
-            isinstance(k, int) and not isinstance(k, bool) and 0 <= k < 65536 and isinstance(v, str) for k, v in value.items()
-        )
-    else:
-        fits = isinstance(value, str) or (isinstance(value, list) and all(isinstance(v, str) for v in value))
-    if not fits:
-        raise ModelError(f"{path}: {name} = {value!r} must be {EXPECTED[name]}")
-    if isinstance(value, list):
-        return tuple(float(v) for v in value) if name in ("mean", "std", "fov_deg") else tuple(value)
-    return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e12
+    return Tensor(node.name, sizes, TYPES[kind])

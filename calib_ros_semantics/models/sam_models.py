@@ -1,13 +1,10 @@
-"""The pair of networks of Segment Anything: an encoder from an image to an embedding, a decoder from points to masks.
-
-Exporters differ in normalisation, padding and tensors; both graphs are identified by the names and shapes of their tensors.
-"""
+"""The pair of networks of Segment Anything: an encoder from an image to an embedding, a decoder from points to masks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ModelError
 from calib_ros_semantics.models.masks import Proposals
-from calib_ros_semantics.models.onnx_model import GREY_LEVELS, Array, Deadline, OnnxModel, Tensor, formula
+from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, Tensor
 
 DEFAULT_SIDE = 1024  # px; size the models were trained at, and the default of graphs of dynamic size
 CELL_PX = 16  # px of the frame of prompts per cell of the embedding, in all families
@@ -29,34 +26,10 @@ KNOWN = (
 )
 
 
-# Normalisation of the pixels that go into a network of Segment Anything: what is usual for its family, or what its YAML says.
-@dataclass(frozen=True)
-class Normalisation:
-    """(pixels * scale - mean) / std of grey levels 0..255. mean, std: one number, or one per channel."""
-
-    scale: float
-    mean: tuple[float, ...] = (0.0,)
-    std: tuple[float, ...] = (1.0,)
-
-    def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Normalised pixels (h, w, 3), in the order of the channels."""
-        mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
-        result: NDArray[Any] = (pixels * np.float32(self.scale) - mean) / std
-        return result
-
-    def text(self, model: OnnxModel) -> str:
-        """The formula, and whether the YAML beside a model says it."""
-        own = model.sidecar
-        return formula(self.scale, self.mean, self.std, bool(own.mean or own.std or own.scale is not None))
-
-
 @dataclass(frozen=True)
 class Preprocessing:
-    """How a family prepares an image.
-
-    padded: the aspect ratio is kept and the rest of the input is zero; else the image is stretched. own_pixels: prompts are in
-    pixels of the original image.
-    """
+    """How a family prepares an image. padded: the aspect ratio is kept and the rest of the input is zero; else the image is
+    stretched. own_pixels: prompts are in pixels of the original image."""
 
     normalised: Normalisation
     padded: bool = True
@@ -67,7 +40,6 @@ IMAGENET = Normalisation(1.0, (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 SAM, SAM2 = Preprocessing(normalised=IMAGENET), Preprocessing(padded=False, normalised=IMAGENET)
 EFFICIENT_SAM = Preprocessing(padded=False, normalised=Normalisation(1 / 255), own_pixels=True)
 RAW = Preprocessing(normalised=Normalisation(1.0))  # the graph does it all
-# By the name in the YAML beside the encoder, lower case, without underscores and hyphens.
 FAMILIES = {
     **dict.fromkeys(("sam", "mobilesam", "edgesam", "nanosam"), SAM),
     "sam2": SAM2,
@@ -76,12 +48,9 @@ FAMILIES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Embedded:
-    """An encoded image. features: arrays by the name of the encoder's output. size: (H, W) of the image.
-
-    frame: (h, w) of the coordinate frame of prompts. content: (h, w) of the image within it, from the upper left corner.
-    """
+class Embedded(NamedTuple):
+    """An encoded image. features: arrays by the name of the encoder's output. size: (H, W) of the image. frame: (h, w) of the
+    coordinate frame of prompts. content: (h, w) of the image within it, from the upper left corner."""
 
     features: dict[str, Array]
     size: tuple[int, int]
@@ -104,30 +73,24 @@ class Encoder:
         self.family, self.preprocessing = self._preprocessing(efficient)
 
     def _preprocessing(self, efficient: bool) -> tuple[str, Preprocessing]:
-        own = self.model.sidecar
-        declared = own.family.lower().replace("_", "").replace("-", "")
-        if declared and declared not in FAMILIES:
-            raise self.model.error(f"family '{own.family}' in its YAML is unknown; known are {', '.join(FAMILIES)}, fastsam")
-        if declared:
-            family = declared
-        elif efficient or self.input.name.startswith("batched"):
-            family = "efficientsam"
-        elif sum(len(t.shape) == 4 for t in self.model.outputs) >= 3:
-            family = "sam2"
-        else:
+        family = declared_family(self.model)
+        if family and family not in FAMILIES:
+            raise self.model.error(f"family '{family}' in its YAML is unknown; known are {', '.join(FAMILIES)}, fastsam")
+        if not family:
             family = "samexporter" if self.channels_last or np.issubdtype(self.input.dtype, np.integer) else "sam"
+            if efficient or self.input.name.startswith("batched"):
+                family = "efficientsam"
+            elif sum(len(t.shape) == 4 for t in self.model.outputs) >= 3:
+                family = "sam2"
         preprocessing = FAMILIES[family]
-        return family, replace(preprocessing, normalised=normalisation_of(self.model, preprocessing.normalised))
+        return family, replace(preprocessing, normalised=Normalisation.of(self.model, preprocessing.normalised))
 
     def __call__(self, image: NDArray[np.uint8], deadline: Deadline) -> Embedded:
         """Embedding of an image (H, W) or (H, W, 3) BGR uint8 of any size. Raises ModelError, BudgetError."""
         height, width = image.shape[:2]
         size = self._input_size(height, width)
-        if self.preprocessing.padded:
-            factor = min(size[0] / height, size[1] / width)
-            inner = max(int(height * factor + 0.5), 1), max(int(width * factor + 0.5), 1)
-        else:
-            inner = size
+        padded = self.preprocessing.padded
+        inner = _scaled((height, width), min(size[0] / height, size[1] / width)) if padded else size
         pixels = to_rgb(image, inner, self.model.sidecar.channels == "bgr")
         whole = np.zeros((*size, 3), np.float32)
         whole[: inner[0], : inner[1]] = self.preprocessing.normalised(pixels)
@@ -136,10 +99,9 @@ class Encoder:
         features = dict(zip((t.name for t in self.model.outputs), outputs, strict=True))
         coarsest = min((a.shape[-2:] for a in outputs if a.ndim == 4), key=lambda s: s[0] * s[1])
         frame = float(CELL_PX * coarsest[0]), float(CELL_PX * coarsest[1])
-        if not self.preprocessing.padded:
-            return Embedded(features, (height, width), frame, frame)
         factor = max(frame) / max(size)
-        return Embedded(features, (height, width), frame, (inner[0] * factor, inner[1] * factor))
+        content = (inner[0] * factor, inner[1] * factor) if padded else frame
+        return Embedded(features, (height, width), frame, content)
 
     def _input_size(self, height: int, width: int) -> tuple[int, int]:
         """Height and width of the input for an image of this size."""
@@ -151,13 +113,11 @@ class Encoder:
         if self.preprocessing.own_pixels:
             return height, width
         if self.channels_last:  # the graph pads by itself
-            factor = DEFAULT_SIDE / max(height, width)
-            return max(int(height * factor + 0.5), 1), max(int(width * factor + 0.5), 1)
+            return _scaled((height, width), DEFAULT_SIDE / max(height, width))
         return rows or DEFAULT_SIDE, columns or DEFAULT_SIDE
 
 
-@dataclass(frozen=True)
-class Roles:
+class Roles(NamedTuple):
     """What the tensors of a decoder are. features: pairs of an input and the name of the encoder's output that feeds it."""
 
     points: Tensor
@@ -190,16 +150,15 @@ class Decoder:
 
     def __call__(self, embedded: Embedded, points: NDArray[np.float64], deadline: Deadline) -> Proposals:
         """Masks for prompts (n, 2), n <= batch, points in pixels of the image. Raises ModelError, BudgetError."""
-        if len(points) == 1 or self._fixed:
-            return self._run(embedded, points, deadline)
         try:
             return self._run(embedded, points, deadline)
         except ModelError:
-            self.batch = 1  # sizes declared as dynamic need not be
+            if len(points) == 1 or self._fixed:
+                raise
+        self.batch = 1  # sizes declared as dynamic need not be
         parts = [self._run(embedded, point[None], deadline) for point in points]
-        first = parts[0]
         logits, score = np.concatenate([p.logits for p in parts]), np.concatenate([p.score for p in parts])
-        return Proposals(logits, score, first.size, first.content, first.soft)
+        return replace(parts[0], logits=logits, score=score)
 
     def _run(self, embedded: Embedded, points: NDArray[np.float64], deadline: Deadline) -> Proposals:
         outputs = [self.roles.masks.name] + ([self.roles.score.name] if self.roles.score else [])
@@ -241,10 +200,7 @@ class Decoder:
 
 
 def roles_of(decoder: OnnxModel, encoder: OnnxModel) -> Roles:
-    """Roles of the tensors of a decoder, by their names, then by their shapes.
-
-    ModelError, naming the tensors of both files, if they fit no known export or not each other.
-    """
+    """Roles of the tensors of a decoder, by their names, then by their shapes. ModelError if they fit no known export."""
     left = list(decoder.inputs)
     points = _take(left, ("coords", "points"), lambda t: len(t.shape) in (3, 4) and t.shape[-1] == 2)
     if points is None or len(points.shape) not in (3, 4) or points.shape[-1] not in (2, None):
@@ -316,31 +272,22 @@ def _mismatch(decoder: OnnxModel, encoder: OnnxModel, problem: str) -> ModelErro
     )
 
 
-def normalisation_of(model: OnnxModel, usual: Normalisation) -> Normalisation:
-    """The normalisation of the YAML beside a model, read as in image_classes, else the usual one of its family (RGB).
-
-    ModelError if the YAML has neither one nor three numbers, or channels other than rgb and bgr.
-    """
-    own = model.sidecar
-    if not isinstance(own.channels, str):
-        raise model.error("'channels:' of the YAML beside it must be rgb or bgr")
-    for name, values in (("mean", own.mean), ("std", own.std)):
-        if len(values) not in (0, 1, 3):
-            raise model.error(f"'{name}:' of the YAML beside it must have 1 or 3 numbers")
-    if not own.mean and not own.std and own.scale is None:
-        return Normalisation(usual.scale, usual.mean[::-1], usual.std[::-1]) if own.channels == "bgr" else usual
-    mean, std, scale = own.mean or (0.0,), own.std or (1.0,), own.scale
-    if scale is None:
-        scale = 1.0 if max(map(abs, mean + std)) > GREY_LEVELS else 1 / 255
-    return Normalisation(scale, mean, std)
-
-
 def to_rgb(image: NDArray[np.uint8], size: tuple[int, int], bgr: bool = False) -> NDArray[np.float32]:
     """Image (H, W) or (H, W, 3) BGR -> (h, w, 3) float32 RGB or BGR, 0..255, at another size."""
     colour = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
     shrinks = size[0] < image.shape[0]
     resized = cv2.resize(colour, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     return np.asarray(resized if bgr else resized[:, :, ::-1], np.float32)
+
+
+def declared_family(model: OnnxModel) -> str:
+    """The family in the YAML beside a model, lower case, without underscores and hyphens; empty if it is not given."""
+    return model.sidecar.family.lower().replace("_", "").replace("-", "")
+
+
+def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    height, width = (max(int(n * factor + 0.5), 1) for n in size)
+    return height, width
 
 
 def _is_picture(tensor: Tensor) -> bool:

@@ -9,23 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
-from calib_ros_semantics.models.fast_sam import MIN_CONFIDENCE, FastSam, is_fast_sam
+from calib_ros_semantics.models.fast_sam import FastSam, is_fast_sam
 from calib_ros_semantics.models.masks import (
     MIN_IOU,
     MIN_STABILITY,
     NMS_IOU,
     Mask,
     MaskFolder,
-    Masks,
     Proposals,
     accepted_masks,
     mask_edges,
     without_duplicates,
 )
 from calib_ros_semantics.models.network_kinds import NetworkKind, kind_of
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
+from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
 from calib_ros_semantics.models.sam_models import Decoder, Encoder, roles_of
 
 Points = NDArray[np.float64]
@@ -39,132 +37,84 @@ SMALL_CELLS = 2.0  # area of a small mask, cells of the grid
 NEIGHBOUR_SPACINGS, SAME_MASK_NEIGHBOURS = 1.1, 2  # reach of neighbours in spacings of the grid; how many of them
 
 
-class MaskEdges:
-    """Frame -> semantic edges (2, H, W) as of `mask_edges`, from the masks of SegmentAnything. Raises the same errors."""
+class MaskEdges(SegmentationModel):
+    """Frame -> semantic edges (2, H, W) as of `mask_edges`, from the masks of `segmenter_of`."""
 
     def __init__(self, config: SemanticsConfig) -> None:
-        self.masks = SegmentAnything(config)
+        self._segmenter = segmenter_of(config)
+        self.fallback, self.needed = self._segmenter.fallback, self._segmenter.needed
 
-    @property
-    def fallback(self) -> str:
-        """Why a model does not run on the configured provider; empty if all do."""
-        return self.masks.fallback
-
-    def describe(self) -> str:
-        """Kind, inputs and outputs, as text."""
-        return self.masks.describe()
-
-    @property
-    def needed(self) -> str:
-        """What a mask needs to count, as text."""
-        return self.masks.needed
-
-    def __call__(self, frame: Frame, deadline: Deadline) -> NDArray[np.float32]:
-        """Edges of a frame. Raises ModelError, BudgetError."""
-        return mask_edges(self.masks(frame, deadline))
-
-
-class SegmentAnything:
-    """Masks of everything in a frame's image, by config.segment_anything; a Segmenter.
-
-    An encoder with its decoder, FastSAM, or a folder of masks. Raises ModelError, MissingDependencyError.
-    """
-
-    def __init__(self, config: SemanticsConfig) -> None:
-        self.models: tuple[OnnxModel, ...] = ()
-        if Path(config.segment_anything).is_dir():
-            self._segmenter: MaskFolder | FastSam | Prompted = MaskFolder(config.segment_anything)
-            return
-        first = OnnxModel(config.segment_anything, config)
-        if is_fast_sam(first, alone=not config.segment_anything_decoder):
-            self._segmenter = FastSam(first, config)
-            self.models = (first,)
-        else:
-            self._segmenter = Prompted(first, _decoder_of(first, config), config)
-            self.models = self._segmenter.models
-
-    @property
-    def fallback(self) -> str:
-        """Why a model does not run on the configured provider; empty if all do."""
-        return "; ".join(model.fallback for model in self.models if model.fallback)
+    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> NDArray[np.float32]:
+        return mask_edges(self._segmenter(frame, deadline), (frame.image.shape[0], frame.image.shape[1]))
 
     def describe(self) -> str:
-        """Kind, inputs and outputs, as text."""
         return self._segmenter.describe()
 
-    @property
-    def needed(self) -> str:
-        """What a mask needs to count, as text."""
-        if isinstance(self._segmenter, FastSam):
-            return f"a confidence of {MIN_CONFIDENCE:g}"
-        return (
-            "a file in the folder"
-            if isinstance(self._segmenter, MaskFolder)
-            else f"a predicted IoU of {MIN_IOU:g} and a stability of {MIN_STABILITY:g}"
-        )
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
-        """Masks at the size of the image. Raises ModelError, BudgetError."""
-        return self._segmenter(frame, deadline)
+def segmenter_of(config: SemanticsConfig) -> MaskFolder | FastSam | Prompted:
+    """What gives the masks of everything in a frame's image: an encoder with its decoder, FastSAM, or a folder of masks.
+
+    Raises ModelError, MissingDependencyError.
+    """
+    if Path(config.segment_anything).is_dir():
+        return MaskFolder(config.segment_anything)
+    first = OnnxModel(config.segment_anything, config)
+    if is_fast_sam(first, alone=not config.segment_anything_decoder):
+        return FastSam(first)
+    return Prompted(first, _decoder_of(first, config), config.prompt_grid)
 
 
 class Prompted:
-    """Encoder and decoder, prompted on a grid over the image; a Segmenter. ModelError if the two do not fit each other."""
+    """Encoder and decoder, prompted on a grid over the image. ModelError if the two do not fit each other."""
 
-    def __init__(self, encoder: OnnxModel, decoder: OnnxModel, config: SemanticsConfig) -> None:
+    needed = f"a predicted IoU of {MIN_IOU:g} and a stability of {MIN_STABILITY:g}"
+
+    def __init__(self, encoder: OnnxModel, decoder: OnnxModel, along: int) -> None:
+        """along: prompts along the longer side of the image."""
         roles = roles_of(decoder, encoder)
-        self.models, self.config = (encoder, decoder), config
+        self.along = along
+        self.fallback = "; ".join(model.fallback for model in (encoder, decoder) if model.fallback)
         self.encoder = Encoder(encoder, roles.in_own_pixels)
         self.decoder = Decoder(decoder, roles, self.encoder, PROMPT_BATCH)
 
     def describe(self) -> str:
         """Family, grid, and tensors of both files, as text."""
-        encoder, decoder = self.models
-        fed = self.encoder.preprocessing.normalised.text(encoder)
+        encoder, decoder = self.encoder.model, self.decoder.model
         return (
-            f"Segment Anything ({self.encoder.family}), {self.config.prompt_grid} prompts along the longer side, "
-            f"{self.decoder.batch} in a run, fed as {fed}, on {decoder.provider}; encoder: {encoder.tensors}; decoder: "
-            f"{decoder.tensors}"
+            f"Segment Anything ({self.encoder.family}), {self.along} prompts along the longer side, {self.decoder.batch} in a "
+            f"run, fed as {self.encoder.preprocessing.normalised.text}, on {decoder.provider}; encoder: {encoder.tensors}; "
+            f"decoder: {decoder.tensors}"
         )
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
+    def __call__(self, frame: Frame, deadline: Deadline) -> list[Mask]:
         """Masks of the frame's image. Raises ModelError, BudgetError."""
-        embedded = self.encoder(frame.image, deadline)
+        embedded, decoder = self.encoder(frame.image, deadline), self.decoder
         return everything(
-            lambda points: self.decoder(embedded, points, deadline),
-            embedded.size,
-            lambda: self.decoder.batch,
-            self.config,
-            deadline,
+            lambda points: decoder(embedded, points, deadline), embedded.size, lambda: decoder.batch, self.along, deadline
         )
 
 
 def _decoder_of(encoder: OnnxModel, config: SemanticsConfig) -> OnnxModel:
-    if not config.segment_anything_decoder:
-        kind = kind_of(encoder)
-        if kind not in (NetworkKind.ENCODER, NetworkKind.OTHER):
-            raise encoder.error(
-                f"this looks like {kind.value}; semantics.segment_anything takes the encoder of Segment Anything or FastSAM"
-            )
-        raise ModelError(
-            f"{encoder.path} needs its decoder: set semantics.segment_anything_decoder to its ONNX file. FastSAM has none; "
-            f"this file has {encoder.tensors}"
+    if config.segment_anything_decoder:
+        return OnnxModel(config.segment_anything_decoder, config)
+    kind = kind_of(encoder)
+    if kind not in (NetworkKind.ENCODER, NetworkKind.OTHER):
+        raise encoder.error(
+            f"this looks like {kind.value}; semantics.segment_anything takes the encoder of Segment Anything or FastSAM"
         )
-    return OnnxModel(config.segment_anything_decoder, config)
+    raise encoder.error("it needs its decoder: set semantics.segment_anything_decoder to its ONNX file. FastSAM has none")
 
 
-def everything(
-    propose: Proposer, size: tuple[int, int], batch: Callable[[], int], config: SemanticsConfig, deadline: Deadline
-) -> Masks:
+def everything(propose: Proposer, size: tuple[int, int], batch: Callable[[], int], along: int, deadline: Deadline) -> list[Mask]:
     """Masks of everything in an image of this size (H, W), from a grid of prompts without redundant ones.
 
-    propose: masks for prompts (n, 2), pixels. batch: prompts per call, which may shrink. Raises BudgetError, and what `propose`
-    raises.
+    propose: masks for prompts (n, 2), pixels. batch: prompts per call, which may shrink. along: see prompt_points. Raises
+    BudgetError, and what `propose` raises.
     """
     found: list[Mask] = []
     prompted: list[Points] = []
-    waiting = list(prompt_points(size, config.prompt_grid))
-    spacing = max(size) / config.prompt_grid
+    waiting = list(prompt_points(size, along))
+    spacing = max(size) / along
     while waiting:
         deadline.check()
         prompts: list[Points] = []
@@ -176,14 +126,13 @@ def everything(
             proposals = propose(np.array(prompts))
             found = without_duplicates(found + accepted_masks(proposals), NMS_IOU)
             prompted += prompts
-    return Masks(size, tuple(found))
+    return found
 
 
 def prompt_points(size: tuple[int, int], along: int) -> Points:
     """Grid of prompts (n, 2), column and row, in an image (H, W): `along` of them on the longer side, as dense on the other.
 
-    Coarse to fine: those on every 2^k-th row and column come first, so that large objects are found first and the prompts of a
-    batch lie far apart.
+    Those on every 2^k-th row and column come first: large objects are found first, and prompts of a batch lie far apart.
     """
     spacing = max(size) / along
     rows, columns = (max(round(n / spacing), 1) for n in size)

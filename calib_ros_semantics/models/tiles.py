@@ -1,14 +1,12 @@
 """Pictures for a network of fixed size: overlapping tiles that keep the shape of things, instead of one stretched picture.
 
-Pixels that get the same class by a compact network of any size and by a copy of it of fixed size, in 10 KITTI frames (3.3:1),
-3 of Waymo (1.5:1), one of nuScenes (1.8:1). 384x384: stretched 68, 84 and 85 %, padded in one piece 69, 84 and 84 %, in tiles
-91, 89 and 90 %. 512x1024: stretched 87 and 95 % (KITTI, Waymo), in one piece 90 and 92 %, in tiles 91 and 97 %.
+On 10 KITTI frames a network of 384x384 gives 91 % of the pixels the class that it gives them at any size; stretched 68 %.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,13 +23,10 @@ SMALLEST = np.float32(1e-6)
 SUM_TOLERANCE = 0.01  # of the sum of probabilities from 1
 
 
-@dataclass(frozen=True)
-class Tiling:
-    """How a picture goes into an input of fixed size, in a row or a column of tiles.
-
-    size: (height, width) that the picture is shrunk or enlarged to. tile: (height, width) of the input. corners: row and column
-    of the first pixel of each tile in the picture; negative where the picture does not fill the tile.
-    """
+class Tiling(NamedTuple):
+    """How a picture goes into an input of fixed size, in a row or a column of tiles. size: (height, width) that the picture is
+    shrunk or enlarged to. tile: (height, width) of the input. corners: row and column of the first pixel of each tile in the
+    picture; negative where the picture does not fill the tile."""
 
     size: Size
     tile: Size
@@ -72,9 +67,7 @@ class Tiling:
         for corner, own in zip(self.corners, tiles, strict=True):
             planes = np.stack([_resized(np.asarray(plane, np.float32), shape) for plane in own])
             if not is_softmax(planes):
-                with np.errstate(invalid="ignore"):  # an infinite score leaves NaN
-                    planes = np.exp(planes - planes.max(axis=0))
-                planes /= planes.sum(axis=0)
+                softmax(planes)
             place, part = self._overlap(corner, whole, shape)
             for sums, plane in zip(merged, planes, strict=True):
                 sums[place] += plane[part] * weight[part]
@@ -99,8 +92,8 @@ class Tiling:
 
     def _merged_sizes(self) -> tuple[Size, Size]:
         """Cells of the picture, and of a tile."""
-        share = self._share
-        return _scaled(self.size, share), _scaled(self.tile, share)
+        (h, w), (rows, columns) = ([max(round(n * self._share), 1) for n in size] for size in (self.size, self.tile))
+        return (h, w), (rows, columns)
 
     @property
     def _share(self) -> float:
@@ -122,16 +115,20 @@ def is_softmax(scores: NDArray[np.generic]) -> bool:
     return bool(sample.min() >= 0 and np.abs(sample.sum(axis=0) - 1).max() < SUM_TOLERANCE)
 
 
+def softmax(scores: Floats) -> None:
+    """Make probabilities of scores (C, h, w), in place."""
+    with np.errstate(invalid="ignore"):  # an infinite score leaves NaN
+        scores -= scores.max(axis=0)
+    np.exp(scores, out=scores)
+    scores /= scores.sum(axis=0)
+
+
 def _starts(whole: int, part: int) -> list[int]:
     """First pixels of the parts that cover a length with the overlap; of one in whose middle it lies where it is shorter."""
     if whole <= part:
         return [(whole - part) // 2]
     count = int(np.ceil((whole - OVERLAP * part) / ((1 - OVERLAP) * part)))
     return [int(n) for n in np.linspace(0, whole - part, max(count, 2)).round()]
-
-
-def _scaled(size: Size, share: float) -> Size:
-    return max(round(size[0] * share), 1), max(round(size[1] * share), 1)
 
 
 def _resized(plane: Floats, size: Size) -> Floats:

@@ -1,14 +1,11 @@
-"""Which weights a network runs with: name, licence and fingerprint, so that whoever ships a vehicle can tell what is in it.
-
-Known before the network is needed: the node says so when it starts, long before the first image.
-"""
+"""Which weights a network runs with: name, licence and fingerprint, known before the network is needed."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +14,8 @@ from calib_ros.config.semantics import BUILTIN
 SHOWN = 12  # digits of a SHA-256: enough to tell files apart, and to read aloud
 
 
-@dataclass(frozen=True)
-class WeightSet:
-    """The weights of a network. licence: as its file states it, empty = not at all, None = its file cannot be read here. sha256:
-    of the file, in hexadecimal."""
+class WeightSet(NamedTuple):
+    """The weights of a network. licence: as its file states it, empty = not at all, None = its file cannot be read here."""
 
     name: str
     licence: str | None
@@ -55,10 +50,10 @@ def weights_of(path: Path) -> WeightSet | None:
 @lru_cache(maxsize=16)
 def _read(path: Path, state: tuple[int, ...]) -> WeightSet:
     """weights_of, once as long as the file does not change. Raises OSError."""
-    data = np.memmap(path, np.uint8, "r").data  # encoders have hundreds of megabytes
+    digest = hashlib.sha256(np.memmap(path, np.uint8, "r").data)  # encoders have hundreds of megabytes
     own = metadata_of(path)
-    licence = None if own is None else own.get("license", "")
-    return WeightSet((own or {}).get("name") or path.stem, licence, hashlib.sha256(data).hexdigest())
+    name, licence = (path.stem, None) if own is None else (own.get("name") or path.stem, own.get("license", ""))
+    return WeightSet(name, licence, digest.hexdigest())
 
 
 def metadata_of(path: Path) -> dict[str, str] | None:

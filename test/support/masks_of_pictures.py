@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
-from calib_ros_semantics.models.masks import Masks
+from calib_ros_semantics.models.masks import Mask
 from calib_ros_semantics.models.onnx_model import Deadline
 
 NO_POINTS = PointCloud(np.zeros((0, 3), np.float32))
@@ -51,9 +51,17 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 
-def compared(masks: Masks, truth: list[np.ndarray], enough: float = 0.8) -> tuple[float, int, int]:
+def picture_of(mask: Mask, size: tuple[int, int]) -> np.ndarray:
+    """A mask at the size of its image, (H, W) bool."""
+    height, width = mask.inside.shape
+    out = np.zeros(size, bool)
+    out[mask.top : mask.top + height, mask.left : mask.left + width] = mask.inside
+    return out
+
+
+def compared(masks: list[Mask], truth: list[np.ndarray], enough: float = 0.8) -> tuple[float, int, int]:
     """Recall of true masks, how many masks tell one that another told already, and how many tell none."""
-    pictures = [masks.picture(k) for k in range(len(masks))]
+    pictures = [picture_of(mask, truth[0].shape) for mask in masks]
     table = np.array([[iou(picture, true) for true in truth] for picture in pictures]).reshape(len(pictures), len(truth))
     told = [int(row.argmax()) for row in table if row.max() > 0.5]
     recall = float((table.max(axis=0, initial=0) > enough).mean())

@@ -203,13 +203,13 @@ def exported(torch: Any, file: Path, size: tuple[int, int] | None) -> Any:
     """An untrained network as a file, and as calib_ros opens it."""
     for module in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(module, reason=NO_TORCH)
-    from calib_ros_semantics.models.image_classes import ImageClasses
+    from calib_ros_semantics.models.image_classes import ImageNetwork
     from training.export import export
     from training.network import Network
 
     torch.manual_seed(0)
     export(Network().fuse(), file, size)
-    return ImageClasses(str(file), SemanticsConfig())
+    return ImageNetwork(file, SemanticsConfig())
 
 
 def test_an_exported_file_of_one_size(torch: Any, tmp_path: Path) -> None:
@@ -226,6 +226,6 @@ def test_calib_ros_gives_the_classes_of_the_exported_file(torch: Any, tmp_path: 
     assert file.stat().st_size < 2e6
     image = street[0].image
     wanted = lookup(data.NAMES)[Predictor(file)(np.ascontiguousarray(image[..., ::-1]))]
-    found = opened(street[0], Deadline(60))
+    found = opened(street[0], Deadline(60)).classes
     assert len(np.unique(found)) > 1
     assert (found == wanted).mean() > 0.999

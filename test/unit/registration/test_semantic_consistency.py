@@ -22,7 +22,7 @@ from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
 from calib_ros.result import CONVERGED, REFUSED, Evidence, RefusalCode, Result
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights, importance
+from calib_ros_thesis.features import FEW_FRAMES_SHARE, frame_weights, importance
 
 QUICK = Config(search=SearchConfig(rounds=2, starts=256, rotation_deg=2, translation_m=0.15))
 SOURCE = update(QUICK, {"semantics": {"image_classes": "source", "cloud_classes": "source"}})

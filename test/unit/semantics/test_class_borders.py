@@ -13,17 +13,17 @@ from onnx_graphs import segmentation
 from scenes import RenderedDrive
 
 from calib_ros.config import Config, SemanticsConfig, update
-from calib_ros.errors import BudgetError, ModelError
+from calib_ros.errors import BudgetError
 from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.image.enhance import prepare
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import EDGE_SHARE, OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros.registration.classes import EDGE_SHARE, OF_CLASSES, OF_MASKS
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros_semantics.models.class_borders import IMAGE_BORDER, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
-from calib_ros_semantics.models.image_classes import ImageClasses
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
+from calib_ros_semantics.models.image_classes import pixel_model
+from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
 from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import CLASS_EDGE_SHARE, semantic_share
@@ -46,9 +46,6 @@ def logits(classes: np.ndarray, height: float = 30.0) -> np.ndarray:
 
 
 ALL = np.array(list(C), np.uint8)
-
-
-# --- values ---------------------------------------------------------------------------------------------------------------
 
 
 def test_a_sure_step_is_a_full_edge_between_its_two_columns() -> None:
@@ -125,9 +122,6 @@ def test_the_border_of_the_image_is_no_edge() -> None:
     assert borders[0, IMAGE_BORDER, 40] == borders[0, -IMAGE_BORDER - 1, 40] == pytest.approx(1, abs=1e-5)
 
 
-# --- scores ---------------------------------------------------------------------------------------------------------------
-
-
 def test_scores_probabilities_and_classes_agree() -> None:
     classes = split(C.VEHICLE, C.GROUND)
     classes[:20] = C.SKY
@@ -188,16 +182,14 @@ def test_where_a_score_is_no_number_there_is_no_border() -> None:
     np.testing.assert_allclose(borders_of_scores(scores, ALL, SIZE), whole, atol=1e-4)
 
 
-# --- networks -------------------------------------------------------------------------------------------------------------
-
 # Scores 2 c v - c^2 of these two classes differ by 20 (v - 0.5): 10 and -10 for white and black.
 CENTRES = np.array([-4.5, 5.5])
 
 
-def network(folder: Path, config: SemanticsConfig | None = None, outputs: str = "scores 1 2 64 128", **more) -> ImageClasses:
+def network(folder: Path, config: SemanticsConfig | None = None, outputs: str = "scores 1 2 64 128", **more) -> SegmentationModel:
     path = segmentation(folder / "net.onnx", 2, outputs, inputs="1 3 64 128", at=CENTRES, **more)
     path.with_suffix(".yaml").write_text("labels: [building, sky]\n")
-    return ImageClasses(str(path), config or SemanticsConfig())
+    return pixel_model(str(path), config or SemanticsConfig())
 
 
 def grey(left: int, right: int) -> Frame:
@@ -214,16 +206,15 @@ def test_a_network_gives_classes_and_borders_of_one_run(tmp_path: Path, monkeypa
     for left, right in ((0, 255), (115, 140), (140, 115)):
         frame = grey(left, right)
         runs.clear()
-        classes, borders = model.segment(frame, later())
+        classes, borders = model(frame, later())
         assert len(runs) == 1
-        assert np.array_equal(classes, model(frame, later()))
         assert classes[30, [10, 100]].tolist() == [C.SKY if v > 127 else C.BUILDING for v in (left, right)]
         sky = [1 / (1 + np.exp(-20 * (v / 255 - 0.5))) for v in (left, right)]
         assert borders[0, 30, 63:65] == pytest.approx(abs(sky[0] - sky[1]), abs=2e-3)
         assert borders[1].max() < 1e-3
-    assert model.segment(frame, later(), borders=False).borders is None
+    assert model(frame, later(), borders=False).borders is None
     with pytest.raises(BudgetError):
-        model.segment(frame, Deadline(0))
+        model(frame, Deadline(0))
 
 
 @pytest.mark.parametrize(
@@ -236,26 +227,10 @@ def test_a_network_gives_classes_and_borders_of_one_run(tmp_path: Path, monkeypa
 )
 def test_networks_of_all_layouts_give_the_same_borders(tmp_path: Path, graph: dict, off: float) -> None:
     halves = split(C.BUILDING, C.SKY, 64, (64, 128))
-    classes, borders = network(tmp_path, **graph).segment(grey(0, 255), later())
+    classes, borders = network(tmp_path, **graph)(grey(0, 255), later())
     assert np.array_equal(classes, halves)
     np.testing.assert_allclose(borders, borders_of_classes(halves), atol=off)
     assert borders[0, 30, 63:65].min() > 0.99
-
-
-def test_label_pictures_and_sources_have_borders_too(tmp_path: Path) -> None:
-    frame = grey(0, 255)
-    classes = split(C.VEHICLE, C.GROUND, 64, (64, 128))
-    source = ImageClasses("source", SemanticsConfig())
-    expected = borders_of_classes(classes)
-    assert np.array_equal(source.segment(replace(frame, classes=classes), later()).borders, expected)
-    with pytest.raises(ModelError, match="has no classes"):
-        source.segment(frame, later())
-    cv2.imwrite(str(tmp_path / "a.png"), np.where(classes == C.VEHICLE, 26, 7).astype(np.uint8))  # of Cityscapes
-    pictures = ImageClasses(str(tmp_path), SemanticsConfig())
-    assert np.array_equal(pictures.segment(frame, later()).borders, expected)
-
-
-# --- what becomes of them -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -288,11 +263,6 @@ def test_masks_come_before_classes(tmp_path: Path, frame: Frame) -> None:
     for semantics in (failed, asked, masked(frame)):
         assert semantics.edges_of == OF_CLASSES
         assert np.array_equal(semantics.edges, own)
-
-
-def test_no_classes_give_no_borders(frame: Frame) -> None:
-    assert models(image_classes="")(frame).edges is models(segmentation="none")(frame).edges is None
-    assert FrameSemantics(np.zeros((2, 4, 4), np.float32)).edges_of == OF_MASKS
 
 
 @pytest.mark.parametrize(("edges_of", "share"), [(OF_MASKS, EDGE_SHARE), (OF_CLASSES, 0.0)])
@@ -334,7 +304,7 @@ def test_borders_of_a_real_street_lie_on_edges_of_the_picture(kitti_root: Path) 
     image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
     if image is None:
         pytest.skip("no such KITTI frame")
-    edges = ImageClasses("builtin", SemanticsConfig()).segment(frame_of(image, "000000"), later()).borders
+    edges = pixel_model("builtin", SemanticsConfig())(frame_of(image, "000000"), later()).borders
     assert edges.shape == (2, *image.shape[:2])
     assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.2
     assert_lies_on_edges(edges, image, sigma=2, shift=12, factor=1.15)

@@ -11,11 +11,9 @@ from masks_of_pictures import frame_of, later
 
 from calib_ros.datasets.kitti import KittiSource
 from calib_ros.datasets.kitti_files import read_scan
-from calib_ros.errors import BudgetError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros_semantics.models.geometric_classes import ClusterClasses, cluster_classes, heights
 from calib_ros_semantics.models.label_files import LabelScans
-from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_synthetic.drive import SyntheticDrive
 
 C = SemanticClass
@@ -50,8 +48,6 @@ def classes_on(shapes: list[Plane | Box], asked: Box, scanner: Spinner = SCANNER
 
 
 CAR = [box(9, 4, 4.2, 1.8, 0.25, 0.9), box(8.7, 4, 2.2, 1.6, 0.9, 1.5)]
-
-
 WALL = box(8, 6.0, 30, 0.3, 0, 5)
 VAN, POST, PLATE_POST = box(10, -4, 4.8, 1.9, 0.2, 2.1), box(8, -3, 0.12, 0.12, 0, 4), box(12, -3, 0.08, 0.08, 0, 2.9)
 PLATE, BACK = box(11.9, -3, 0.03, 0.7, 2.1, 2.8, reflectivity=1.0), box(7.9, -3, 0.03, 0.7, 2.1, 2.6)
@@ -147,8 +143,9 @@ def cloud() -> PointCloud:
 
 
 def test_classes_are_repeatable_and_do_not_depend_on_lost_returns(cloud: PointCloud) -> None:
-    labels = cluster_classes(cloud)
-    assert np.array_equal(cluster_classes(cloud), labels)
+    labels, look = cluster_classes(cloud), ClusterClasses()
+    assert np.array_equal(look(frame_of(np.zeros((8, 8), np.uint8), cloud=cloud), later()), labels)
+    assert "vehicles" in look.describe()
     lost = np.zeros(len(cloud) + 200, bool)
     lost[::100][:200] = True
     xyz, light = np.full((len(lost), 3), np.nan, np.float32), np.zeros(len(lost), np.float32)
@@ -185,22 +182,13 @@ def test_degenerate_clouds_have_no_classes(xyz: np.ndarray) -> None:
     assert set(labels) <= {UNLABELLED}
 
 
-def test_geometric_classes_replace_a_network(cloud: PointCloud) -> None:
-    frame, look = frame_of(np.zeros((8, 8), np.uint8), cloud=cloud), ClusterClasses()
-    assert np.array_equal(look(frame, later()), cluster_classes(cloud))
-    assert look.fallback == ""
-    assert "vehicles" in look.describe()
-    with pytest.raises(BudgetError):
-        look(frame, Deadline(0))
-
-
 @pytest.mark.kitti
 def test_a_labelled_scan(kitti_root: Path) -> None:
     sequence = kitti_root / "odometry" / "sequences" / "00"
     if not (sequence / "labels").is_dir():
         pytest.skip("no labels beside the scans")
     frame = KittiSource(sequence)[0]
-    found, truth = cluster_classes(frame.cloud), LabelScans(sequence / "labels")(frame, later())
+    found, truth = cluster_classes(frame.cloud), LabelScans(sequence / "labels")(frame)
     floors = {C.VEHICLE: (0.95, 0.7), C.POLE: (0.8, 0.5), C.BUILDING: (0.75, 0.6), C.VEGETATION: (0.75, 0.65)}
     assert_floors(found, truth, {**floors, C.GROUND: (0.9, 0.98)})
     assert np.count_nonzero(found == C.PERSON) < 100, "there is nobody in this scan"

@@ -24,12 +24,12 @@ from calib_ros_semantics.models.cloud_classes import (
     CENET,
     RANGE_FIRST,
     XYZ_FIRST,
-    CloudClasses,
     CloudInput,
     classes_of_points,
+    point_model,
     range_view,
 )
-from calib_ros_semantics.models.image_classes import ImageClasses, ImageInput
+from calib_ros_semantics.models.image_classes import ImageInput, pixel_model
 from calib_ros_semantics.models.labels import (
     CAMVID,
     CITYSCAPES,
@@ -41,7 +41,7 @@ from calib_ros_semantics.models.labels import (
     LabelTable,
     lookup,
 )
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
+from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
 from calib_ros_synthetic.drive import SyntheticDrive
 
 CONFIG = SemanticsConfig()
@@ -83,8 +83,6 @@ def error_of(make) -> str:
     return str(caught.value)
 
 
-# --- networks for pictures ------------------------------------------------------------------------------------------------
-
 DYNAMIC = "batch 3 height width"
 FIVE = ["sky", "car", "road", "void", "tree"]
 LEVELS = {"normal": ((0.0,) * 3, (1 / 255,) * 3)}  # the graph takes grey levels
@@ -101,7 +99,7 @@ def case(outputs: str, classes=19, names=None, *, size=(375, 1242), margin=6, ch
 
 
 EXPORTS = {
-    "mmsegmentation argmax": case("argmax 1 1 256 512", says="network that gives class numbers (mmsegmentation): 512x256 RGB"),
+    "mmsegmentation argmax": case("argmax 1 1 256 512", says="segmentation network: 512x256 RGB"),
     "mmsegmentation dynamic": case("argmax batch 1 h w", inputs=DYNAMIC, says="RGB (at most 1024 wide)"),
     "mmsegmentation logits": case("output 1 19 256 512", says="v / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225] of"),
     "PIDNet": case("output 1 19 32 64", stride=8, margin=40, says="segmentation network"),
@@ -111,15 +109,14 @@ EXPORTS = {
     "PIDNet heads alike": case("aux ?; s ?; aux2 ?", inputs=DYNAMIC, stride=8, margin=40, says="PIDNet with auxiliary heads"),
     "PIDNet told": case(HEADS, **SMALL, yaml="family: pidnet", says=f"PIDNet: 128x64 {TILED} (v / 255 - [0.485, 0.456, "),
     "DDRNet": case("1173 1 19 32 64; aux 1 19 32 64", stride=8, margin=40, names_of_tensors=("x.1", "1173")),
-    "DDRNet told": case("s 1 19 64 128; aux 1 19 64 128", **SMALL, yaml="family: DDRNet", says="DDRNet: "),
-    "torchvision": case("out b 21 h w; aux b 21 h w", 21, inputs=DYNAMIC, says="torchvision: "),
+    "torchvision": case("out b 21 h w; aux b 21 h w", 21, inputs=DYNAMIC),
     "SegFormer": case(
         "logits batch_size num_labels height width", inputs="batch_size num_channels height width", stride=4, margin=20,
-        names_of_tensors=("pixel_values", "logits"), says="SegFormer (transformers): ",
+        names_of_tensors=("pixel_values", "logits"),
     ),
     # 150 classes cannot be told within half a cell of a border.
     "SegFormer ADE20K": case("logits 1 150 128 128", 150, inputs="1 3 512 512", stride=4, margin=20, size=(500, 520)),
-    "EdgeNets": case("o 1 20 256 512", 20, [*CITYSCAPES, "background"], says="EdgeNets: "),
+    "EdgeNets": case("o 1 20 256 512", 20, [*CITYSCAPES, "background"]),
     "raw ids": case("o 1 34 256 512", 34, CITYSCAPES_RAW),
     "raw ids chosen": case("argmax 1 256 512", 34, CITYSCAPES_RAW),
     "CamVid": case("o 1 11 256 512", 11, CAMVID),
@@ -149,14 +146,6 @@ EXPORTS = {
         "o 1 19 256 512", normal=CAFFE, channel=0, yaml="mean: [104, 117, 123]\nchannels: bgr",
         says="BGR (pictures of another shape in tiles), fed as (v - [104, 117, 123]) of grey levels v in 0..255 (as its YAML",
     ),
-    "YAML: divided by 255": case(
-        *("o 1 5 64 128", 5, FIVE), **SMALL, normal=((0,) * 3, (1,) * 3),
-        yaml=f"scale: 0.00392156862745098\nlabels: {dict(enumerate(FIVE))}", says="fed as v / 255 of",
-    ),
-    "YAML: nothing done": case("o 1 19 256 512", **LEVELS, yaml="scale: 1.0", says=f"{TILED} v of grey levels v in 0..255 (as"),
-    "YAML: scale and std": case(
-        "o 1 19 256 512", normal=((0,) * 3, (1 / 510,) * 3), yaml="scale: 0.5\nstd: [0.25]", says=f"{TILED} v * 0.5 / [0.25] of"
-    ),
     "YAML: size": case("o b 19 h w", inputs=DYNAMIC, yaml="size: [128, 256]\nlabels: cityscapes", margin=10, says="256x128 RGB"),
     "YAML: output": case("aux 1 19 64 128; o 1 19 64 128", **SMALL, yaml="output: o"),
     "YAML: labels of numbers": case("argmax 1 1 64 128", 12, CAMVID, **SMALL, yaml="labels: camvid"),
@@ -167,11 +156,11 @@ EXPORTS = {
 def test_networks_for_pictures_put_every_class_at_its_place(tmp_path: Path, name: str) -> None:
     (classes, names, size, margin, channel, yaml, says), graph = EXPORTS[name]
     path = segmentation(tmp_path / "n.onnx", classes, names=graph.pop("names_of_tensors", None), **graph)
-    network = ImageClasses(str(beside(path, yaml)), CONFIG)
+    network = pixel_model(str(beside(path, yaml)), CONFIG)
     for first in (0, 11) if classes > ROWS * COLUMNS else (0,):
         numbers = blocks(*size, classes, first)
         image = picture(numbers, classes, channel or 0)
-        found = network(frame_of(image if channel is not None else image[..., 0].copy()), later())
+        found = network(frame_of(image if channel is not None else image[..., 0].copy()), later()).classes
         assert found.shape == size
         assert found.dtype == np.uint8
         keep = inner(numbers, margin)
@@ -184,24 +173,24 @@ def test_networks_for_pictures_put_every_class_at_its_place(tmp_path: Path, name
 
 def test_what_is_assumed_of_a_network_is_said(tmp_path: Path) -> None:
     path = segmentation(tmp_path / "n.onnx", 34, "argmax 1 256 512")
-    network = ImageClasses(str(path), CONFIG)
+    network = pixel_model(str(path), CONFIG)
     assert "argmax: class numbers, assumed to be cityscapes without labels: in its YAML, on cpu" in network.describe()
     network(frame_of(picture(np.full((64, 128), 26), 34)), later())
     assert "assumed to be cityscapes_raw without" in network.describe()
-    assert (network(frame_of(picture(np.full((64, 128), 7), 34)), later()) == C.GROUND).all()
-    assert ImageClasses(str(beside(path, "labels: camvid")), CONFIG).describe().endswith("argmax: class numbers, on cpu")
+    assert (network(frame_of(picture(np.full((64, 128), 7), 34)), later()).classes == C.GROUND).all()
+    assert pixel_model(str(beside(path, "labels: camvid")), CONFIG).describe().endswith("argmax: class numbers, on cpu")
     heads = segmentation(tmp_path / "heads.onnx", 19, HEADS, inputs="1 3 64 128")  # three, but not of PIDNet
-    assert "-> aux: scores" in ImageClasses(str(beside(heads, "family: DDRNet")), CONFIG).describe()
+    assert "-> aux: scores" in pixel_model(str(beside(heads, "family: DDRNet")), CONFIG).describe()
 
 
 def test_the_picture_is_not_turned_and_edges_stay_where_they_are(tmp_path: Path) -> None:
     """Scores in eighths: the edge of two classes comes back within a pixel, in a picture that is no multiple of anything."""
-    network = ImageClasses(str(segmentation(tmp_path / "n.onnx", 19, "o b 19 h w", inputs=DYNAMIC, stride=8)), CONFIG)
+    network = pixel_model(str(segmentation(tmp_path / "n.onnx", 19, "o b 19 h w", inputs=DYNAMIC, stride=8)), CONFIG)
     for height, width, edge in ((250, 1000, 400), (375, 1242, 500), (480, 640, 320), (1200, 1920, 900)):
         numbers = np.where(np.arange(width)[None] < edge, 8, 9) + np.zeros((height, 1), int)
-        found = network(frame_of(picture(numbers, 19)), later())
+        found = network(frame_of(picture(numbers, 19)), later()).classes
         assert set(np.unique(found)) == {C.VEGETATION, C.GROUND}
-        upright = network(frame_of(np.ascontiguousarray(picture(numbers, 19).transpose(1, 0, 2))), later())
+        upright = network(frame_of(np.ascontiguousarray(picture(numbers, 19).transpose(1, 0, 2))), later()).classes
         for at in ((found == C.VEGETATION).sum(axis=1), (upright == C.VEGETATION).sum(axis=0)):
             assert np.abs(at - edge).max() <= max(1, round(width / 1024 * 1.5)), (height, width)
 
@@ -245,7 +234,7 @@ REFUSED = [
     (SCORES, "labels: {0: raod}", "class name 'raod' is unknown; map it to one of other, vehicle"),
     (SCORES, "labels: kitti", "labels = 'kitti' is none of cityscapes"),
     (SCORES, "output: b", "there is no output 'b'"),
-    (SCORES, "mean: [1, 2]", "'mean:' must have 3 numbers"),
+    (SCORES, "mean: [1, 2]", "'mean:' of the YAML beside it must have 1 or 3 numbers"),
     (SCORES, "size: [512, 512]", "does not run at the height and width [512, 512]"),
     (SCORES, "channels: [range, x]", "must be rgb or bgr"),
     (SCORES, "family: zzz", "family 'zzz' is unknown; known are mmsegmentation, pidnet"),
@@ -253,8 +242,8 @@ REFUSED = [
     ({"classes": 3, "outputs": "s 1 3 256 512"}, "labels: [object, void, unknown]", "none of its classes is of use here"),
     ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "scores of 7 classes, which are of no known dataset"),
     ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "inputs: input float32 1x3x256x512; outputs: o float32 1x7x256x512"),
-    (MEANS, "", "this looks like a classifier of whole pictures"),
-    (MEANS, "labels: cityscapes", "(mean 1x19x1x1); known are scores NxCxHxW"),
+    (MEANS, "", "(mean 1x19x1x1); known are scores NxCxHxW"),
+    ({"classes": 256, "inputs": "1 3 64 64", "outputs": "s 1 256 64 64"}, "", "encoder of Segment Anything, for semantics"),
     ({"inputs": "1 5 64 1024", "outputs": "o 1 19 64 1024", "normal": ([0] * 5, [1] * 5)}, "", "takes one picture as 1x3xHxW"),
     (
         {"inputs": "1 3 1024 2048", "outputs": "s 1 19 4096 8192", "enlarged": 4},
@@ -269,7 +258,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("graph", "yaml", "says"), REFUSED)
 def test_networks_for_pictures_that_cannot_be_used(tmp_path: Path, graph: dict, yaml: str, says: str) -> None:
-    text = error_of(lambda: ImageClasses(str(beside(segmentation(tmp_path / "n.onnx", **graph), yaml)), CONFIG))
+    text = error_of(lambda: pixel_model(str(beside(segmentation(tmp_path / "n.onnx", **graph), yaml)), CONFIG))
     assert says in text
     assert str(tmp_path / "n.") in text
 
@@ -282,23 +271,23 @@ def test_networks_for_pictures_that_cannot_be_used(tmp_path: Path, graph: dict, 
     ],
 )
 def test_outputs_that_turn_out_to_hold_no_classes(tmp_path: Path, classes: int, outputs: str, level: int, says: str) -> None:
-    network = ImageClasses(str(segmentation(tmp_path / "n.onnx", classes, outputs)), CONFIG)
+    network = pixel_model(str(segmentation(tmp_path / "n.onnx", classes, outputs)), CONFIG)
     assert says in error_of(lambda: network(frame_of(DARK + np.uint8(level)), later()))
 
 
 def test_the_first_run_of_a_network_of_any_size_can_be_broken_off(tmp_path: Path) -> None:
     """What it gives is not seen before it runs; that run ends with the call's own deadline, and the next call tries again."""
     frame, asked = frame_of(DARK), itertools.count()
-    network = ImageClasses(str(endless(tmp_path / "slow.onnx", above=-9.0, size=("h", "w"))), CONFIG)
+    network = pixel_model(str(endless(tmp_path / "slow.onnx", above=-9.0, size=("h", "w"))), CONFIG)
     assert "output known after its first run" in network.describe()
     with pytest.raises(BudgetError, match="no longer wanted"):
         network(frame, Deadline(600, lambda: next(asked) > 5))
     with pytest.raises(BudgetError, match=r"budget of 0\.2 s"):
         network(frame, Deadline(0.2))
-    network = ImageClasses(str(endless(tmp_path / "quick.onnx", size=("h", "w"))), CONFIG)
-    assert (network(frame, later()) == C.GROUND).all()
+    network = pixel_model(str(endless(tmp_path / "quick.onnx", size=("h", "w"))), CONFIG)
+    assert (network(frame, later()).classes == C.GROUND).all()
     assert "output: scores of 19 classes" in network.describe()
-    scans = CloudClasses(str(scan_network(tmp_path, "bonnetal", size=(64, "w"))), CONFIG)
+    scans = point_model(str(scan_network(tmp_path, "bonnetal", size=(64, "w"))), CONFIG)
     with pytest.raises(BudgetError, match="no longer wanted"):
         scans(frame_of(DARK, cloud=scan()), Deadline(60, lambda: True))
     assert "output known after its first run" in scans.describe()
@@ -307,13 +296,12 @@ def test_the_first_run_of_a_network_of_any_size_can_be_broken_off(tmp_path: Path
 def test_a_network_of_any_size_that_gives_no_classes_says_so_in_its_first_run(tmp_path: Path) -> None:
     nodes = [helper.make_node("NonZero", ["i"], ["places"])]
     path = save(tmp_path / "n.onnx", nodes, [value("i", shape_of(DYNAMIC))], [value("places", None, Type.INT64)])
-    network = ImageClasses(str(path), CONFIG)
+    network = pixel_model(str(path), CONFIG)
     for _ in range(2):
         text = error_of(lambda: network(frame_of(DARK), later()))
         assert "none of its outputs is a map of classes for an input of 256x512 (places 4x393216); known are scores" in text
 
 
-# --- networks for scans ---------------------------------------------------------------------------------------------------
 # Of a scanner with 64 rings and 1024 columns per turn, whose every ray has its own pixel in the range image of that size.
 HIGH, LOW = 3.0, -25.0
 
@@ -328,7 +316,7 @@ def scan(columns: int = 1024) -> PointCloud:
     return PointCloud(xyz, (0.5 + 0.5 * np.cos(5 * yaw - 3 * down)).ravel().astype(np.float32))
 
 
-def classes_of(network: CloudClasses, cloud: PointCloud) -> np.ndarray:
+def classes_of(network: SegmentationModel, cloud: PointCloud) -> np.ndarray:
     return network(frame_of(DARK, cloud=cloud), later())
 
 
@@ -347,7 +335,7 @@ def scan_network(folder: Path, family: str, channel: str = "range", name: str = 
     return range_network(folder / f"{name}.onnx", at, order.index(channel), mean, std, **graph)
 
 
-def assert_labels(network: CloudClasses, family: str, channel: str, cloud: PointCloud, share: float = 1.0) -> None:
+def assert_labels(network: SegmentationModel, family: str, channel: str, cloud: PointCloud, share: float = 1.0) -> None:
     """Points get the class of the band that their own value lies in, but for those at its border."""
     names, (low, high) = FAMILIES[family][2], BANDS[channel]
     x, y, z = cloud.xyz.T
@@ -387,7 +375,7 @@ SCAN_EXPORTS = {
 def test_networks_for_scans_give_each_point_the_class_of_its_value(tmp_path: Path, name: str) -> None:
     family, graph, yaml, *channels = SCAN_EXPORTS[name]
     for channel in channels[0] if channels else ("range", "y"):
-        network = CloudClasses(str(beside(scan_network(tmp_path, family, channel, **graph), yaml)), CONFIG)
+        network = point_model(str(beside(scan_network(tmp_path, family, channel, **graph), yaml)), CONFIG)
         assert_labels(network, family, channel, scan())
         assert network.note == ""
         assert not channels or network.describe().startswith(f"{family}: 64x1024 ")
@@ -397,11 +385,11 @@ def test_assumed_statistics_are_said(tmp_path: Path) -> None:
     """Several outputs may be CENet's, whose mean and std are others."""
     said, heads = "(of bonnetal, assumed; say family: cenet, or mean and std, for others)", {"outputs": ["output", "aux_2"]}
     path = scan_network(tmp_path, "bonnetal", **heads)
-    assert said in CloudClasses(str(path), CONFIG).describe()
+    assert said in point_model(str(path), CONFIG).describe()
     for text in ("family: cenet", "family: bonnetal", TOLD):
-        assert said not in CloudClasses(str(beside(path, text)), CONFIG).describe()
+        assert said not in point_model(str(beside(path, text)), CONFIG).describe()
     for other in (scan_network(tmp_path, "cenet", name="cenet", **heads), scan_network(tmp_path, "bonnetal", name="one")):
-        assert said not in CloudClasses(str(other), CONFIG).describe()
+        assert said not in point_model(str(other), CONFIG).describe()
 
 
 def test_empty_pixels_are_zero_and_far_points_do_not_hide_near_ones(tmp_path: Path) -> None:
@@ -436,7 +424,7 @@ def test_points_without_a_return_have_no_class(tmp_path: Path) -> None:
     cloud = scan()
     xyz = cloud.xyz.copy()
     xyz[::3], xyz[1::7] = np.nan, 0
-    network = CloudClasses(str(scan_network(tmp_path, "bonnetal")), CONFIG)
+    network = point_model(str(scan_network(tmp_path, "bonnetal")), CONFIG)
     plain, found = (classes_of(network, given) for given in (cloud, PointCloud(xyz, cloud.intensity)))
     lost = ~PointCloud(xyz).finite_mask()
     assert (found[lost] == UNLABELLED).all()
@@ -450,7 +438,7 @@ def test_the_width_follows_the_scan(tmp_path: Path) -> None:
     for columns, width in ((480, 512), (512, 512), (1024, 1024), (1800, 2048), (2048, 2048)):
         feeds, _, note = dynamic.feed(scan(columns))
         assert (feeds["input"].shape[3], note) == (width, "")
-    fixed = CloudClasses(str(scan_network(tmp_path, "bonnetal", name="fixed")), CONFIG)
+    fixed = point_model(str(scan_network(tmp_path, "bonnetal", name="fixed")), CONFIG)
     for columns in (512, 2048):
         classes_of(fixed, scan(columns))
         assert f"takes 1024 columns per turn, but the scan has {columns}" in fixed.note
@@ -461,10 +449,10 @@ def test_the_width_follows_the_scan(tmp_path: Path) -> None:
 def test_another_field_of_view(tmp_path: Path) -> None:
     path, cloud = scan_network(tmp_path, "bonnetal", "z"), scan()
     tilted = PointCloud(cloud.xyz * np.array([1, 1, -1], np.float32), cloud.intensity)
-    network = CloudClasses(str(path), CONFIG)
+    network = point_model(str(path), CONFIG)
     classes_of(network, tilted)
     assert "of the points lie outside of the elevations -25 to +3 deg" in network.note
-    network = CloudClasses(str(beside(path, "fov_deg: [25, -3]")), CONFIG)
+    network = point_model(str(beside(path, "fov_deg: [25, -3]")), CONFIG)
     classes_of(network, tilted)
     assert network.note == ""
     assert "-3 to +25 deg" in network.describe()
@@ -473,7 +461,7 @@ def test_another_field_of_view(tmp_path: Path) -> None:
 def test_a_network_for_a_part_of_the_turn(tmp_path: Path) -> None:
     """SqueezeSeg's own networks see the quarter ahead, in columns as dense as the scanner's."""
     path = beside(scan_network(tmp_path, "squeezeseg", "y", size=(64, 512)), "azimuth_deg: 90")
-    network, cloud = CloudClasses(str(path), CONFIG), scan(2048)
+    network, cloud = point_model(str(path), CONFIG), scan(2048)
     found = classes_of(network, cloud)
     assert network.note == ""
     ahead = np.abs(np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])) < np.deg2rad(45)
@@ -512,16 +500,13 @@ def test_networks_for_scans_that_cannot_be_used(tmp_path: Path) -> None:
         (usual, "size: [64, 512]", "does not run at the height and width"),
         (usual, "labels: [car]", "names 1 classes"),
     ):
-        assert says in error_of(lambda path=path, yaml=yaml: CloudClasses(str(beside(path, yaml)), CONFIG))
-
-
-# --- classes that are given -----------------------------------------------------------------------------------------------
+        assert says in error_of(lambda path=path, yaml=yaml: point_model(str(beside(path, yaml)), CONFIG))
 
 
 def test_labels_of_the_source(drive: SyntheticDrive) -> None:
     frame = drive[0]
-    pixels, points = ImageClasses("source", CONFIG), CloudClasses("source", CONFIG)
-    assert np.array_equal(pixels(frame, later()), frame.classes)
+    pixels, points = pixel_model("source", CONFIG), point_model("source", CONFIG)
+    assert np.array_equal(pixels(frame, later()).classes, frame.classes)
     returns = frame.cloud.finite_mask()
     found = points(frame, later())
     assert np.array_equal(found[returns], frame.cloud.label[returns])
@@ -541,7 +526,7 @@ def test_label_pictures_of_few_bits(tmp_path: Path, bits: int, labels, palette: 
     numbers = blocks(90, 161, 2**bits)
     (tmp_path / "labels.yaml").write_text(f"labels: {'camvid' if labels is CAMVID else labels}")
     (tmp_path / "a.png").write_bytes(png(numbers, bits, palette))
-    found = ImageClasses(str(tmp_path), CONFIG)(frame_of(np.zeros((90, 161, 3), np.uint8), "a"), later())
+    found = pixel_model(str(tmp_path), CONFIG)(frame_of(np.zeros((90, 161, 3), np.uint8), "a"), later()).classes
     assert np.array_equal(found, lookup(labels)[numbers])
 
 
@@ -550,29 +535,29 @@ def encoded(numbers: np.ndarray) -> bytes:
 
 
 def test_a_folder_of_label_pictures(tmp_path: Path) -> None:
-    assert "holds no label pictures *.png" in error_of(lambda: ImageClasses(str(tmp_path), CONFIG))
+    assert "holds no label pictures *.png" in error_of(lambda: pixel_model(str(tmp_path), CONFIG))
     numbers = blocks(90, 160, 34).astype(np.uint8)
     frame = frame_of(np.zeros((90, 160, 3), np.uint8), "1317.000000005")
     for data in (encoded(numbers), encoded(numbers.astype(np.uint16)), png(numbers, 8, True)):
         (tmp_path / "1317.000000005.png").write_bytes(data)
-        assert np.array_equal(ImageClasses(str(tmp_path), CONFIG)(frame, later()), lookup(CITYSCAPES_RAW)[numbers])
+        assert np.array_equal(pixel_model(str(tmp_path), CONFIG)(frame, later()).classes, lookup(CITYSCAPES_RAW)[numbers])
     # For a picture of twice the size.
     double = frame_of(np.zeros((180, 320), np.uint8), frame.name)
     expected = lookup(CITYSCAPES_RAW)[numbers].repeat(2, axis=0).repeat(2, axis=1)
-    folder = ImageClasses(str(tmp_path), CONFIG)
-    assert np.array_equal(folder(double, later()), expected)
+    folder = pixel_model(str(tmp_path), CONFIG)
+    assert np.array_equal(folder(double, later()).classes, expected)
     assert folder.describe() == "folder of 1 label pictures *.png"
     (tmp_path / "labels.yaml").write_text("labels: camvid")
-    assert np.array_equal(ImageClasses(str(tmp_path), CONFIG)(frame, later()), lookup(CAMVID)[numbers])
+    assert np.array_equal(pixel_model(str(tmp_path), CONFIG)(frame, later()).classes, lookup(CAMVID)[numbers])
     (tmp_path / "labels.yaml").write_text("labels: {0: sky, 1: cow}")
-    assert "labels.yaml: class name 'cow'" in error_of(lambda: ImageClasses(str(tmp_path), CONFIG))
+    assert "labels.yaml: class name 'cow'" in error_of(lambda: pixel_model(str(tmp_path), CONFIG))
 
 
 def test_label_pictures_that_cannot_be_used(tmp_path: Path) -> None:
     frame = frame_of(np.zeros((90, 160, 3), np.uint8), "a")
     numbers = blocks(90, 160, 34).astype(np.uint8)
     (tmp_path / "a.png").write_bytes(encoded(numbers))
-    folder = ImageClasses(str(tmp_path), CONFIG)
+    folder = pixel_model(str(tmp_path), CONFIG)
     assert "b.png cannot be read" in error_of(lambda: folder(replace(frame, name="b"), later()))
     for name in ("", "../a", "x/a"):
         assert "is no plain file name: label pictures" in error_of(lambda name=name: folder(replace(frame, name=name), later()))
@@ -590,16 +575,16 @@ def test_label_pictures_that_cannot_be_used(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_label_files(tmp_path: Path) -> None:
-    assert "holds no label files *.label" in error_of(lambda: CloudClasses(str(tmp_path), CONFIG))
+    assert "holds no label files *.label" in error_of(lambda: point_model(str(tmp_path), CONFIG))
     cloud = PointCloud(np.array([[5, 0, 0], [6, 1, 0], [7, 0, 1], [np.nan] * 3, [9, 9, 0], [4, 4, 4]], np.float32))
     frame = frame_of(DARK, "000007", cloud)
     numbers = np.array([10, 252 + (3 << 16), 80, 40, 0, 71], "<u4")  # instances stand in the upper half
     numbers.tofile(tmp_path / "000007.label")
-    folder = CloudClasses(str(tmp_path), CONFIG)
+    folder = point_model(str(tmp_path), CONFIG)
     assert folder(frame, later()).tolist() == [C.VEHICLE, C.VEHICLE, C.POLE, UNLABELLED, UNLABELLED, C.VEGETATION]
     assert folder.describe() == "folder of 1 label files *.label"
     (tmp_path / "labels.yaml").write_text("labels: {10: person, 80: building}")
-    found = CloudClasses(str(tmp_path), CONFIG)(frame, later()).tolist()
+    found = point_model(str(tmp_path), CONFIG)(frame, later()).tolist()
     assert found == [C.PERSON, UNLABELLED, C.BUILDING, UNLABELLED, UNLABELLED, UNLABELLED]
     for wrong in (numbers[:-1], np.append(numbers, 0), numbers.view(np.uint8)[:-1]):
         wrong.tofile(tmp_path / "000007.label")
@@ -612,12 +597,12 @@ def test_a_real_scan(tmp_path: Path, kitti_root: Path) -> None:
     """Labels of SemanticKITTI; a network of any width runs at 2048, and points get the class of their own range."""
     sequence = kitti_root / "odometry/sequences/00"
     frame = KittiSource(sequence)[0]
-    found = CloudClasses(str(sequence / "labels"), CONFIG)(frame, later())
+    found = point_model(str(sequence / "labels"), CONFIG)(frame, later())
     raw = np.fromfile(sequence / "labels/000000.label", "<u4") & 0xFFFF
     for cls, numbers in ((C.GROUND, [40, 44, 48, 49, 60, 72]), (C.POLE, [80]), (UNLABELLED, [0, 1])):
         assert np.array_equal(found == cls, np.isin(raw, numbers))
     height = frame.cloud.xyz[:, 2]
     assert np.median(height[found == C.GROUND]) < -1.5 < np.median(height[found == C.BUILDING])
-    network = CloudClasses(str(scan_network(tmp_path, "bonnetal", size=(64, "width"))), CONFIG)
+    network = point_model(str(scan_network(tmp_path, "bonnetal", size=(64, "width"))), CONFIG)
     assert_labels(network, "bonnetal", "range", frame.cloud, 0.95)
     assert network.note == ""

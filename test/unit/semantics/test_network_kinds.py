@@ -12,10 +12,10 @@ from sam_graphs import encoder, fast_sam, other, raw_encoder, sam2_pair
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import ModelError
-from calib_ros_semantics.models.image_classes import ImageClasses
+from calib_ros_semantics.models.image_classes import ImageNetwork
 from calib_ros_semantics.models.network_kinds import NetworkKind, kind_of
 from calib_ros_semantics.models.onnx_model import OnnxModel
-from calib_ros_semantics.models.segment_anything import SegmentAnything
+from calib_ros_semantics.models.segment_anything import segmenter_of
 
 CONFIG = SemanticsConfig()
 
@@ -46,7 +46,7 @@ BOXES = {
 def test_detectors(tmp_path: Path, name: str) -> None:
     path = made(tmp_path / "n.onnx", *BOXES[name])
     assert kind_of(OnnxModel(path, CONFIG)) == NetworkKind.DETECTOR
-    for load in (lambda: ImageClasses(str(path), CONFIG), lambda: SegmentAnything(SemanticsConfig(segment_anything=str(path)))):
+    for load in (lambda: ImageNetwork(path, CONFIG), lambda: segmenter_of(SemanticsConfig(segment_anything=str(path)))):
         with pytest.raises(ModelError, match="this looks like a detector of boxes"):
             load()
 
@@ -60,7 +60,7 @@ def test_networks_for_masks_are_no_networks_for_classes(tmp_path: Path) -> None:
     ):
         assert kind_of(OnnxModel(path, CONFIG)) == kind, path
         with pytest.raises(ModelError, match=f"this looks like {kind.value}"):
-            ImageClasses(path, CONFIG)
+            ImageNetwork(path, CONFIG)
 
 
 def test_classifiers_and_networks_for_classes(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_classifiers_and_networks_for_classes(tmp_path: Path) -> None:
         path = segmentation(tmp_path / "n.onnx", 19, outputs, **graph)
         assert kind_of(OnnxModel(path, CONFIG)) == NetworkKind.CLASSES, outputs
         with pytest.raises(ModelError, match="this looks like a network for classes of pixels"):
-            SegmentAnything(SemanticsConfig(segment_anything=str(path)))
+            segmenter_of(SemanticsConfig(segment_anything=str(path)))
     nodes = [helper.make_node("NonZero", ["i"], ["o"])]
     free = save(tmp_path / "f.onnx", nodes, [value("i", [1, 3, "h", "w"])], [value("o", None, Type.INT64)])
     assert kind_of(OnnxModel(free, CONFIG)) == NetworkKind.OTHER

@@ -7,7 +7,7 @@ import pytest
 
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as C
-from calib_ros_semantics.models.plausible import implausible, of_little_use
+from calib_ros_semantics.models.segmentation import implausible, of_little_use
 from calib_ros_synthetic.drive import SyntheticDrive
 
 ALL = frozenset(int(c) for c in C)

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 import sam_graphs as graphs
-from masks_of_pictures import compared, frame_of, iou, later
+from masks_of_pictures import compared, frame_of, iou, later, picture_of
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros_semantics.models.image_classes import ImageInput
-from calib_ros_semantics.models.masks import Masks
+from calib_ros_semantics.models.masks import Mask
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
-from calib_ros_semantics.models.segment_anything import SegmentAnything
+from calib_ros_semantics.models.segment_anything import segmenter_of
 
 BACKGROUND = (90, 90, 90)
 COLOUR = np.array([40.0, 60, 200])  # BGR
@@ -39,8 +39,8 @@ SCENES = {"wide": painted((360, 640), WIDE), "tall": painted((480, 300), TALL)}
 IMAGE, TRUTH = SCENES["wide"]
 
 
-def segment(config: SemanticsConfig, image: np.ndarray) -> Masks:
-    return SegmentAnything(config)(frame_of(image), later())
+def segment(config: SemanticsConfig, image: np.ndarray) -> list[Mask]:
+    return segmenter_of(config)(frame_of(image), later())
 
 
 def assert_finds(config: SemanticsConfig, image: np.ndarray, truth: list[np.ndarray], enough: float = 0.8) -> None:
@@ -101,12 +101,12 @@ ANY_SHAPE += [f"samexporter{more}" for more in ("", " of a fixed size")]
 def test_every_export_finds_each_thing_where_it_is(tmp_path: Path, convention: str, shape: str) -> None:
     image, truth = SCENES[shape]
     masks = segment(settings(*PAIRS[convention](tmp_path)), image)
-    assert masks.size == image.shape[:2]
     assert len(masks) == len(truth)
-    assert np.abs(masks.score - 0.97).max() < 0.001  # the model's own, which says that labels and prompts were as it wants them
+    # The model's own, which says that labels and prompts were as it wants them.
+    assert [mask.score for mask in masks] == pytest.approx([0.97] * len(masks), abs=0.001)
     cell = cell_of(shape, convention)
     for true in truth:
-        best = max((masks.picture(k) for k in range(len(masks))), key=lambda picture: iou(picture, true))
+        best = max((picture_of(mask, true.shape) for mask in masks), key=lambda picture: iou(picture, true))
         inner = cv2.distanceTransform(np.pad(true, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
         outer = cv2.distanceTransform((~true).astype(np.uint8), cv2.DIST_L2, 5)
         assert max(inner[true & ~best].max(initial=0), outer[best & ~true].max(initial=0)) <= cell + 1
@@ -124,11 +124,11 @@ def test_the_yaml_beside_the_encoder_tells_the_family(tmp_path: Path) -> None:
     encoder, decoder = official(tmp_path)
     # The same numbers as without, for grey levels 0..1.
     (tmp_path / "encoder.yaml").write_text("family: mobile_sam\nmean: [0.485, 0.456, 0.406]\nstd: [0.229, 0.224, 0.225]\n")
-    assert SegmentAnything(settings(encoder, decoder)).describe().startswith("Segment Anything (mobilesam), 5 prompts")
+    assert segmenter_of(settings(encoder, decoder)).describe().startswith("Segment Anything (mobilesam), 5 prompts")
     assert_finds(settings(encoder, decoder), IMAGE, TRUTH)
     (tmp_path / "encoder.yaml").write_text("family: segnet\n")
     with pytest.raises(ModelError, match=r"family 'segnet'.*mobilesam.*efficientsam"):
-        SegmentAnything(settings(encoder, decoder))
+        segmenter_of(settings(encoder, decoder))
 
 
 @pytest.mark.parametrize(
@@ -151,38 +151,30 @@ def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text
     encoder, decoder = official(tmp_path)
     (tmp_path / "encoder.yaml").write_text(text)
     image = np.full((64, 64, 3), COLOUR, np.uint8)
-    halves = SegmentAnything(settings(encoder, decoder))._segmenter
-    embedded = halves.encoder(image, later())  # type: ignore[union-attr]
+    halves = segmenter_of(settings(encoder, decoder))
+    embedded = halves.encoder(image, later())
     cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
     assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
     network = ImageInput(OnnxModel(encoder, SemanticsConfig())).feed(image)["input_image"]
     assert network[0, :, 500, 500] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("mean: [1, 2]", r"'mean:' of the YAML beside it must have 1 or 3 numbers"),
-        ("std: [1, 2, 3, 4]", r"'std:' of the YAML beside it must have 1 or 3 numbers"),
-        ("channels: [range, x]", r"'channels:' of the YAML beside it must be rgb or bgr"),
-    ],
-)
-def test_a_yaml_that_no_picture_fits(tmp_path: Path, text: str, says: str) -> None:
+def test_a_yaml_that_no_picture_fits(tmp_path: Path) -> None:
     for model in (official(tmp_path), (in_wide(tmp_path),)):
-        Path(model[0]).with_suffix(".yaml").write_text(text)
-        with pytest.raises(ModelError, match=rf"{Path(model[0]).name}: {says}"):
-            SegmentAnything(settings(*model))
+        Path(model[0]).with_suffix(".yaml").write_text("std: [1, 2, 3, 4]")
+        with pytest.raises(ModelError, match=rf"{Path(model[0]).name}: 'std:' of the YAML beside it must have 1 or 3 numbers"):
+            segmenter_of(settings(*model))
 
 
 def test_the_yaml_beside_the_decoder_names_the_masks(tmp_path: Path) -> None:
     config = settings(*official(tmp_path))
     for name in ("masks", "low_res_masks"):
         (tmp_path / "decoder.yaml").write_text(f"output: {name}")
-        assert SegmentAnything(config)._segmenter.decoder.roles.masks.name == name  # type: ignore[union-attr]
+        assert segmenter_of(config).decoder.roles.masks.name == name
         assert_finds(config, IMAGE, TRUTH)
     (tmp_path / "decoder.yaml").write_text("output: mask")
     with pytest.raises(ModelError, match=r"decoder\.onnx: there is no output 'mask'.*low_res_masks"):
-        SegmentAnything(config)
+        segmenter_of(config)
 
 
 @pytest.mark.parametrize("transposed", [False, True])
@@ -194,17 +186,17 @@ def test_fast_sam(tmp_path: Path, transposed: bool) -> None:
             own = [(left + right) / 2, (upper + lower) / 2 + TOP, right - left + grown, lower - upper + grown]
             rows.append([*own, confidence, *np.eye(len(palette))[k]])
     rows += [[320, 320, 10, 10, 0.1, *np.zeros(len(palette))]] * 50
-    model = SegmentAnything(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, np.array(rows), palette, transposed)))
+    model = segmenter_of(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, np.array(rows), palette, transposed)))
     masks = model(frame_of(IMAGE), later())
     assert model.describe().startswith("FastSAM, 640x640 RGB, fed as v / 255 of grey levels v in 0..255 (assumed")
     assert compared(masks, TRUTH, 0.95) == (1.0, 0, 0)
-    assert masks.score == pytest.approx([0.9, 0.8, 0.7, 0.6])
+    assert [mask.score for mask in masks] == pytest.approx([0.9, 0.8, 0.7, 0.6])
 
 
 TWO_ALIKE = {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (40, 60, 200)}
 
 
-def of_two(folder: Path, **wrong: float) -> Masks:
+def of_two(folder: Path, **wrong: float) -> list[Mask]:
     """Masks of two things of a colour; wrong: columns of the first's detection."""
     detections = np.array([[120, 90 + TOP, 160, 120, 0.9, 1], [360, 195 + TOP, 120, 270, 0.8, 1]] + [[0] * 6] * 20)
     for column, value in wrong.items():
@@ -214,10 +206,7 @@ def of_two(folder: Path, **wrong: float) -> Masks:
 
 
 def test_fast_sam_cuts_off_what_lies_beyond_the_box(tmp_path: Path) -> None:
-    assert np.abs(np.array([mask.box for mask in of_two(tmp_path).masks]) - list(TWO_ALIKE)).max() <= 4
-
-
-TOP = 140  # rows above the wide picture's 360 in the middle of 640
+    assert np.abs(np.array([mask.box for mask in of_two(tmp_path)]) - list(TWO_ALIKE)).max() <= 4
 
 
 TOP = 140  # rows above the wide picture's 360 in the middle of 640
@@ -247,21 +236,21 @@ def test_fast_sam_with_a_yaml(tmp_path: Path) -> None:
     for name in ("nothing", "many"):
         yaml.write_text(f"output: {name}")
         with pytest.raises(ModelError, match=rf"fast\.onnx: '{name}', which 'output:'.*outputs: empty"):
-            SegmentAnything(settings(path))
+            segmenter_of(settings(path))
 
 
 @pytest.mark.parametrize(("column", "bad"), [("c0", np.nan), ("c3", np.inf), ("c3", -np.inf), ("c5", np.nan), ("c5", np.inf)])
 def test_fast_sam_drops_nan_detections(tmp_path: Path, column: str, bad: float) -> None:
     masks = of_two(tmp_path, **{column: bad})
-    assert masks.score == pytest.approx([0.8])
-    assert masks.masks[0].box == pytest.approx(list(TWO_ALIKE)[1], abs=4)
+    assert [mask.score for mask in masks] == pytest.approx([0.8])
+    assert masks[0].box == pytest.approx(list(TWO_ALIKE)[1], abs=4)
 
 
 def test_fast_sam_with_nms_inside_is_refused(tmp_path: Path) -> None:
     says = r"fast\.onnx: it was exported with NMS inside; export it with nms=False"
     for metadata in ({"nms": "True"}, {"end2end": "True"}, {"args": "{'batch': 1, 'half': False, 'nms': True}"}):
         with pytest.raises(ModelError, match=says):
-            SegmentAnything(settings(in_wide(tmp_path, metadata=metadata)))
+            segmenter_of(settings(in_wide(tmp_path, metadata=metadata)))
     without = {"nms": "False", "args": "{'batch': 1, 'nms': False}", "end2end": "False"}
     assert_finds_things(in_wide(tmp_path, metadata=without))
     # Nothing said: corners, confidence, class, coefficients, filled up with nothing; fewer rows than columns, too.
@@ -282,14 +271,15 @@ def test_files_without_an_encoder_decoder_pair_are_refused(tmp_path: Path) -> No
         ((decoder, encoder), r"no pair"),
         ((small, decoder), r"the encoder gives image_embeddings.*32x32.*decoder takes.*64x64"),
         ((encoder,), r"semantics\.segment_anything_decoder"),
+        ((graphs.other(tmp_path / "o.onnx"),), "this looks like a classifier of whole pictures"),
         ((encoder, str(tmp_path / "gone.onnx")), r"gone\.onnx.*no such file"),
     ):
         with pytest.raises(ModelError, match=says):
-            SegmentAnything(settings(*pair))
+            segmenter_of(settings(*pair))
 
 
 def test_deadline_ends_segmentation(tmp_path: Path) -> None:
-    model, asked = SegmentAnything(settings(*official(tmp_path))), itertools.count()
+    model, asked = segmenter_of(settings(*official(tmp_path))), itertools.count()
     # At once, and somewhere among the prompts.
     for deadline in (Deadline(0), Deadline(60, lambda: next(asked) > 8)):
         with pytest.raises(BudgetError):

@@ -52,22 +52,6 @@ def offsets(shape: tuple[int, int], y: int, x: int) -> tuple[np.ndarray, np.ndar
 # Density completion, eq. 3.11 and figure 3.13
 
 
-def test_a_single_point_fills_a_square_of_20_px_with_cut_corners():
-    """Diamond of 2 px, then squares of 3 and of 15 px around what is there: rows and columns that exceed 18 px exceed it by
-    2 px together. The median takes a corner pixel away where less than 13 of its 25 are filled. All else stays empty."""
-    dense = complete(single((61, 61), (30, 30, 77)))
-    y, x = offsets((61, 61), 30, 30)
-    cut = np.maximum(y - 18, 0) + np.maximum(x - 18, 0) <= 2
-    before_blur = (y <= 20) & (x <= 20) & cut
-    counted = ndimage.convolve(before_blur.astype(int), np.ones((5, 5), int), mode="constant")
-    assert np.array_equal(dense, np.where(counted >= 13, 77, 0))
-    assert dense[30, 10] == dense[30, 50] == dense[10, 30] == dense[50, 30] == 77
-    assert dense[30, 9] == dense[30, 51] == dense[10, 10] == 0
-    nothing = np.zeros((61, 61), np.int16)
-    assert not complete(nothing).any()
-    assert not complete_depth(nothing, FAR).any()
-
-
 def test_completion_agrees_with_the_same_steps_of_scipy():
     for share, shape in itertools.product((0.003, 0.03, 0.3), ((40, 50), (120, 90), (7, 64))):
         sparse = sparse_map(shape, share, seed=1)
@@ -83,6 +67,7 @@ def test_completion_agrees_with_the_same_steps_of_scipy():
         dense = ndimage.median_filter(dense, size=5, mode="nearest")
         assert dense.any()
         assert np.array_equal(complete(sparse), dense)
+    assert not complete(np.zeros((61, 61), np.int16)).any()
 
 
 def test_a_point_acts_on_nothing_beyond_the_reach():
@@ -125,16 +110,6 @@ def test_buffers_give_the_same_to_the_bit_however_often_and_for_whatever_shape()
 # Closing of the object map
 
 
-def test_closing_fills_gaps_narrower_than_its_square_and_grows_nothing():
-    labels = np.zeros((20, 40), np.uint8)
-    labels[8:12, 10:14] = labels[8:12, 18:22] = 5  # a gap of 4
-    expected = labels.copy()
-    expected[8:12, 14:18] = 5
-    assert np.array_equal(close_gaps(labels, 5), expected)
-    assert np.array_equal(close_gaps(labels, 4), labels)  # the square fits into the gap
-    assert np.array_equal(close_gaps(labels, 1), labels)
-
-
 def test_closing_of_odd_and_even_sizes_stays_in_place():
     """No label sinks, what is closed stays closed, and turning the map turns the result; odd sizes are scipy's."""
     for size in (1, 2, 3, 4, 9, 10, 31):
@@ -150,9 +125,6 @@ def test_closing_of_odd_and_even_sizes_stays_in_place():
         out = np.empty_like(labels)
         assert np.shares_memory(close_gaps(labels, size, out), out)
         assert np.array_equal(out, closed)
-
-
-# Levels of the points
 
 
 def attributes_of(depth, reflectivity, ground, label) -> PointAttributes:
@@ -186,9 +158,6 @@ def test_depth_is_inverted_about_the_farthest_that_passes():
     assert low_level(ThesisConfig(low_reflectivity=0.3)) == 300
     for level in (1, 2, 5999, FAR):  # and inverted back at both ends
         assert set(np.unique(complete_depth(single((61, 61), (30, 30, level)), FAR))) == {0, level}
-
-
-# Edge maps
 
 
 def wall_and_box(share: float = 0.25, seed: int = 7) -> tuple[np.ndarray, np.ndarray, PointAttributes]:
@@ -283,9 +252,6 @@ def test_the_scan_s_edges_are_the_mean_of_three_where_points_are():
     assert total[v, u] == pytest.approx(mean[v, u], abs=1e-6)
     assert 0.5 < total.max() <= 1
     assert (mean[~maps.occupied] > 0.3).any()  # the operator alone finds edges between the points too
-
-
-# The fast form
 
 
 def scattered(seed: int, shape: tuple[int, int], share: float, region: tuple[slice, slice]):

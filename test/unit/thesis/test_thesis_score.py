@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 from scenes import QUICK_SEARCH, RenderedDrive
-from thesis_objectives import thesis_objective
 
 from calib_ros import Calibrator, SearchBox, se3
 from calib_ros.camera import Camera
@@ -105,9 +104,6 @@ def test_of_points_on_one_pixel_the_last_is_shown():
     assert dict(zip(pixels.tolist(), points.tolist(), strict=True)) == {7: 12, 5: 13, 3: 14}
 
 
-# ---- on a scene ---------------------------------------------------------------------------------------------------------
-
-
 @dataclasses.dataclass
 class Scene:
     camera: Camera
@@ -195,20 +191,6 @@ def test_attached_edges_score_as_they_do_where_they_are(scene):
     assert by_hand > 0.2
 
 
-def test_attached_edges_have_an_exact_gradient(scene):
-    score = ThesisScore(scene.thesis, scene.truth, THESIS).attached(scene.truth).at(1)
-    T = off(scene.truth, 0, 0.3, 0.03)
-    gradient, _ = score.linearise(T)
-    step = np.repeat([1e-3, 1e-2], 3)
-    numeric = [
-        (score.value(se3.exp(s * axis) @ T) - score.value(se3.exp(-s * axis) @ T)) / (2 * s)
-        for s, axis in zip(step, np.eye(6), strict=True)
-    ]
-    assert gradient == pytest.approx(numeric, rel=0.2, abs=0.05 * np.abs(numeric).max())
-
-
-# ---- as the calibrator's objective --------------------------------------------------------------------------------------
-
 ONCE = {"dense_edges": "once_per_level"}
 METHODS: dict[str, dict[str, dict[str, object]]] = {
     "nelder_mead": {"refine": {"objective": "thesis"}, "thesis": {"evaluations": 80}},
@@ -252,14 +234,6 @@ def test_repeated_optimum_is_not_refused(scene, optimizer):
         scores.append(result.score)
     assert scores == sorted(scores)
     assert se3.rotation_error_deg(scene.truth, T) < 0.4
-
-
-def test_optimizer_does_not_change_the_validation(scene):
-    ends = [
-        thesis_objective(scene.features, scene.truth, Config.from_dict(METHODS[method])).edges.optimise(off(scene.truth, 2))
-        for method in ("nelder_mead", "barzilai_borwein")
-    ]
-    assert np.array_equal(*ends)
 
 
 @pytest.mark.parametrize("method", ["nelder_mead", "attached"])
@@ -354,15 +328,3 @@ def test_covariance_includes_the_systematic_error_of_the_objective(scene):
     assert (sigma["thesis"][:3] >= np.deg2rad(0.1)).all()
     assert (sigma["thesis"][3:] >= 0.03).all()
     assert (sigma["fast"] < sigma["thesis"]).all()
-
-
-def test_first_step_bounds_the_optimizer_range(scene, monkeypatch):
-    """A simplex of a hair's breadth stays where it begins; one of degrees does not."""
-    moved = []
-    for step in (0.01, 1.6):
-        monkeypatch.setattr("calib_ros_thesis.objective.FIRST_SIMPLEX_DEG", step)
-        config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"evaluations": 40}})
-        objective = thesis_objective(scene.features[:1], scene.truth, config)
-        start = off(scene.truth, 3)
-        moved.append(se3.rotation_error_deg(start, objective.optimise(start)))
-    assert moved[0] < 0.3 < moved[1]
