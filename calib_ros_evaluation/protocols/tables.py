@@ -16,7 +16,7 @@ from calib_ros_evaluation.protocols.detection import INCONCLUSIVE, RIGHT, RIGHT_
 from calib_ros_evaluation.protocols.published import ACCURACIES, CAVEATS, INTRODUCTIONS, OURS, TITLES, Published, rows_of
 from calib_ros_evaluation.report.sections import Section
 from calib_ros_evaluation.report.statistics import median, wilson
-from calib_ros_evaluation.report.table import NONE, Cell, Rows, Table, degrees, number, table
+from calib_ros_evaluation.report.table import NONE, Rows, Table, degrees, number, percent, table
 from calib_ros_evaluation.results import Trial
 
 DECISIONS = "decisions.csv"
@@ -56,18 +56,18 @@ def _of(trials: Sequence[Trial], size: Size, scene: str, count: int) -> list[Tri
     return [t for t in trials if _is_of(t, size) and (t.scene, len(t.frames)) == (scene, count)]
 
 
-def _published(row: Published) -> list[Cell | str]:
+def _published(row: Published) -> list[str]:
     system = f"{row.system} ({'learned' if row.learned else 'classical'})"
-    errors = _deg(row.rotation_deg), _cm(row.translation_m)
-    return [system, row.data, str(row.frames or NONE), NONE, _percent(row.success), *([NONE] * 5), *errors]
+    errors = degrees(row.rotation_deg), number(100 * row.translation_m, 2)
+    return [system, row.data, str(row.frames or NONE), NONE, percent(row.success, 1), *([NONE] * 5), *errors]
 
 
-def _figures(protocol: Protocol, own: Sequence[Trial]) -> list[Cell | str]:
+def _figures(protocol: Protocol, own: Sequence[Trial]) -> list[str]:
     n, succeeded = len(own), sum(map(protocol.succeeded, own))
     accepted = [t for t in own if t.status == "done"]
     return [
         str(n),
-        _percent(succeeded / n),
+        percent(succeeded / n, 1),
         _interval(succeeded, n),
         str(n - len(accepted)),
         str(sum(map(protocol.wrong, own))),
@@ -76,11 +76,12 @@ def _figures(protocol: Protocol, own: Sequence[Trial]) -> list[Cell | str]:
     ]
 
 
-def _means(trials: Sequence[Trial]) -> list[Cell | str]:
+def _means(trials: Sequence[Trial]) -> list[str]:
     """Mean errors. A refused trial ends at its start, and counts with its error."""
     if not trials:
         return [NONE, NONE]
-    return [_deg(float(np.mean([t.rotation_deg for t in trials]))), _cm(float(np.mean([t.translation_m for t in trials])))]
+    deg, m = np.mean([(t.rotation_deg, t.translation_m) for t in trials], axis=0).tolist()
+    return [degrees(deg), number(100 * m, 2)]
 
 
 def _cpu(trials: Sequence[Trial]) -> str:
@@ -138,14 +139,14 @@ def accuracy_table(found: Sequence[Decision], counts: Sequence[int]) -> Table:
         alarms = [one for one in own if one.set_name == RIGHT_SET]
         shares = [_right(own, name) for name in ("rot_hard", "trans_easy")]
         false = f"{sum(one.kind == WRONG for one in alarms)} of {len(alarms)}"
-        rows.append([THIS, str(count), str(len(own)), _percent(right / len(own)), _interval(right, len(own)), *shares, false])
+        rows.append([THIS, str(count), str(len(own)), percent(right / len(own), 1), _interval(right, len(own)), *shares, false])
     header = ("system", "frames", "decisions", "all", "95 %", "rot_hard", "trans_easy", "false alarms")
     return table("Share of right decisions", header, rows)
 
 
-def _right(found: Sequence[Decision], name: str) -> Cell:
+def _right(found: Sequence[Decision], name: str) -> str:
     own = [one for one in found if one.set_name == name]
-    return _percent(sum(one.kind == RIGHT for one in own) / len(own) if own else math.nan)
+    return percent(sum(one.kind == RIGHT for one in own) / len(own) if own else math.nan, 1)
 
 
 def _check_cpu(found: Sequence[Decision], counts: Sequence[int]) -> str:
@@ -164,10 +165,6 @@ def write_decisions(folder: Path, found: Sequence[Decision]) -> Path:
     return folder / DECISIONS
 
 
-def _percent(share: float) -> Cell:
-    return Cell(NONE if math.isnan(share) else f"{100 * share:.1f} %", share)
-
-
 def _stated(share: float) -> str:
     """With the digits that are published: 99.97 % is not 100.0 %."""
     return f"{100 * share:.4g} %"
@@ -176,11 +173,3 @@ def _stated(share: float) -> str:
 def _interval(successes: int, n: int) -> str:
     low, high = wilson(successes, n)
     return f"{100 * low:.0f} to {100 * high:.0f} %"
-
-
-def _deg(value: float) -> Cell:
-    return degrees(value)
-
-
-def _cm(value_m: float) -> Cell:
-    return number(100 * value_m, 2)

@@ -30,9 +30,9 @@ from calib_ros_evaluation.protocols.detection import (
     read_table,
     run_checks,
 )
+from calib_ros_evaluation.protocols.evaluate import collected, drawn, run_trials, trial_jobs
 from calib_ros_evaluation.protocols.published import rows_of
 from calib_ros_evaluation.protocols.tables import accuracy_table, sets_table, size_table, trial_section
-from calib_ros_evaluation.protocols.trials import collected, drawn, run_trials, trial_jobs
 from calib_ros_evaluation.results import Trial
 
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
