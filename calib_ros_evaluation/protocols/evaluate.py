@@ -13,6 +13,8 @@ import numpy as np
 
 from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.journal import Answer
+from calib_ros_evaluation.csv_files import TRIALS as CSV
+from calib_ros_evaluation.csv_files import write_trials
 from calib_ros_evaluation.evaluate import Progress, RunOptions, answered, silent
 from calib_ros_evaluation.experiments.answers import read_answer, trial_of
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
@@ -21,7 +23,7 @@ from calib_ros_evaluation.experiments.trial import calibrated
 from calib_ros_evaluation.methods.own import Own
 from calib_ros_evaluation.protocols.definitions import COUNTS, MISCALIBRATION, PROTOCOLS, TRIALS, Protocol, Size, check_name
 from calib_ros_evaluation.protocols.detection import Perturbed, decisions, detection_jobs, read_table, run_checks
-from calib_ros_evaluation.protocols.tables import detection_section, trial_section, write_decisions, write_protocol_trials
+from calib_ros_evaluation.protocols.tables import detection_section, trial_section, write_decisions
 from calib_ros_evaluation.report.page import write_sections
 from calib_ros_evaluation.report.sections import Section
 from calib_ros_evaluation.results import Trial
@@ -114,7 +116,8 @@ def _report(options: ProtocolOptions, planned: list[EvaluationJob], answers: Map
         return detection_section(found), write_decisions(options.out, found)
     protocol = PROTOCOLS[options.name]
     trials = collected(planned, answers)
-    return trial_section(protocol, trials), write_protocol_trials(options.out, protocol, trials)
+    write_trials(options.out / CSV, trials, protocol.succeeded)
+    return trial_section(protocol, trials), options.out / CSV
 
 
 def trial_jobs(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.io import write_atomically
-from calib_ros_evaluation.csv_files import TRIALS, as_csv, write_trials
+from calib_ros_evaluation.csv_files import as_csv
 from calib_ros_evaluation.protocols.definitions import MISCALIBRATION, Protocol, Size
 from calib_ros_evaluation.protocols.detection import INCONCLUSIVE, RIGHT, RIGHT_SET, WRONG, Decision
 from calib_ros_evaluation.protocols.published import ACCURACIES, CAVEATS, INTRODUCTIONS, OURS, TITLES, Published, rows_of
@@ -38,22 +38,12 @@ def trial_section(protocol: Protocol, trials: Sequence[Trial]) -> Section:
 def size_table(protocol: Protocol, size: Size, trials: Sequence[Trial]) -> Table:
     """Published rows, then a row for each of our sources and numbers of frames. wrong: accepted, but beyond the limits."""
     rows: Rows = [_published(row) for row in rows_of(protocol.name, size)]
-    for scene, count in cells(size, trials):
-        rows.append([THIS, scene, str(count), *_figures(protocol, _of(trials, size, scene, count))])
+    cells: dict[tuple[str, int], list[Trial]] = {}
+    for trial in trials:
+        if (trial.start_deg, trial.start_m) == (size.deg, size.m):
+            cells.setdefault((trial.scene, len(trial.frames)), []).append(trial)
+    rows += [[THIS, scene, str(count), *_figures(protocol, own)] for (scene, count), own in cells.items()]
     return table(f"From {size.words}", HEADER, rows)
-
-
-def cells(size: Size, trials: Sequence[Trial]) -> list[tuple[str, int]]:
-    """Sources and numbers of frames that there are trials of, in their order."""
-    return list(dict.fromkeys((t.scene, len(t.frames)) for t in trials if _is_of(t, size)))
-
-
-def _is_of(trial: Trial, size: Size) -> bool:
-    return (trial.start_deg, trial.start_m) == (size.deg, size.m)
-
-
-def _of(trials: Sequence[Trial], size: Size, scene: str, count: int) -> list[Trial]:
-    return [t for t in trials if _is_of(t, size) and (t.scene, len(t.frames)) == (scene, count)]
 
 
 def _published(row: Published) -> list[str]:
@@ -91,12 +81,6 @@ def _cpu(trials: Sequence[Trial]) -> str:
         f"{median(own):.1f} s (mean {np.mean(own):.1f} s) with {count} frame{'s' if count > 1 else ''}" for count, own in medians
     ]
     return f"median of a trial without features {', '.join(parts)}"
-
-
-def write_protocol_trials(folder: Path, protocol: Protocol, trials: Sequence[Trial]) -> Path:
-    """trials.csv, its column success by the protocol's limits."""
-    write_trials(folder / TRIALS, trials, protocol.succeeded)
-    return folder / TRIALS
 
 
 def detection_section(found: Sequence[Decision]) -> Section:

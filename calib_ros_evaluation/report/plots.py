@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ DASHES: tuple[Any, ...] = ("--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1))
 MARKERS = ("s", "^", "D", "v", "P", "X", "*")
 LONGEST = 70  # letters of a name in a plot
 LIMITS = (SUCCESS_DEG, 100 * SUCCESS_M)  # deg, cm
-DODGE = 0.62  # of the narrowest gap between two positions, shared by the methods that stand side by side
+DODGE = 0.62  # of the gap between two positions, shared by the methods that stand side by side
 PAPER = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1}  # behind text
 
 
@@ -84,22 +84,12 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def legend(figure: Any, handles: Iterable[Any], columns: int = 8) -> None:
-    """Above all axes."""
-    handles = list(handles)
-    if handles:
-        figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), columns), frameon=False, fontsize=11)
-
-
-def method_legend(figure: Any, own: dict[str, LineStyle], markers: bool = False) -> None:
-    """Names and lines of methods above all axes."""
+def method_legend(figure: Any, own: Mapping[str, LineStyle]) -> None:
+    """Names, lines and marks of methods above all axes."""
     from matplotlib.lines import Line2D
 
-    lines = [
-        Line2D([], [], label=plain(name), marker=style.marker if markers else "", markersize=6, **style.line)
-        for name, style in own.items()
-    ]
-    legend(figure, lines)
+    lines = [Line2D([], [], label=plain(name), marker=style.marker, markersize=6, **style.line) for name, style in own.items()]
+    figure.legend(handles=lines, loc="outside upper center", ncols=min(len(lines), 8), frameon=False, fontsize=11)
 
 
 def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], styles: Mapping[str, LineStyle]) -> Plot:
@@ -112,7 +102,7 @@ def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves
             axes.plot(found.offsets[axis], found.scaled()[axis], **style.line)
             if np.isfinite(found.values[axis]).all():
                 axes.plot(found.peaks[axis], 1, style.marker, color=style.color, markersize=7, zorder=style.layer, clip_on=False)
-    method_legend(figure, own, markers=True)
+    method_legend(figure, own)
     return finished(figure, name, title, caption)
 
 
@@ -169,7 +159,7 @@ def starts(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle
     figure = empty_figure(13, 5.2)
     axes = figure.add_subplot()
     sizes = start_sizes(t for own in trials.values() for t in own)
-    places, note = _places([deg for deg, _ in sizes])
+    places = np.arange(len(sizes), dtype=float)
     for place, (method, own) in zip(_dodged(places, len(trials)), trials.items(), strict=True):
         found = [[t.success for t in own if (t.start_deg, t.start_m) == size] for size in sizes]
         kept = [k for k, good in enumerate(found) if good]
@@ -177,9 +167,9 @@ def starts(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle
         ends = np.array([wilson(sum(found[k]), len(found[k])) for k in kept]).reshape(-1, 2)
         _with_bars(axes, place[kept], 100 * share, 100 * ends.T, styles[method])
     axes.set_xticks(places, [f"±{deg:g} deg\n±{100 * m:g} cm" for deg, m in sizes])
-    axes.set(xlabel=f"start error per axis{note}", ylabel="success, %", ylim=(-3, 103), yticks=range(0, 101, 20))
+    axes.set(xlabel="start error per axis", ylabel="success, %", ylim=(-3, 103), yticks=range(0, 101, 20))
     axes.grid(axis="y", color="0.9")
-    method_legend(figure, {method: styles[method] for method in trials}, markers=True)
+    method_legend(figure, {method: styles[method] for method in trials})
     caption = "Bars: 95 % intervals (Wilson). Methods stand side by side only so that their bars can be seen."
     return finished(figure, "starts", "Success by size of the start error", caption)
 
@@ -188,7 +178,7 @@ def frames(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle
     """Errors against the number of frames."""
     figure = empty_figure(13, 5.2)
     numbers = sorted({len(t.frames) for own in trials.values() for t in own})
-    places, note = _places(numbers)
+    places = np.arange(len(numbers), dtype=float)
     for k, (label, limit) in enumerate(zip(("rotation error, deg", "translation error, cm"), LIMITS, strict=True)):
         axes = figure.add_subplot(1, 2, k + 1)
         drawn = []
@@ -204,9 +194,9 @@ def frames(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle
         decimal(axes.yaxis)
         axes.set_ylim(*_seen(drawn, limit))
         axes.set_xticks(places, [str(n) for n in numbers])
-        axes.set(xlabel=f"frames{note}", ylabel=f"{label} (logarithmic)")
+        axes.set(xlabel="frames", ylabel=f"{label} (logarithmic)")
         axes.grid(axis="y", color="0.9")
-    method_legend(figure, {method: styles[method] for method in trials}, markers=True)
+    method_legend(figure, {method: styles[method] for method in trials})
     caption = "Median over all trials, bars from quartile to quartile; dotted: the limit of success."
     return finished(figure, "frames", "Errors by number of frames", caption)
 
@@ -217,17 +207,9 @@ def _with_bars(axes: Any, x: Matrix, y: Matrix, ends: Matrix, style: LineStyle) 
     axes.errorbar(x, y, off, marker=style.marker, markersize=6, elinewidth=1, capsize=2.5, **style.line)
 
 
-def _places(values: Sequence[float]) -> tuple[Matrix, str]:
-    """Positions of values on the axis, logarithmic where possible, and what the label adds."""
-    if len(set(values)) == len(values) and values and min(values) > 0:
-        return np.log2(np.array(values, float)), " (logarithmic)" if len(values) > 1 else ""
-    return np.arange(len(values), dtype=float), " (equally spaced)"
-
-
 def _dodged(places: Matrix, n: int) -> list[Matrix]:
     """Places of n methods side by side."""
-    gap = float(np.diff(places).min()) if len(places) > 1 else 1.0
-    return [places + DODGE * gap * ((k + 0.5) / n - 0.5) for k in range(n)]
+    return [places + DODGE * ((k + 0.5) / n - 0.5) for k in range(n)]
 
 
 def _seen(drawn: Sequence[Matrix], limit: float) -> tuple[float, float]:

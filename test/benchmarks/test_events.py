@@ -148,17 +148,10 @@ def test_an_empty_road_has_nothing_in_sight_and_the_rest_of_the_street_stays() -
         SyntheticDrive(3, empty=(5, 5))
 
 
-LENSES = {
-    "pinhole": Camera(np.array([[360.0, 0, 304], [0, 360, 87], [0, 0, 1]]), 620, 188),
-    "plumb_bob": Camera(
-        np.array([[360.0, 0, 304], [0, 360, 87], [0, 0, 1]]), 620, 188, "plumb_bob", np.array([-0.2, 0.05, 1e-3, 0, 0])
-    ),
-}
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_points_hit_the_same_grey_values_in_a_turned_image(name: str) -> None:
-    drive = SyntheticDrive(2, 6, 32, speed=0, noise=0, camera=LENSES[name])
+def test_points_hit_the_same_grey_values_in_a_turned_image() -> None:
+    K = np.array([[360.0, 0, 304], [0, 360, 87], [0, 0, 1]])
+    camera = Camera(K, 620, 188, "plumb_bob", np.array([-0.2, 0.05, 1e-3, 0, 0]))
+    drive = SyntheticDrive(2, 6, 32, speed=0, noise=0, camera=camera)
     displacement = MountDisplacement(0.5, deg=2.0, m=0.05)
     source = EventSource(Plain(drive), [displacement])
     before, after = drive[5], source[5]

@@ -16,7 +16,6 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
 from calib_ros.result import Result
 from calib_ros_evaluation.commands import sources_in
-from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import job
@@ -35,7 +34,6 @@ from calib_ros_evaluation.experiments.setup import (
     worker_cache,
 )
 from calib_ros_evaluation.methods.registry import NAMES
-from calib_ros_evaluation.report.statistics import peak_distances
 from calib_ros_evaluation.results import TWIST_AXES
 
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
@@ -216,16 +214,6 @@ def test_a_damaged_answer_is_named() -> None:
     one = job("curves", "ours", "drive", [3])
     with pytest.raises(BadInputError, match=r"curves\|ours\|drive\|3.*--fresh"):
         collect_results([one], {one.key: {}}, {"ours": "Ours"})
-
-
-def test_a_flat_curve_has_no_peak() -> None:
-    offsets = np.tile(np.linspace(-2.0, 2.0, 5), (6, 1))
-    values = np.tile([0.0, 1, 4, 1, 0], (6, 1))
-    values[1] = 3.0
-    peaks = Curves(offsets, values).peaks
-    assert np.isnan(peaks[1])
-    assert np.allclose(np.delete(peaks, 1), 0)
-    assert peak_distances(Curves(offsets, values))[1] == 2.0  # as bad as can be
 
 
 def test_results_of_another_version_are_not_reused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

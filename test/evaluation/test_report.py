@@ -129,6 +129,8 @@ def test_a_curve_rises_up_to_its_first_step_back() -> None:
     assert basins(curves)[:5] == pytest.approx([1.5, 1.0, 2.0, 2.0, 0.0])
     assert math.isnan(basins(curves)[5])
     assert peak_distances(curves)[:3] == pytest.approx([0.0454545, 2, 2], abs=1e-6)
+    assert math.isnan(curves.peaks[4])  # flat: no peak, which is as bad as can be
+    assert peak_distances(curves)[4] == 2
     assert math.isnan(peak_distances(curves)[5])
 
 
