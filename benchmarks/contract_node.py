@@ -24,7 +24,7 @@ import rclpy
 from calib_ros_msgs.msg import Extrinsic
 from numpy.typing import NDArray
 
-from benchmarks.fed_node import Pace, fed_node, own_network
+from benchmarks.fed_node import fed_node, own_network
 from benchmarks.records import append_records
 from benchmarks.sources import Changed
 from benchmarks.study_contract import FAULTS, Fault, Watch, beside, table
@@ -78,7 +78,7 @@ def play(name: str, source: Faulty, bag: Path, folder: Path, number: int, second
         fed.client._node.create_subscription(Extrinsic, "/calib_ros/extrinsic", hear, 100)
         fed.client.spin(0.5)
         began = time.monotonic()
-        fed.run(round(seconds * source.rate), Pace(source.rate, 0.5))
+        fed.run(round(seconds * source.rate), source.rate)
         fed.client.spin(QUIET_S, fed.ended)
         fed.check()
     end = watch.end()

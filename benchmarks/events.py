@@ -10,17 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.events_recorded import Recorded, covered_image
+from benchmarks.events_recorded import covered_image, moved
 from benchmarks.sources import Changed
 from calib_ros import se3
 from calib_ros.datasets.source import Source
-from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_synthetic.lidar import PERIOD
@@ -28,7 +26,6 @@ from calib_ros_synthetic.lidar import PERIOD
 Floats = NDArray[np.float64]
 Axis = tuple[float, float, float]
 DOWN: Axis = (0.0, 1.0, 0.0)  # the camera's y: a turn about it is a yaw
-LOOKS = ("dark", "white", "frozen")
 
 
 def _unit(axis: Axis) -> Floats:
@@ -97,14 +94,9 @@ class MountDisplacement(Event):
 
 @dataclass(frozen=True)
 class Covered(Event):
-    """The image shows nothing: "dark" and "white" with a sensor's noise, or "frozen", the last image again and again."""
+    """The image shows nothing but a sensor's noise."""
 
-    look: str = "dark"
     label: ClassVar[str] = "covered lens"
-
-    def describe(self) -> str:
-        """For people."""
-        return f"{self.label} ({self.look}) {self.start:g}-{self.end:g} s"
 
 
 @dataclass(frozen=True)
@@ -165,25 +157,19 @@ class EventSource(Changed):
     """The frames of another source, with events. Frames without a cloud are missing; `positions` says which are there.
 
     times: (n,) s of the drive, one per frame. Frame.reference is the true extrinsic of that very frame, if the source knows it;
-    `reference` that at the start of the drive. BadInputError: overlapping events of one kind that cannot both be, an empty road
-    in a recording, or nothing left of the source.
+    `reference` that at the start of the drive. Only a synthetic drive can lead along an empty road.
     """
 
-    def __init__(self, base: Source, events: Sequence[Event], seed: int = 0) -> None:
+    def __init__(self, base: Source, events: Sequence[Event]) -> None:
         self.events = tuple(sorted(events, key=lambda e: e.start))
-        self._seed = seed
-        for kind in (Covered, LateCamera, EmptyRoad, LostClouds):
-            _refuse_overlaps(self._of(kind))
-        super().__init__(_emptied(base, self._of(EmptyRoad)))
-        self.name += f" with {', '.join(e.label for e in self.events) or 'no events'}"
-        self._recorded = Recorded(self.source, drive_times(self.source))
-        every = self._recorded.times
-        lost = [self._lost(number, event, every) for number, event in enumerate(self._of(LostClouds))]
-        self.positions = np.setdiff1d(np.arange(len(every)), np.concatenate([np.zeros(0, int), *lost]))
-        if not len(self.positions):
-            raise BadInputError(f"{base.name}: the events leave no frame")
-        self.times = every[self.positions]
-        self._frozen: tuple[int, NDArray[np.uint8]] | None = None
+        for road in self._of(EmptyRoad):
+            assert isinstance(base, SyntheticDrive)
+            base = base.emptied(road.start, road.end)
+        super().__init__(base)
+        self._every = drive_times(base)
+        lost = [self._lost(number, event) for number, event in enumerate(self._of(LostClouds))]
+        self.positions = np.setdiff1d(np.arange(len(self._every)), np.concatenate([np.zeros(0, int), *lost]))
+        self.times = self._every[self.positions]
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -192,58 +178,23 @@ class EventSource(Changed):
         """Frame `index`, counted from the end if negative. IndexError past either end."""
         position = int(self.positions[index])
         frame = self._seen(position)
-        for event in self._of(Covered):
-            if event.holds(float(self._recorded.times[position])):
-                return replace(frame, image=self._covered(event, position, frame.image))
+        if any(event.holds(float(self._every[position])) for event in self._of(Covered)):
+            return replace(frame, image=covered_image(frame.image, np.random.default_rng([0, 8, position])))
         return frame
-
-    def describe(self) -> dict[str, str]:
-        """The source's facts, and the events."""
-        facts = self.source.describe() | {"frames": f"{len(self)}, over {self.times[-1]:g} s"}
-        return facts | {"events": "; ".join(e.describe() for e in self.events) or "none"}
-
-    def truth(self, index: int) -> Floats | None:
-        """T_camera_lidar (4, 4) of frame `index`, without rendering it; None if the source does not know its own."""
-        return None if self.reference is None else mount(self.events, float(self.times[index])) @ self.reference
 
     def _seen(self, position: int) -> Frame:
         """The frame through an uncovered lens."""
-        time = float(self._recorded.times[position])
+        time = float(self._every[position])
         delay = next((e.delay_s for e in self._of(LateCamera) if e.holds(time)), 0.0)
-        moved, moved_before = mount(self.events, time), mount(self.events, time - delay)
+        mounted, mounted_before = mount(self.events, time), mount(self.events, time - delay)
         if not isinstance(self.source, SyntheticDrive):
-            return self._recorded.moved(position, moved, moved_before, delay)
-        frame = self.source.moved(position, moved_before @ self.source.reference, delay)
-        return replace(frame, reference=moved @ self.source.reference)
+            return moved(self.source, position, mounted, mounted_before, delay)
+        frame = self.source.moved(position, mounted_before @ self.source.reference, delay)
+        return replace(frame, reference=mounted @ self.source.reference)
 
-    def _covered(self, event: Covered, position: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        if event.look != "frozen":
-            return covered_image(image, event.look == "white", np.random.default_rng([self._seed, 8, position]))
-        last = max(int(np.searchsorted(self._recorded.times, event.start)) - 1, 0)  # the last one before it froze
-        if self._frozen is None or self._frozen[0] != last:
-            self._frozen = last, self._seen(last).image
-        return np.array(self._frozen[1])
-
-    def _lost(self, number: int, event: LostClouds, times: Floats) -> NDArray[np.intp]:
-        inside = np.flatnonzero((times >= event.start) & (times < event.end))
-        rng = np.random.default_rng([self._seed, 9, number])
-        return rng.choice(inside, round(event.share * len(inside)), replace=False)
+    def _lost(self, number: int, event: LostClouds) -> NDArray[np.intp]:
+        inside = np.flatnonzero((self._every >= event.start) & (self._every < event.end))
+        return np.random.default_rng([0, 9, number]).choice(inside, round(event.share * len(inside)), replace=False)
 
     def _of(self, kind: type[Kind]) -> list[Kind]:
         return [e for e in self.events if isinstance(e, kind)]
-
-
-def _refuse_overlaps(events: Sequence[Event]) -> None:
-    for a, b in pairwise(events):
-        if b.start < a.end:
-            raise BadInputError(f"events: '{a.describe()}' and '{b.describe()}' overlap; let one end before the other begins")
-
-
-def _emptied(base: Source, roads: Sequence[EmptyRoad]) -> Source:
-    if not roads:
-        return base
-    if not isinstance(base, SyntheticDrive):
-        raise BadInputError(f"{base.name}: only a synthetic drive can be made to lead along an empty road; leave that event out")
-    if len(roads) > 1:
-        raise BadInputError("events: one empty road per drive")
-    return base.emptied(roads[0].start, roads[0].end)

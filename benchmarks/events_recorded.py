@@ -18,13 +18,12 @@ from calib_ros_synthetic.rays import pixel_directions
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-DARK, WHITE = 7.0, 253.0  # grey levels of a covered and an overexposed image
-NOISE = 1.8  # grey levels
+DARK, NOISE = 7.0, 1.8  # grey levels of a covered image
 
 
-def covered_image(like: Image, white: bool, rng: np.random.Generator) -> Image:
-    """An image of the same shape that shows nothing but noise, dark or white."""
-    level = (WHITE if white else DARK) + NOISE * rng.standard_normal(like.shape, np.float32)
+def covered_image(like: Image, rng: np.random.Generator) -> Image:
+    """A dark image of the same shape that shows nothing but noise."""
+    level = DARK + NOISE * rng.standard_normal(like.shape, np.float32)
     return np.asarray(np.clip(np.rint(level), 0, 255), np.uint8)
 
 
@@ -53,48 +52,43 @@ def shifted_cloud(frame: Frame, shift: Floats) -> Frame:
     return replace(frame, cloud=cloud, twist=twist)
 
 
-class Recorded:
-    """Frames of a source whose camera has moved. times: (n,) s of the drive, one per frame."""
+def moved(source: Source, position: int, mount: Floats, mount_before: Floats, delay_s: float = 0.0) -> Frame:
+    """The frame at `position` whose extrinsic is mount @ T, T being its own.
 
-    def __init__(self, source: Source, times: Floats) -> None:
-        self.source, self.times = source, times
+    The image is turned, the cloud is shifted: the change of the extrinsic's translation is put on the LiDAR, since a picture
+    holds no depth. mount: (4, 4) at the cloud's time. delay_s: the image shows what was there so long before its stamp, by
+    a camera mounted as in mount_before. A frame without reference stays as it is but for that.
+    """
+    frame = source[position]
+    T = frame.reference
+    if delay_s > 0:
+        frame = _late(source, frame, position, delay_s)
+    if T is None:
+        return frame
+    R = mount_before[:3, :3]
+    if not np.allclose(R, np.eye(3), atol=1e-12):
+        frame = replace(frame, image=turned_image(frame.image, frame.camera, R))
+    # mount T p' = (R_mount, 0) T p for every point p.
+    shift = -T[:3, :3].T @ mount[:3, :3].T @ mount[:3, 3]
+    if np.abs(shift).max() > 0:
+        frame = shifted_cloud(frame, shift)
+    return replace(frame, reference=mount @ T)
 
-    def moved(self, position: int, mount: Floats, mount_before: Floats, delay_s: float = 0.0) -> Frame:
-        """The frame whose extrinsic is mount @ T, T being its own.
 
-        The image is turned, the cloud is shifted: the change of the extrinsic's translation is put on the LiDAR, since a picture
-        holds no depth. mount: (4, 4) at the cloud's time. delay_s: the image shows what was there so long before its stamp, by
-        a camera mounted as in mount_before. A frame without reference stays as it is but for that.
-        """
-        frame = self.source[position]
-        T = frame.reference
-        if delay_s > 0:
-            frame = self._late(frame, position, delay_s)
-        if T is None:
-            return frame
-        R = mount_before[:3, :3]
-        if not np.allclose(R, np.eye(3), atol=1e-12):
-            frame = replace(frame, image=turned_image(frame.image, frame.camera, R))
-        # mount T p' = (R_mount, 0) T p for every point p.
-        shift = -T[:3, :3].T @ mount[:3, :3].T @ mount[:3, 3]
-        if np.abs(shift).max() > 0:
-            frame = shifted_cloud(frame, shift)
-        return replace(frame, reference=mount @ T)
+def _late(source: Source, frame: Frame, position: int, delay_s: float) -> Frame:
+    """With an earlier image, stamped delay_s too late: the one that then comes nearest to the cloud."""
+    delay = round(delay_s * NANOSECONDS)
 
-    def _late(self, frame: Frame, position: int, delay_s: float) -> Frame:
-        """With an earlier image, stamped delay_s too late: the one that then comes nearest to the cloud."""
-        delay = round(delay_s * NANOSECONDS)
+    def gap(other: Frame) -> int:
+        return abs(other.stamp + delay - frame.moment_of_cloud)
 
-        def gap(other: Frame) -> int:
-            return abs(other.stamp + delay - frame.moment_of_cloud)
-
-        best = frame
-        for before in range(position - 1, -1, -1):
-            other = self.source[before]
-            if gap(other) >= gap(best):
-                break
-            best = other
-        return replace(frame, image=best.image, stamp=best.stamp + delay, cloud_stamp=frame.moment_of_cloud, camera=best.camera)
+    best = frame
+    for before in range(position - 1, -1, -1):
+        other = source[before]
+        if gap(other) >= gap(best):
+            break
+        best = other
+    return replace(frame, image=best.image, stamp=best.stamp + delay, cloud_stamp=frame.moment_of_cloud, camera=best.camera)
 
 
 def reversed_time(frame: Frame, stamp: int) -> Frame:
@@ -103,11 +97,6 @@ def reversed_time(frame: Frame, stamp: int) -> Frame:
     cloud = frame.cloud if frame.cloud.time is None else replace(frame.cloud, time=-frame.cloud.time)
     twist = None if frame.twist is None else -frame.twist
     return replace(frame, stamp=stamp - (frame.stamp - frame.moment_of_cloud), cloud_stamp=stamp, cloud=cloud, twist=twist)
-
-
-def restamped(frame: Frame, stamp: int) -> Frame:
-    """The frame with its cloud at `stamp` (ns), and its image as long after it as before."""
-    return replace(frame, stamp=stamp + frame.stamp - frame.moment_of_cloud, cloud_stamp=stamp)
 
 
 class ThereAndBack(Changed):
@@ -142,10 +131,8 @@ class ThereAndBack(Changed):
         """Frame `index`; its name says which time round it is. IndexError past either end."""
         frame = self.source[self._order[index]]
         stamp = self._start + round(float(self.times[index]) * NANOSECONDS)
-        changed = restamped(frame, stamp) if self._forwards[index] else reversed_time(frame, stamp)
+        if self._forwards[index]:
+            changed = replace(frame, stamp=stamp + frame.stamp - frame.moment_of_cloud, cloud_stamp=stamp)
+        else:
+            changed = reversed_time(frame, stamp)
         return replace(changed, name=f"{frame.name}@{self.times[index]:.1f}")
-
-    def describe(self) -> dict[str, str]:
-        """The recording's facts, and for how long it goes on."""
-        facts = self.source.describe()
-        return facts | {"frames": f"{len(self)}, there and back for {self.times[-1]:.1f} s; {facts.get('frames', '')}"}

@@ -32,7 +32,6 @@ from calib_ros.ros.client import ExtrinsicClient
 
 IMAGE, INFO, POINTS = "/camera/image_raw", "/camera/camera_info", "/velodyne_points"  # as bag_writer names them
 GAP_NS = NANOSECONDS  # between two laps: the jump from the last scene to the first must not look like motion
-LOWEST, HIGHEST = 2.0, 200.0  # pairs per second
 STAMP = 4  # offset of the stamp in a message that begins with a header, behind the encapsulation
 DRIVE = "synthetic:seed=1,frames=60,stride=1"
 RATE = 10.0  # pairs per second of the benchmarks that fix it
@@ -58,12 +57,10 @@ def start_node(T: Any, folder: Path, *parameters: str) -> subprocess.Popen[bytes
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
 
-def memory_mb(pid: int) -> tuple[float, float]:
-    """Resident memory, and the part of it that is shared (Fast DDS's segments)."""
+def memory_mb(pid: int) -> float:
+    """Resident memory of a process."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    values = {key: value for key, _, value in (line.partition(":") for line in lines)}
-    rss, shared = (float(values[name].split()[0]) / 1024 for name in ("VmRSS", "RssShmem"))
-    return rss, shared
+    return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:"))
 
 
 def cpu_s(pid: int) -> float:
@@ -99,31 +96,6 @@ def restamped(messages: list[Recorded]) -> Iterator[Recorded]:
             yield message
 
 
-class Pace:
-    """Pairs per second: fixed, or as fast as the node takes them.
-
-    The node never falls behind: a busy worker leaves pairs out. So the rate rises until more than `share` of the pairs of the
-    last seconds were left out or a message was lost, and then stays a little below.
-    """
-
-    def __init__(self, fixed: float | None, share: float) -> None:
-        self.rate = fixed or 10.0
-        self._fixed, self._share = fixed is not None, share
-        self._seen: list[tuple[int, int]] = []
-
-    def heard(self, pairs: int, left_out: int) -> None:
-        """The node's counts, once a second."""
-        self._seen = [*self._seen[-5:], (pairs, left_out)]
-        if self._fixed or len(self._seen) < 6:
-            return
-        new, lost = (self._seen[-1][k] - self._seen[0][k] for k in (0, 1))
-        if lost > self._share * new:
-            self.rate = max(0.85 * self.rate, LOWEST)
-            self._seen = self._seen[-1:]  # losses at the old rate do not count at the new one
-        elif new > 0.9 * 5 * self.rate:  # else we are the slow ones
-            self.rate = min(1.04 * self.rate, HIGHEST)
-
-
 class Feeder:
     """Publishers of the three topics."""
 
@@ -140,14 +112,14 @@ class Feeder:
         """True if every topic has a subscriber."""
         return all(publisher.get_subscription_count() for publisher in self._publishers.values())
 
-    def run(self, pairs: int, pace: Pace, idle: Callable[[float], None], stopped: Callable[[], bool]) -> None:
-        """Publish so many pairs. idle: called with the time at which the next one is due, at least once for each."""
+    def run(self, pairs: int, rate: float, idle: Callable[[float], None], stopped: Callable[[], bool]) -> None:
+        """Publish so many pairs, `rate` a second. idle: called with the time at which the next one is due, once for each."""
         due = time.monotonic()
         for message in restamped(self._messages):
             if message.topic == IMAGE:
                 if self.sent[IMAGE] == pairs or stopped():
                     return
-                due = max(due + 1 / pace.rate, time.monotonic() - 1 / pace.rate)  # a delay is not made up for in a burst
+                due = max(due + 1 / rate, time.monotonic() - 1 / rate)  # a delay is not made up for in a burst
                 idle(due)
             self._publishers[message.topic].publish(bytes(message.data))
             self.sent[message.topic] += 1
@@ -170,9 +142,9 @@ class Feeding:
             if time.monotonic() >= until:
                 return
 
-    def run(self, pairs: int, pace: Pace, idle: Callable[[float], None] | None = None) -> None:
-        """Publish so many pairs. CalibrationError if the node ends meanwhile."""
-        self.feeder.run(pairs, pace, idle or self.idle, self.ended)
+    def run(self, pairs: int, rate: float) -> None:
+        """Publish so many pairs, `rate` a second. CalibrationError if the node ends meanwhile."""
+        self.feeder.run(pairs, rate, self.idle, self.ended)
         self.check()
 
     def check(self) -> None:

@@ -1,6 +1,6 @@
 """What the node costs at 10 Hz: CPU time of its process and memory, for some shares of a core that it may use.
 
-    python -m benchmarks.load_study [SOURCE] [--seconds 60] [--max-load 0.3 0.5 1.0] [--mode continuous] [--out FOLDER]
+    python -m benchmarks.load_study [SOURCE] [--seconds 60] [--max-load 0.3 0.5 1.0] [--out FOLDER]
 
 SOURCE: as for calib-ros; by default the drive of the soak test. A node with its default configuration, in a process of its own,
 is fed over DDS. CPU time is that of the whole process as the kernel counts it: other work on the same cores does not matter.
@@ -17,7 +17,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 
-from benchmarks.fed_node import DRIVE, OFF, RATE, Pace, cpu_s, fed_node, memory_mb, on_recording
+from benchmarks.fed_node import DRIVE, OFF, RATE, cpu_s, fed_node, memory_mb, on_recording
 from calib_ros import se3
 from calib_ros.online.pacing import Work
 from calib_ros.result import CONVERGED
@@ -49,7 +49,7 @@ class Watcher:
 
     def _on_diagnostics(self, msg: DiagnosticArray) -> None:
         values = {v.key: v.value for v in msg.status[0].values}
-        self.moments.append(Moment(time.monotonic(), cpu_s(self.pid), memory_mb(self.pid)[0], values))
+        self.moments.append(Moment(time.monotonic(), cpu_s(self.pid), memory_mb(self.pid), values))
 
     def row(self, name: str, began: float) -> str:
         """Of the table."""
@@ -68,10 +68,10 @@ class Watcher:
 
 def measure(bag: Path, reference: Any, folder: Path, max_load: float, args: argparse.Namespace) -> str:
     """One run of the node."""
-    parameters = (f"online.max_load:={max_load}", f"online.mode:={args.mode}", *args.parameters)
+    parameters = (f"online.max_load:={max_load}", *args.parameters)
     with fed_node(bag, se3.perturb(reference, *OFF), folder, *parameters) as fed:
         watcher, began = Watcher(fed.client, fed.process.pid), time.monotonic()
-        fed.run(int(args.seconds * RATE), Pace(RATE, 0.5))
+        fed.run(int(args.seconds * RATE), RATE)
         return watcher.row(f"{max_load:g}", began)
 
 
@@ -83,7 +83,6 @@ def main() -> int:
     parser.add_argument(
         "--max-load", type=float, nargs="+", default=[0.3, 0.5, 1.0], help="online.max_load (default 0.3 0.5 1.0)"
     )
-    parser.add_argument("--mode", default="continuous", help="online.mode (default continuous)")
     parser.add_argument("--parameters", nargs="*", default=[], metavar="NAME:=VALUE", help="more parameters of the node")
     parser.add_argument("--out", metavar="FOLDER", help="keep bag and node.log here; reuses the bag")
     args = parser.parse_args()

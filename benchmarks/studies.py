@@ -9,8 +9,6 @@ ablation      some of its rows with one part of the method switched off at a tim
 vehicles      is what is accepted right, and what is right accepted: single frames and sets of SOURCE, of --soft, whose reference
               is known to 0.9 deg / 25 cm only, and of the synthetic --rigs
 vehicle_parts the same with one part of the method switched off at a time
-monitor       does the monitor notice a wrong extrinsic: sets of 1, 5 and 20 keyframes of SOURCE, KITTI or synthetic drives
-monitor_vehicles  the monitor itself on every single frame of SOURCE and of the synthetic --rigs, a line per set
 monitor_hours hours of quiet driving and knocks, driving and standing: SOURCE of 10 Hz, or six synthetic rigs, lap after lap
 covariance    normalised errors squared of estimates from subsets of frames of SOURCE, or synthetic drives and KITTI
 classes       single KITTI frames from 5 deg / 0.3 m per axis, with and without the classes of the package's networks
@@ -51,13 +49,10 @@ from benchmarks import (
     study_contract,
     study_hours,
     study_intrinsics,
-    study_monitor,
-    study_refined,
     study_registration,
 )
-from benchmarks.faults import late
 from benchmarks.records import append_records, read_records
-from benchmarks.sources import Listed, frames_of
+from benchmarks.sources import Listed, frames_of, late
 from benchmarks.study_registration import DRIVE, ODOMETRY, SCENES, spread
 from benchmarks.study_runner import CLASSES_OFF, RIGHT, Case, End, Estimate, FeaturesOf, Record, Study, Variant, run, table
 from calib_ros import se3
@@ -288,21 +283,14 @@ def thesis(optimizer: str, **own: Any) -> Variant:
     return Variant({"refine": {"objective": "thesis", "optimizer": optimizer}, "thesis": own})
 
 
-NO_CHECK = dict.fromkeys(
-    ("calib_ros.registration.objective.consistency_score", "calib_ros.registration.acceptance.checks.consistency_score"),
-    lambda views: None,
-)
 STUDIES: dict[str, Study] = {
     **study_registration.STUDIES,
-    **study_monitor.STUDIES,
     "monitor_hours": study_hours.STUDY,
     "classes": Study(
         single_frames,
         with_classes,
         {
             "none": Variant({"semantics": {"segmentation": "none"}}),
-            "points only": Variant({"semantics": {"image_classes": "", "cloud_classes": "geometric"}}),
-            "without consistency check": Variant(replaced=NO_CHECK),
             "default": Variant(),
         },
         trials=2,
@@ -343,7 +331,6 @@ STUDIES: dict[str, Study] = {
         {
             "eq. 3.12, Nelder-Mead": thesis("nelder_mead"),
             "eq. 3.12, Barzilai-Borwein": thesis("barzilai_borwein"),
-            "eq. 3.12 not normalised, Nelder-Mead": thesis("nelder_mead", normalize=False),
             "edges attached, Levenberg-Marquardt": thesis("auto", dense_edges="once_per_level"),
             "fast form": Variant(),
         },
@@ -351,8 +338,7 @@ STUDIES: dict[str, Study] = {
     ),
     "checks": study_checks.STUDY,
     "contract": study_contract.STUDY,
-    "intrinsics": study_intrinsics.STUDY,
-    "refined": study_refined.STUDY,
+    **study_intrinsics.STUDIES,
 }
 
 
@@ -369,7 +355,7 @@ def main() -> int:
     parser.add_argument("--variants", nargs="+", metavar="NAME")
     parser.add_argument("--config", help="YAML")
     parser.add_argument("--csv", type=Path, help="add every trial; go on with a study that was interrupted")
-    parser.add_argument("--plot", type=Path, help="of covariance and monitor")
+    parser.add_argument("--plot", type=Path, help="of covariance")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (default one per core)")
     args = parser.parse_args()
     study = STUDIES[args.study]

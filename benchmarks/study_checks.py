@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.faults import in_other_frame, late, with_intrinsics
 from benchmarks.records import markdown
+from benchmarks.sources import in_other_frame, late, with_intrinsics
 from benchmarks.study_runner import Case, End, FeaturesOf, Record, Study, Variant
 from calib_ros import se3
 from calib_ros.camera import Camera, Rectifier

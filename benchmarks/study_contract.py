@@ -11,25 +11,20 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.faults import in_other_frame, late, turned, with_intrinsics
 from benchmarks.records import markdown
-from benchmarks.sources import frames_of
+from benchmarks.sources import frames_of, in_other_frame, late, turned, with_intrinsics
 from benchmarks.study_runner import CLASSES_OFF, NEAR, Case, End, FeaturesOf, Record, Study, Variant
 from calib_ros import se3
-from calib_ros.camera import Camera
-from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import FrameSemantics
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.result import CONVERGED, INITIAL, Result
 
 Matrix = NDArray[np.float64]
@@ -98,28 +93,6 @@ class Watch:
         return End(self.deg, self.cm, self.status, said, result)
 
 
-class Remembering(FeatureExtractor):
-    """Features of a frame, extracted once for all runs."""
-
-    def __init__(self, camera: Camera, config: Config, features: dict[bytes, FrameFeatures]) -> None:
-        super().__init__(camera, config)
-        self._features = features
-
-    def __call__(
-        self, frame: Frame, semantics: FrameSemantics | None = None, plain: FrameFeatures | None = None
-    ) -> FrameFeatures:
-        key = frame.name.encode() + (b"" if frame.twist is None else frame.twist.tobytes())
-        if key not in self._features:
-            self._features[key] = super().__call__(frame, semantics, plain)
-        return self._features[key]
-
-
-@lru_cache(maxsize=1)
-def remembered(number: int, variant: str) -> dict[bytes, FrameFeatures]:
-    """What all runs of a case share."""
-    return {}
-
-
 def recordings(args: argparse.Namespace) -> Iterator[Case]:
     for number, name in enumerate(args.sources):
         yield Case(name if name.startswith("synthetic") else Path(name).name, frames_of(name), number)
@@ -130,8 +103,6 @@ def played(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int)
     fault, frames = FAULTS[case.variant], case.frames
     start = Result(beside(case.truth, fault, trial), INITIAL)
     recalibrator = Recalibrator(frames[0].camera, start, calibrator.config)
-    memory = remembered(case.number, case.variant)
-    recalibrator.calibrator.extract = Remembering(recalibrator.camera, recalibrator.config, memory)
     watch, result = Watch(fault), start
     for frame in frames:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import copy
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -20,15 +19,14 @@ from benchmarks.records import markdown
 from benchmarks.sources import frames_of
 from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
 from calib_ros import se3
-from calib_ros.config import Config, update
+from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.lidar.rings import rings_by_order
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_synthetic.rigs import RIGS
 
 Matrix = NDArray[np.float64]
@@ -65,15 +63,13 @@ def subset(frames: Sequence[Frame], size: int, number: int, rng: np.random.Gener
 
 @dataclass(frozen=True)
 class Row:
-    """Frames of a source (0 = one frame per trial, each in turn), box, part of the rings; from nominal, or from starts anywhere
-    in the box around the reference."""
+    """Frames of a source (0 = one frame per trial, each in turn), box of the starts around the reference, part of the rings."""
 
     source: str
     frames: int
     rotation_deg: float
     translation_m: float
     every_ring: int = 1
-    nominal: bool = False
 
 
 ROWS = {
@@ -87,11 +83,9 @@ ROWS = {
     "odo1": Row(ODOMETRY, 0, 5, 0.3),
     "drive16-16rings": Row(DRIVE, 16, 5, 0.3, 4),
     "odo10-16rings": Row(ODOMETRY, 10, 5, 0.3, 4),
-    "drive15-nominal": Row(DRIVE, 15, *NOMINAL_BOX.reach, nominal=True),
-    "odo10-nominal": Row(ODOMETRY, 10, *NOMINAL_BOX.reach, nominal=True),
     "synthetic16": Row("synthetic:seed=11,frames=16", 16, 10, 0.5),
 }
-ABLATION_ROWS = ("drive16", "odo10", "drive5", "odo10-wide")
+ABLATION_ROWS = ("drive16", "odo10", "drive5")
 OUTWARD, TOP = ({f"calib_ros.lidar.edges.{name}": 0.0} for name in ("OUTWARD_SHIFT", "TOP_SPREAD"))
 # By the configuration, or, where users have no reason to switch a part off, from outside.
 ABLATION = {
@@ -141,14 +135,9 @@ def thinned(frame: Frame, every: int) -> Frame:
 
 
 def from_row(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
-    """Each trial has its own seed; those from nominal have one start only, and differ in the seed of the search."""
-    row, own, start = ROWS[case.group], features(), nominal()
-    if row.nominal:
-        calibrator = copy.copy(calibrator)
-        calibrator.config = update(calibrator.config, {"search": {"seed": trial}})
-    else:
-        rng = np.random.default_rng(trial)
-        start = se3.perturb(case.truth, *(rng.uniform(-half, half, 3) for half in (row.rotation_deg, row.translation_m)))
+    """Each trial has its own seed."""
+    row, own, rng = ROWS[case.group], features(), np.random.default_rng(trial)
+    start = se3.perturb(case.truth, *(rng.uniform(-half, half, 3) for half in (row.rotation_deg, row.translation_m)))
     result = calibrator.estimate(own if row.frames else [own[trial % len(own)]], start, case.box)
     return End.at(result.T_camera_lidar, case.truth, result.status, result=result)
 

@@ -120,7 +120,7 @@ class Study:
 @dataclass(frozen=True)
 class Record:
     """The end of one trial. right: within the limits, accepted or not. cpu_s: without features. From refusal on, what the
-    estimate says of itself; nees: its error squared, normalised by its covariance. agreed, climbed: of its starts."""
+    estimate says of itself; nees: its error squared, normalised by its covariance."""
 
     group: str
     variant: str
@@ -134,16 +134,8 @@ class Record:
     said: str
     frames: int = 1
     refusal: str = ""
-    reason: str = ""
     nees: float = NAN
-    z_score: float = NAN
-    p_value: float = NAN
     disagreement: float = NAN
-    sigma_deg: float = NAN
-    sigma_cm: float = NAN
-    agreed: int = 0
-    climbed: int = 0
-    score: float = NAN
 
     @property
     def accepted(self) -> bool:
@@ -152,15 +144,13 @@ class Record:
 
 def _of_result(result: Result, truth: Matrix) -> dict[str, Any]:
     """What a record takes from an estimate."""
-    known: dict[str, Any] = {"refusal": result.refusal.value if result.refusal else "", "reason": result.reason}
-    known |= {"score": result.score} | dict(zip(("agreed", "climbed"), result.starts or (), strict=False))
+    known: dict[str, Any] = {"refusal": result.refusal.value if result.refusal else ""}
     if result.evidence is not None:
-        known |= {name: getattr(result.evidence, name) for name in ("z_score", "p_value", "disagreement")}
+        known["disagreement"] = result.evidence.disagreement
     if result.covariance is not None:
         T = result.T_camera_lidar if result.optimum is None else result.optimum
-        off, sigma = se3.log(T @ se3.inverse(truth)), np.sqrt(np.diag(result.covariance))
-        known |= {"nees": float(off @ np.linalg.solve(result.covariance, off))}
-        known |= {"sigma_deg": float(np.rad2deg(sigma[:3].max())), "sigma_cm": float(100 * sigma[3:].max())}
+        off = se3.log(T @ se3.inverse(truth))
+        known["nees"] = float(off @ np.linalg.solve(result.covariance, off))
     return known
 
 

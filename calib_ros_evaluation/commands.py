@@ -30,7 +30,7 @@ from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, labels
 from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, TRIALS, check_name
 from calib_ros_evaluation.protocols.evaluate import Evaluated, ProtocolOptions, evaluate_protocol
-from calib_ros_evaluation.report.summary import summary
+from calib_ros_evaluation.report.tables import summary
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 
 

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.report.table import Cell, table
+from calib_ros_evaluation.report.table import table
 from calib_ros_evaluation.results import IDENTITY, Trial
 
 Matrix = NDArray[np.float64]
 CONFIDENCE = 0.95
-CHUNK = 4_000_000  # counts held at once, 16 MB
 Keyed = dict[tuple[object, ...], Trial]  # by the values of IDENTITY
 BETTER, WORSE, SAME = "better", "worse", "no difference shown"
 FEW_CLUSTERS = 5  # from so many on, intervals hold what they promise for normal values; see interval()
@@ -168,7 +167,7 @@ def as_text(comparisons: Sequence[Comparison], name_a: str, name_b: str) -> str:
     return "\n".join([f"A: {name_a}", f"B: {name_b}", "", aligned, "", *_notes(comparisons)])
 
 
-def _rows(c: Comparison) -> Iterator[list[Cell | str]]:
+def _rows(c: Comparison) -> Iterator[list[str]]:
     for n, (key, one) in enumerate(MEASURES.items()):
         e = c.estimates[key]
         a, b = (_text(one.form, value * one.unit) for value in (e.a, e.b))
@@ -221,16 +220,7 @@ class ClusterBootstrap:
 
     def medians(self, values: Matrix) -> Matrix:
         """Median of values (n,) in every sample, (resamples,)."""
-        order = np.argsort(values, kind="stable")
-        ordered, cluster = values[order], self.cluster[order]
-        found = np.empty(self.resamples)
-        step = max(CHUNK // len(values), 1)
-        for first in range(0, self.resamples, step):
-            below = np.cumsum(self.drawn[first : first + step, cluster], axis=1, dtype=np.int32)
-            half = below[:, -1:] / 2
-            lower, upper = np.argmax(below >= half, axis=1), np.argmax(below > half, axis=1)
-            found[first : first + step] = (ordered[lower] + ordered[upper]) / 2
-        return found
+        return np.array([np.median(np.repeat(values, row[self.cluster])) for row in self.drawn])
 
 
 def interval(samples: Matrix, clusters: int) -> tuple[float, float]:

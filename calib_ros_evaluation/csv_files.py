@@ -11,16 +11,15 @@ from typing import Any
 
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
-from calib_ros_evaluation.curves import AXES
-from calib_ros_evaluation.results import COLUMNS, TWIST_AXES, TWISTS, Results, Trial
+from calib_ros_evaluation.results import COLUMNS, TWIST_AXES, TWISTS, Trial
 
-TRIALS, CURVES, PEAKS, COSTS = "trials.csv", "curves.csv", "peaks.csv", "costs.csv"
+TRIALS = "trials.csv"
 STATUSES = ("done", "refused", "failed")
 PLAIN = {"str": str, "int": int, "float": float}  # types of Trial's fields that are one column each
 
 
 def write_trials(path: Path, trials: Sequence[Trial], succeeded: Callable[[Trial], bool] | None = None) -> None:
-    """A row for each trial under a header, see COLUMNS; floats so that reading gives the same ones. Traces are left out.
+    """A row for each trial under a header, see COLUMNS; floats so that reading gives the same ones.
 
     succeeded: for the column success; None = Trial.success. The file is replaced as a whole; BadInputError if its folder cannot
     be written.
@@ -97,42 +96,6 @@ def _trial(values: dict[str, str], where: str) -> Trial:
         if field.name in COLUMNS and field.name not in known:
             known[field.name] = parsed(field.name, PLAIN[str(field.type)], values[field.name])
     return Trial(**known)
-
-
-def write_tables(folder: Path, results: Results) -> list[Path]:
-    """trials.csv (one row a calibration), curves.csv (one row a value), peaks.csv (where curves are highest), costs.csv.
-
-    Each is replaced as a whole; of those without rows, earlier ones go.
-    """
-    units = ["deg"] * 3 + ["cm"] * 3
-    tables: dict[str, tuple[Sequence[str], list[Sequence[Any]]]] = {
-        CURVES: (
-            ("experiment", "method", "frames", "axis", "unit", "offset", "score"),
-            [
-                (c.experiment, c.method, c.label, name, unit, repr(float(x)), repr(float(y)))
-                for c in results.curves
-                for name, unit, xs, ys in zip(AXES, units, c.curves.offsets, c.curves.values, strict=True)
-                for x, y in zip(xs, ys, strict=True)
-            ],
-        ),
-        PEAKS: (
-            ("experiment", "method", "frames", *(f"{name}_{unit}" for name, unit in zip(AXES, units, strict=True))),
-            [(c.experiment, c.method, c.label, *(repr(float(x)) for x in c.curves.peaks)) for c in results.curves],
-        ),
-        COSTS: (
-            ("method", "scene", "frames", "features_ms_per_frame", "evaluation_ms", "memory_mb"),
-            [(c.method, c.scene, c.frames, c.features_ms_per_frame, c.evaluation_ms, c.memory_mb) for c in results.costs],
-        ),
-    }
-    written = [TRIALS] * bool(results.trials) + [name for name, (_, rows) in tables.items() if rows]
-    if results.trials:
-        write_trials(folder / TRIALS, results.trials)
-    for name in written:
-        if name in tables:
-            write_atomically(folder / name, as_csv(*tables[name]))
-    for name in {TRIALS, *tables} - {*written}:
-        (folder / name).unlink(missing_ok=True)
-    return [folder / name for name in written]
 
 
 def as_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:

@@ -15,14 +15,13 @@ from calib_ros_check.jobs.cluster import ClusterPool
 from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.local import LocalPool
 from calib_ros_check.jobs.pool import Pool, run
-from calib_ros_evaluation.csv_files import write_tables
+from calib_ros_evaluation.csv_files import TRIALS, write_trials
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache, code_fingerprint, inspect_sources
 from calib_ros_evaluation.methods.registry import NAMES, check_names
 from calib_ros_evaluation.report.page import check_report, write_report
-from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
 from calib_ros_evaluation.results import Results
 from calib_ros_semantics.models.segmentation import SegmentationModels
 
@@ -70,7 +69,7 @@ class EvaluationOptions(RunOptions):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What came of it. files: the report first, then the tables. notes: for people."""
+    """What came of it. files: the report first. notes: for people."""
 
     results: Results
     files: list[Path]
@@ -78,7 +77,7 @@ class Evaluation:
 
 
 def evaluate(options: EvaluationOptions, facts: Mapping[str, str], progress: Progress = silent) -> Evaluation:
-    """Do what the journal in the folder does not hold yet, then write tables and report. facts: for the head of the report.
+    """Do what the journal in the folder does not hold yet, then write table and report. facts: for the head of the report.
 
     Interrupted or killed at any moment, the same options go on where it stopped. Raises BadInputError for a folder that holds
     an evaluation of something else, and what sources raise that cannot be used.
@@ -94,8 +93,12 @@ def evaluate(options: EvaluationOptions, facts: Mapping[str, str], progress: Pro
     if failed:
         notes.append(f"{failed} of {len(planned)} jobs failed; the end of the report says why")
     facts = {**facts, **_facts(results, summaries, notes)}
-    report = write_report(options.out, results, facts, options.settings, _pictures(cache, results))
-    return Evaluation(results, [*report, *write_tables(options.out, results)], notes)
+    report = write_report(options.out, results, facts, options.settings)
+    if not results.trials:
+        (options.out / TRIALS).unlink(missing_ok=True)  # an earlier one
+        return Evaluation(results, report, notes)
+    write_trials(options.out / TRIALS, results.trials)
+    return Evaluation(results, [*report, options.out / TRIALS], notes)
 
 
 def answered(
@@ -141,13 +144,3 @@ def _facts(results: Results, summaries: list[SourceSummary], notes: list[str]) -
     if notes:
         out["Left out"] = "; ".join(notes)
     return out
-
-
-def _pictures(cache: WorkerCache, results: Results) -> list[Picture]:
-    """Overlays of the best and the worst single frames."""
-    cases = []
-    for caption, trial in chosen_cases(results.trials, list(results.titles)):
-        position = trial.frames[0]
-        reference = cache.reference(trial.scene, position)
-        cases.append((caption, cache.frame(trial.scene, position), reference, trial.extrinsic(reference)))
-    return overlay_pictures(cases, cache.config)

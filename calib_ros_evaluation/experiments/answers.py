@@ -11,21 +11,16 @@ import numpy as np
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.experiments.frames import averaging, similarity_of_frames
 from calib_ros_evaluation.experiments.job import EvaluationJob
-from calib_ros_evaluation.experiments.scores import heat_map, loss_curves, trust
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
-from calib_ros_evaluation.experiments.trial import cost, trial
-from calib_ros_evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
+from calib_ros_evaluation.experiments.trial import cost, loss_curves, trial, trust
+from calib_ros_evaluation.results import Cost, CurveResult, Results, Trial, Trust
 
 T = TypeVar("T")
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
 KINDS: dict[str, Callable[[WorkerCache, EvaluationJob], Answer]] = {
     **dict.fromkeys(TRIALS, trial),
     "curves": loss_curves,
-    "heat": heat_map,
-    "averaging": averaging,
-    "similarity": similarity_of_frames,
     "cost": cost,
     "trust": trust,
 }
@@ -80,30 +75,7 @@ def trial_of(job: EvaluationJob, answer: Answer) -> Trial:
     size = {name: job.option(name) for name in ("start_deg", "start_m", "seed")}
     scores = {name: math.nan if answer[name] is None else float(answer[name]) for name in SCORES}
     twists = {name: tuple(answer[name]) for name in ("start", "end")}
-    trace = tuple(map(tuple, answer["trace"]))
-    return Trial(job.experiment, job.method, job.scene, job.frames, **size, **(answer | scores | twists | {"trace": trace}))
-
-
-def _heat(job: EvaluationJob, answer: Answer) -> HeatMap:
-    axes = (int(job.option("first")), int(job.option("second")))
-    return HeatMap(job.method, answer["label"], axes, *(np.array(answer[name], float) for name in ("x", "y", "values")))
-
-
-def _similarity(job: EvaluationJob, answer: Answer) -> Similarity:
-    histograms = {name: np.array(shares, float) for name, shares in answer["histograms"].items()}
-    keyframes = {threshold: tuple(chosen) for threshold, chosen in answer["keyframes"]}
-    stamps, matrix = (np.array(answer[name], float) for name in ("stamps", "matrix"))
-    chosen, threshold = tuple(answer["online"]), answer["online_threshold"]
-    return Similarity(job.scene, tuple(answer["names"]), stamps, matrix, keyframes, chosen, threshold, histograms)
-
-
-def _averaging(job: EvaluationJob, answer: Answer) -> Averaging:
-    offsets = answer["offsets"]
-    single = tuple(_curves(offsets, values) for values in answer["single"])
-    weighted, unweighted = (_curves(offsets, answer[name]) for name in ("weighted", "unweighted"))
-    weights, distances = (np.array(answer[name], float) for name in ("weights", "distances"))
-    about = job.method, job.scene, tuple(answer["labels"])
-    return Averaging(*about, weights, single, weighted, unweighted, answer["classes"], distances)
+    return Trial(job.experiment, job.method, job.scene, job.frames, **size, **(answer | scores | twists))
 
 
 def _curves(offsets: Any, values: Any) -> Curves:
@@ -116,9 +88,6 @@ SCORES = ("score_start", "score_end", "score_reference")
 READ: dict[str, tuple[str, Callable[[EvaluationJob, Answer], Any]]] = {
     **dict.fromkeys(TRIALS, ("trials", trial_of)),
     "curves": ("curves", lambda j, a: CurveResult(j.experiment, j.method, a["label"], _curves(a["offsets"], a["values"]))),
-    "heat": ("heat_maps", _heat),
-    "similarity": ("similarities", _similarity),
     "cost": ("costs", lambda j, a: Cost(j.method, j.scene, len(j.frames), *(a[name] for name in COSTS))),
-    "averaging": ("averagings", _averaging),
     "trust": ("trusts", lambda j, a: Trust(j.scene, a["right"], tuple((deg, m, share) for deg, m, share in a["wrong"]))),
 }

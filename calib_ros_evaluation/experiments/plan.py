@@ -11,21 +11,17 @@ from calib_ros.errors import BadInputError
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
 
-ROTATIONS, SHIFTS = (0, 1), (0, 1)  # of the heat maps: r_x with r_y, t_x with t_y
-AVERAGED = ("thesis", "ours")
 TRUSTED = "levinson"  # whose test of a calibration is tried
 TOGETHER = 8  # jobs given to a worker at once; so many are lost at most when it is killed
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Sizes of the experiments. start: of single frames and sets, deg and m per axis. sizes: of the start errors compared.
-    trust_step: how far the neighbours are that an extrinsic is compared with, deg and m."""
+    """Sizes of the experiments. start: of single frames and sets, deg and m per axis. sizes: of the start errors compared."""
 
     curve_frames: int = 12
     curve_samples: int = 41
     curve_reach: tuple[float, float] = (2.0, 0.3)
-    heat_samples: int = 21
     single_frames: int = 44
     start: tuple[float, float] = (2.0, 0.2)
     repeats: int = 1
@@ -33,10 +29,8 @@ class Plan:
     sizes: tuple[tuple[float, float], ...] = ((0.5, 0.05), (1.0, 0.1), (2.0, 0.2), (5.0, 0.3), (10.0, 0.5))
     counts: tuple[int, ...] = (1, 2, 5, 10)
     sets: int = 5
-    averaged_frames: int = 10
     cost_frames: int = 3
     trust_frames: int = 24
-    trust_step: tuple[float, float] = (0.2, 0.04)
     seed: int = 0
 
 
@@ -44,13 +38,11 @@ FULL = Plan()
 QUICK = Plan(
     curve_frames=3,
     curve_samples=21,
-    heat_samples=9,
     single_frames=5,
     size_frames=2,
     sizes=((0.5, 0.05), (2.0, 0.2)),
     counts=(1, 4),
     sets=1,
-    averaged_frames=4,
     cost_frames=2,
     trust_frames=4,
 )
@@ -70,32 +62,20 @@ def groups(todo: Sequence[EvaluationJob]) -> list[list[EvaluationJob]]:
     """Jobs that share features together, in an order in which a worker finds frames again that it has read."""
     out: dict[tuple[object, ...], list[EvaluationJob]] = {}
     for one in sorted(todo, key=lambda j: (j.scene, j.frames, j.method)):
-        # A cost is measured with features made anew, and what is long is alone.
-        alone = one.key if one.experiment in ("cost", "averaging", "heat") else ""
+        alone = one.key if one.experiment == "cost" else ""  # measured with features made anew
         out.setdefault((one.scene, one.frames, one.method, alone), []).append(one)
     return [whole[k : k + TOGETHER] for whole in out.values() for k in range(0, len(whole), TOGETHER)]
 
 
 def _curves(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    options = _around(plan, plan.curve_samples)
+    options = {"deg": plan.curve_reach[0], "m": plan.curve_reach[1], "samples": plan.curve_samples}
     chosen = shared_out(summaries, plan.curve_frames)
     return [job("curves", method, label, [k], options) for label, k in chosen for method in methods]
 
 
-def _heat(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    largest = max(summaries, key=lambda s: len(s.frames))
-    label, k = largest.label, largest.frames[len(largest.frames) // 2]
-    planes = (ROTATIONS, (3 + SHIFTS[0], 3 + SHIFTS[1]))
-    return [
-        job("heat", method, label, [k], {**_around(plan, plan.heat_samples), "first": first, "second": second})
-        for method in methods
-        for first, second in planes
-    ]
-
-
 def _single(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     return [
-        job("single", method, label, [k], _start(plan.start, plan.seed + n, trace=n == 0))
+        job("single", method, label, [k], _start(plan.start, plan.seed + n))
         for n in range(plan.repeats)
         for label, k in shared_out(summaries, plan.single_frames)
         for method in methods
@@ -125,21 +105,6 @@ def _frames(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[st
     return list(dict.fromkeys(out))  # a set that is drawn twice, as that of all frames, is one
 
 
-def _averaging(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    options = _around(plan, plan.curve_samples)
-    large = [(one.label, group) for one in summaries for group in one.groups if len(group) >= 3]
-    return [
-        job("averaging", method, label, spread(group, plan.averaged_frames), options)
-        for label, group in large
-        for method in AVERAGED
-        if method in methods
-    ]
-
-
-def _similarity(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    return [job("similarity", "", one.label, one.frames) for one in summaries if len(one.frames) > 1]
-
-
 def _cost(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     one = max(summaries, key=lambda s: len(s.groups[0]))
     chosen = spread(one.groups[0], plan.cost_frames)
@@ -149,27 +114,19 @@ def _cost(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]
 def _trust(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     if TRUSTED not in methods:
         return []
-    options = {"step_deg": plan.trust_step[0], "step_m": plan.trust_step[1], "seed": plan.seed}
-    return [job("trust", TRUSTED, label, [k], options) for label, k in shared_out(summaries, plan.trust_frames)]
+    return [job("trust", TRUSTED, label, [k], {"seed": plan.seed}) for label, k in shared_out(summaries, plan.trust_frames)]
 
 
-def _around(plan: Plan, samples: int) -> dict[str, float | int | str]:
-    return {"deg": plan.curve_reach[0], "m": plan.curve_reach[1], "samples": samples}
-
-
-def _start(size: tuple[float, float], seed: int, trace: bool = False) -> dict[str, float | int | str]:
-    return {"start_deg": size[0], "start_m": size[1], "seed": seed, "trace": int(trace)}
+def _start(size: tuple[float, float], seed: int) -> dict[str, float | int | str]:
+    return {"start_deg": size[0], "start_m": size[1], "seed": seed}
 
 
 # In the order of the report.
 MAKERS = {
     "curves": _curves,
-    "heat": _heat,
     "single": _single,
     "starts": _starts,
     "frames": _frames,
-    "averaging": _averaging,
-    "similarity": _similarity,
     "cost": _cost,
     "trust": _trust,
 }

@@ -6,12 +6,11 @@ import hashlib
 import json
 import time
 import zlib
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,21 +31,9 @@ from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.registry import methods
 
 Matrix = NDArray[np.float64]
-T = TypeVar("T")
 MOST_FRAMES = 60  # of a source; more are spread over it
 FRAMES, FEATURES = 12, 24  # kept by a worker: 4 MB for a KITTI frame, and up to 20 MB for its features
-# Code on which no answer depends: it shows answers, or runs elsewhere.
-NOT_OF_ANSWERS = {
-    calib_ros: ("ros/", "cli/", "overlay.py", "export.py"),
-    calib_ros_check: ("fleet/", "jobs/", "node/", "cli.py", "page.py", "report.py"),
-    calib_ros_semantics: ("class_pictures.py", "cli.py"),
-    calib_ros_synthetic: ("demo.py", "commands.py"),
-    calib_ros_thesis: (),
-    calib_ros_evaluation: (
-        *("report/", "steps/", "rendering.py", "cli.py", "commands.py", "compare.py", "csv_files.py"),
-        *("protocols/evaluate.py", "protocols/published.py", "protocols/tables.py"),
-    ),
-}
+PACKAGES = (calib_ros, calib_ros_check, calib_ros_evaluation, calib_ros_semantics, calib_ros_synthetic, calib_ros_thesis)
 
 
 @dataclass(frozen=True)
@@ -84,14 +71,12 @@ class Setup:
 
 
 def code_fingerprint() -> str:
-    """Of the code that answers depend on: two states of it must not share a folder, though their version be the same."""
+    """Of the code that answers may depend on: two states of it must not share a folder, though their version be the same."""
     found = hashlib.sha256()
-    for package, left_out in NOT_OF_ANSWERS.items():
+    for package in PACKAGES:
         folder = Path(package.__path__[0])
         for path in sorted(folder.rglob("*.py")):
-            name = path.relative_to(folder).as_posix()
-            if not name.startswith(left_out):
-                found.update(f"{package.__name__}/{name}\0".encode() + path.read_bytes())
+            found.update(f"{package.__name__}/{path.relative_to(folder).as_posix()}\0".encode() + path.read_bytes())
     return found.hexdigest()[:16]
 
 
@@ -125,26 +110,20 @@ class WorkerCache:
         self.setup, self.config, self._note = setup, setup.config, note
         self.methods: dict[str, Method] = methods(setup.config)
         self._warm: set[str] = set()
-        self._sources: dict[str, Source] = {}
-        self._frames: OrderedDict[Hashable, Frame] = OrderedDict()
-        self._features: OrderedDict[Hashable, tuple[Any, float]] = OrderedDict()
+        self.source = lru_cache(maxsize=None)(self._opened)
+        self.frame = lru_cache(FRAMES)(self._read)
+        self.features = lru_cache(FEATURES)(self._made)
 
-    def source(self, label: str) -> Source:
+    def _opened(self, label: str) -> Source:
         """The source of a scene."""
-        if label not in self._sources:
-            self._sources[label] = WithMotion(self.setup.scene(label).open(), self.config.motion, self._note)
-        return self._sources[label]
+        return WithMotion(self.setup.scene(label).open(), self.config.motion, self._note)
 
-    def frame(self, label: str, position: int) -> Frame:
+    def _read(self, label: str, position: int) -> Frame:
         """A frame of a scene. SourceGoneError if it cannot be read."""
-
-        def read() -> Frame:
-            try:
-                return self.source(label)[position]
-            except CalibrationError as error:
-                raise SourceGoneError(str(error)) from error
-
-        return _remembered(self._frames, (label, position), FRAMES, read)
+        try:
+            return self.source(label)[position]
+        except CalibrationError as error:
+            raise SourceGoneError(str(error)) from error
 
     def reference(self, label: str, position: int) -> Matrix:
         """T_camera_lidar (4, 4) that counts as true for a frame. BadInputError if there is none."""
@@ -157,28 +136,15 @@ class WorkerCache:
             raise BadInputError(f"{label} states no reference extrinsic to compare with; give one by --reference FILE")
         return stated
 
-    def features(self, method: str, label: str, position: int) -> tuple[Any, float]:
+    def _made(self, method: str, label: str, position: int) -> tuple[Any, float]:
         """A method's features of a frame, and the CPU seconds that they took when they were made."""
-
-        def make() -> tuple[Any, float]:
-            frame = self.frame(label, position)
-            if method not in self._warm:  # the first frame would pay for imports and look-up tables
-                self._warm.add(method)
-                self.methods[method].features(frame)
-            started = time.process_time()
-            made = self.methods[method].features(frame)
-            return made, time.process_time() - started
-
-        return _remembered(self._features, (method, label, position), FEATURES, make)
-
-
-def _remembered(memory: OrderedDict[Hashable, T], key: Hashable, limit: int, make: Callable[[], T]) -> T:
-    if key not in memory:
-        memory[key] = make()
-        while len(memory) > limit:
-            memory.popitem(last=False)
-    memory.move_to_end(key)
-    return memory[key]
+        frame = self.frame(label, position)
+        if method not in self._warm:  # the first frame would pay for imports and look-up tables
+            self._warm.add(method)
+            self.methods[method].features(frame)
+        started = time.process_time()
+        made = self.methods[method].features(frame)
+        return made, time.process_time() - started
 
 
 @lru_cache(maxsize=1)

@@ -1,4 +1,4 @@
-"""Accuracy and cost of a method: one calibration from a wrong start, and CPU time and memory."""
+"""What is measured of a method: calibrations from wrong starts, its score around the reference, its cost."""
 
 from __future__ import annotations
 
@@ -6,25 +6,27 @@ import contextlib
 import time
 import tracemalloc
 import zlib
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.registration.score.point_score import Score
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_check.jobs.journal import Answer
+from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache
-from calib_ros_evaluation.methods.method import TracePoint
+from calib_ros_evaluation.methods.levinson import Levinson, worse_share
 
 Matrix = NDArray[np.float64]
-KEPT_STEPS = 40  # of a trace
 BATCHES, EVALUATIONS = 7, 10  # the middle batch counts; the clock of CPU time is too coarse for one evaluation
 LONGEST_S = 0.5  # of a batch: a slow score is evaluated less often
 SPREAD = np.repeat([np.deg2rad(0.5), 0.05], 3)  # rad, m; around the reference, where the score is evaluated for its cost
+# Errors that `trust` compares with none, deg and m: a turn about, and a shift along, a direction that the seed draws.
+ERRORS = ((0.25, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.2))
+DIRECTIONS = 8
 
 
 def wrong_start(T: Matrix, job: EvaluationJob) -> Matrix:
@@ -47,7 +49,7 @@ def calibrated(cache: WorkerCache, job: EvaluationJob, start: Matrix) -> Answer:
     """One calibration from a start (4, 4), searched as far as the job's start_deg and start_m. A method that fails gives an
     answer with the reason; NOT_THE_METHODS is raised."""
     reference = cache.reference(job.scene, job.frames[0])
-    answer: Answer = {"status": "done", "reason": "", "start": off(start, reference), "trace": []}
+    answer: Answer = {"status": "done", "reason": "", "start": off(start, reference)}
     answer["start_rotation_deg"], answer["start_translation_m"] = _error(start, reference)
     answer |= _end(start, reference)
     answer |= dict.fromkeys(("score_start", "score_end", "score_reference"))
@@ -71,10 +73,6 @@ def calibrated(cache: WorkerCache, job: EvaluationJob, start: Matrix) -> Answer:
         answer |= {f"score_{name}": score.value(T) for name, T in (("start", start), ("end", found.T), ("reference", reference))}
     if found.refused:
         answer |= {"status": "refused", "reason": found.refused}
-    if job.option("trace"):
-        # A method may see better extrinsics than it ends at: beyond its reach, or one that it does not trust.
-        last = found.evaluations, answer["cpu_s"], *_error(found.T, reference)
-        answer["trace"] = [list(row) for row in (*_trace(found.trace, reference), last)]
     return answer
 
 
@@ -91,13 +89,6 @@ def off(T: Matrix, reference: Matrix) -> list[float]:
     """Twist (6,) of T against the reference in the camera frame, deg and m."""
     xi = se3.log(T @ se3.inverse(reference))
     return [*np.rad2deg(xi[:3]).tolist(), *xi[3:].tolist()]
-
-
-def _trace(steps: Sequence[TracePoint], reference: Matrix) -> list[tuple[float, float, float, float]]:
-    """Rows of Trial.trace: evaluations, CPU s, deg, m; at most KEPT_STEPS, spread evenly, with the first and the last."""
-    if len(steps) > KEPT_STEPS:
-        steps = [steps[k] for k in np.unique(np.linspace(0, len(steps) - 1, KEPT_STEPS).round().astype(int))]
-    return [(s.evaluations, s.cpu_s, *_error(s.T, reference)) for s in steps]
 
 
 def cost(cache: WorkerCache, job: EvaluationJob) -> Answer:
@@ -140,3 +131,35 @@ def _memory(cache: WorkerCache, job: EvaluationJob) -> float:
         return tracemalloc.get_traced_memory()[1] / 1e6
     finally:
         tracemalloc.stop()
+
+
+def loss_curves(cache: WorkerCache, job: EvaluationJob) -> Answer:
+    """Curves over the six axes (figures 4.7, 4.10, 4.13)."""
+    score = _score(cache, job)
+    reference = cache.reference(job.scene, job.frames[0])
+    found = curves(score, reference, job.option("deg"), job.option("m"), job.option("samples"))
+    name = cache.frame(job.scene, job.frames[0]).name or str(job.frames[0])
+    return {"label": f"{job.scene}, {name}", "offsets": found.offsets.tolist(), "values": found.values.tolist()}
+
+
+def _score(cache: WorkerCache, job: EvaluationJob) -> Score:
+    features = [cache.features(job.method, job.scene, position)[0] for position in job.frames]
+    return cache.methods[job.method].score(features, cache.reference(job.scene, job.frames[0]))
+
+
+def trust(cache: WorkerCache, job: EvaluationJob) -> Answer:
+    """F_C at the reference and at extrinsics that are wrong by each of ERRORS."""
+    method = cache.methods[job.method]
+    if not isinstance(method, Levinson):
+        raise BadInputError(f"{job.method} has no share of worse neighbours; only levinson has")
+    reference = cache.reference(job.scene, job.frames[0])
+    score = method.score([cache.features(job.method, job.scene, position)[0] for position in job.frames], reference)
+    rng = np.random.default_rng(int(job.option("seed")))  # the same for all frames, as if a mount had been displaced
+    wrong = []
+    for deg, m in ERRORS:
+        for _ in range(DIRECTIONS):
+            way = rng.normal(size=3)
+            way /= np.linalg.norm(way)
+            error = se3.exp([*(np.deg2rad(deg) * way), *(m * way)])
+            wrong.append([deg, m, worse_share(score, error @ reference)])
+    return {"right": worse_share(score, reference), "wrong": wrong}

@@ -184,7 +184,7 @@ class Castorena(Viewing):
         return CastorenaScore(self, features, T_prior, self.scales[-1])
 
     def optimise(self, features: Sequence[CastorenaFeatures], T: Matrix, reach: SearchBox) -> Outcome:
-        """FISTA within reach, coarse to fine. The trace holds the start and the steps of the last search; all are counted."""
+        """FISTA within reach, coarse to fine; the evaluations of all searches are counted."""
         watched, found = Watched(self.score(features, T)), T
         start = watched.value(T)
         for scale in self.scales[:-1]:
@@ -192,7 +192,7 @@ class Castorena(Viewing):
             found, _ = fista(coarse, T, reach.half_width(), self.finest_deg * scale, self.evaluations, found)
             watched.evaluations += coarse.evaluations
         found, end = fista(watched, T, reach.half_width(), self.finest_deg, self.evaluations, found)
-        return watched.outcome(found if end > start else T)
+        return Outcome(found if end > start else T, watched.evaluations)
 
 
 def edge_weights(gray: NDArray[np.uint8], gamma: float, sigma: float) -> Map:

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import expit
+from scipy.stats import norm
 
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.registration.score.point_score import Score
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, near, require
@@ -33,15 +31,7 @@ RESOLUTION = 1 / (len(NEIGHBOURS) - 1)  # of a share; no deviation is known bett
 STEP_DEG, STEP_M = 0.2, 0.04  # of the test of a calibration: half and twice as much tell right from wrong less well
 
 
-class ManyScore(Score, Protocol):
-    """A score that takes many extrinsics at once."""
-
-    def values(self, transforms: Matrix) -> Matrix:
-        """Scores (k,) of (k, 4, 4)."""
-        ...
-
-
-def grid_search(score: ManyScore, watched: Watched, T: Matrix, half_width: Matrix, finest: Matrix) -> Matrix:
+def grid_search(score: LevinsonScore, watched: Watched, T: Matrix, half_width: Matrix, finest: Matrix) -> Matrix:
     """The best extrinsic (4, 4) by grid search around T: of the 729 neighbours the best is moved to; while that is the centre
     itself, the step is halved, as long as it is above `finest` on any axis.
 
@@ -69,12 +59,12 @@ def _differ(step: Matrix) -> NDArray[np.intp]:
     return np.flatnonzero(~NEIGHBOURS[:, step == 0].any(axis=1))
 
 
-def worse_share(score: ManyScore, T: Matrix, step_deg: float = STEP_DEG, step_m: float = STEP_M) -> float:
+def worse_share(score: LevinsonScore, T: Matrix) -> float:
     """F_C: the share of the 728 neighbours of T (4, 4), one step away along any of the axes, whose score is lower than that of T.
 
     Without structure it is about one half; at the optimum of a score that is well-behaved it is 1.
     """
-    step = np.repeat([np.deg2rad(step_deg), step_m], 3)
+    step = np.repeat([np.deg2rad(STEP_DEG), STEP_M], 3)
     values = score.values(se3.exp_many(step * NEIGHBOURS) @ T)
     return float(np.mean(values[1:] < values[0]))
 
@@ -157,7 +147,8 @@ class Levinson(Viewing):
         score = self.score(features, T)
         watched = Watched(score)
         finest = np.repeat([np.deg2rad(self.finest_deg), self.finest_m], 3)
-        return watched.outcome(grid_search(score, watched, T, reach.half_width(), finest))
+        found = grid_search(score, watched, T, reach.half_width(), finest)
+        return Outcome(found, watched.evaluations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +161,7 @@ class _FramePoints:
 
 
 class LevinsonScore:
-    """J of eq. 4.3, the mean over frames; a ManyScore. Points outside the image, or less than MIN_DEPTH in front of it, add 0."""
+    """J of eq. 4.3, the mean over frames; a Score. Points outside the image, or less than MIN_DEPTH in front of it, add 0."""
 
     def __init__(self, features: Sequence[LevinsonFeatures], T_prior: Matrix, margin: float, min_points: int) -> None:
         self._frames: list[_FramePoints] = []
@@ -211,30 +202,15 @@ class LevinsonScore:
         return own.table.take(v.astype(np.int32))
 
 
-@dataclass(frozen=True)
-class Distribution:
-    """A normal distribution of F_C."""
-
-    mean: float
-    deviation: float
-
-    def log_density(self, shares: ArrayLike) -> Matrix:
-        """Natural logarithm of the density at shares (n,)."""
-        z = (np.asarray(shares, float) - self.mean) / self.deviation
-        return np.asarray(-0.5 * z * z - np.log(self.deviation * np.sqrt(2 * np.pi)))
+def fitted(shares: Sequence[float]) -> tuple[float, float]:
+    """Mean and standard deviation of the normal distribution of shares (n,), at least two of them."""
+    return float(np.mean(shares)), max(float(np.std(shares, ddof=1)), RESOLUTION)
 
 
-def fitted(shares: ArrayLike) -> Distribution:
-    """The normal distribution of shares (n,), at least two of them, else BadInputError."""
-    shares = np.asarray(shares, float)
-    if shares.ndim != 1 or len(shares) < 2:
-        raise BadInputError(f"a distribution cannot be fitted to shares of shape {shares.shape}; give at least two frames")
-    return Distribution(float(shares.mean()), max(float(shares.std(ddof=1)), RESOLUTION))
-
-
-def probability_right(shares: ArrayLike, right: Distribution, wrong: Distribution) -> float:
+def probability_right(shares: Sequence[float], right: tuple[float, float], wrong: tuple[float, float]) -> float:
     """Probability 0..1 that the calibration is right, given F_C of the last frames (w,), and both as likely beforehand.
 
-    By Bayes, the frames taken as independent. Frames of one place are not, and the probability is then too sure of itself.
+    right, wrong: how F_C is distributed then, see `fitted`. By Bayes, the frames taken as independent. Frames of one place are
+    not, and the probability is then too sure of itself.
     """
-    return float(expit(np.sum(right.log_density(shares) - wrong.log_density(shares))))
+    return float(expit(np.sum(norm.logpdf(shares, *right) - norm.logpdf(shares, *wrong))))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
@@ -29,26 +28,12 @@ REFINED_DEG = 0.4  # of a reach of zero, which refines a start that is right: a 
 
 
 @dataclass(frozen=True, eq=False)
-class TracePoint:
-    """The best extrinsic T_camera_lidar (4, 4) after so many evaluations of the score and so many CPU seconds."""
-
-    evaluations: int
-    cpu_s: float
-    T: Matrix
-
-
-@dataclass(frozen=True, eq=False)
 class Outcome:
-    """Where a method ended. T: T_camera_lidar (4, 4), the start if refused. score: of T. evaluations: of the score.
-
-    trace: the start, and every better extrinsic on the way. refused: why the method itself does not trust its optimum; empty if
-    it does, or has no test for it.
-    """
+    """Where a method ended. T: T_camera_lidar (4, 4), the start if refused. evaluations: of the score. refused: why the method
+    itself does not trust its optimum; empty if it does, or has no test for it."""
 
     T: Matrix
-    score: float
     evaluations: int
-    trace: tuple[TracePoint, ...] = ()
     refused: str = ""
 
 
@@ -86,26 +71,15 @@ class Method(Protocol):
 
 @dataclass(eq=False)
 class Watched:
-    """A score that counts its evaluations and keeps the best extrinsic; a Score."""
+    """A score that counts its evaluations; a Score."""
 
     score: Score
     evaluations: int = 0
-    best: float = -np.inf
-    trace: list[TracePoint] = field(default_factory=list)
-    _started: float = field(default_factory=time.process_time)
 
     def value(self, T: Matrix) -> float:
         """At T (4, 4)."""
-        value = self.score.value(T)
         self.evaluations += 1
-        if value > self.best:
-            self.best = value
-            self.trace.append(TracePoint(self.evaluations, time.process_time() - self._started, T))
-        return value
-
-    def outcome(self, T: Matrix, refused: str = "") -> Outcome:
-        """Where it ended; T (4, 4) is not counted as an evaluation."""
-        return Outcome(T, self.score.value(T), self.evaluations, tuple(self.trace), refused)
+        return self.score.value(T)
 
 
 def typical_step_deg(reach: SearchBox) -> float:
@@ -138,26 +112,18 @@ class PreprocessedFrame:
     reflectivity: NDArray[np.float32] | None
 
 
-class Preprocessor:
-    """Makes them of frames; the look-up tables of the last camera's lens are kept."""
+class Extractors:
+    """The feature extractor of a configuration for the last camera, whose look-up tables are kept."""
 
     def __init__(self, config: Config) -> None:
-        # The baselines project by eq. 2.3.
-        self.config = replace(config, image=replace(config.image, projection="pinhole"))
-        self._extract: FeatureExtractor | None = None
+        self.config = config
+        self._last: FeatureExtractor | None = None
 
-    def __call__(self, frame: Frame) -> PreprocessedFrame:
-        """Preprocess a frame. TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
-        require_returns(frame.cloud)
-        if self._extract is None or self._extract.source_camera != frame.camera:
-            self._extract = FeatureExtractor(frame.camera, self.config)
-        extract, cloud, keep = self._extract, frame.cloud, frame.cloud.finite_mask()
-        at_image = deskewed_points(frame, self.config.motion)
-        measured = cloud.finite()
-        xyz = measured.xyz if at_image is None else at_image[keep]
-        return PreprocessedFrame(
-            to_gray(extract.working_image(frame.image)), extract.camera, measured, xyz, reflectivity(measured.intensity)
-        )
+    def of(self, camera: Camera) -> FeatureExtractor:
+        """For images of a camera."""
+        if self._last is None or self._last.source_camera != camera:
+            self._last = FeatureExtractor(camera, self.config)
+        return self._last
 
 
 class Viewing:
@@ -166,8 +132,18 @@ class Viewing:
     config: Config
 
     @cached_property
-    def _preprocess(self) -> Preprocessor:
-        return Preprocessor(self.config)
+    def _extractors(self) -> Extractors:
+        # The baselines project by eq. 2.3.
+        return Extractors(replace(self.config, image=replace(self.config.image, projection="pinhole")))
+
+    def _preprocess(self, frame: Frame) -> PreprocessedFrame:
+        """Preprocess a frame. TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
+        require_returns(frame.cloud)
+        extract, measured = self._extractors.of(frame.camera), frame.cloud.finite()
+        at_image = deskewed_points(frame, self.config.motion)
+        xyz = measured.xyz if at_image is None else at_image[frame.cloud.finite_mask()]
+        gray = to_gray(extract.working_image(frame.image))
+        return PreprocessedFrame(gray, extract.camera, measured, xyz, reflectivity(measured.intensity))
 
 
 class Points(Protocol):
@@ -205,25 +181,15 @@ class Extracting:
     config: Config
 
     @cached_property
-    def _extraction(self) -> Extraction:
-        return Extraction(replace(self.config, refine=replace(self.config.refine, objective=self.objective)))
+    def _extractors(self) -> Extractors:
+        return Extractors(replace(self.config, refine=replace(self.config.refine, objective=self.objective)))
+
+    @cached_property
+    def _segmentation(self) -> SegmentationModels:
+        return SegmentationModels(self.config.semantics)
 
     def features(self, frame: Frame) -> FrameFeatures:
         """Features of a frame, with semantics where the configuration asks for any. TooFewFeaturesError or BadTimesError if it
         cannot be used."""
-        return self._extraction(frame)
-
-
-class Extraction:
-    """Features of frames, with semantics where the configuration asks for any. The models, and the look-up tables of the last
-    camera's lens, are kept."""
-
-    def __init__(self, config: Config) -> None:
-        self.config, self.segmentation = config, SegmentationModels(config.semantics)
-        self._extract: FeatureExtractor | None = None
-
-    def __call__(self, frame: Frame) -> FrameFeatures:
-        """Features of a frame for the configured objective. TooFewFeaturesError or BadTimesError if it cannot be used."""
-        if self._extract is None or self._extract.source_camera != frame.camera:
-            self._extract = FeatureExtractor(frame.camera, self.config)
-        return self._extract(frame, self.segmentation(frame) if self.segmentation.active else None)
+        seen = self._segmentation(frame) if self._segmentation.active else None
+        return self._extractors.of(frame.camera)(frame, seen)

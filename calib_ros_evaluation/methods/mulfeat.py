@@ -175,15 +175,13 @@ class Mulfeat(Viewing):
         return MulfeatScore(frames, self.lidar_edge, self.image_edge)
 
     def optimise(self, features: Sequence[MulfeatFeatures], T: Matrix, reach: SearchBox) -> Outcome:
-        """Steepest ascent with the steps of Barzilai and Borwein, round after round from the best so far, within the reach.
-        The trace also holds what was tried for the slope only, half a step aside.
-        """
+        """Steepest ascent with the steps of Barzilai and Borwein, round after round from the best so far, within the reach."""
         watched, limits = Watched(self.score(features, T)), search_limits(T, reach)
         step = max(self.step_share * typical_step_deg(reach), 2 * self.finest_deg)
         while step / 2 >= self.finest_deg:
             T, _ = barzilai_borwein(watched, T, step, step / 2, self.evaluations, limits)
             step /= 2
-        return watched.outcome(T)
+        return Outcome(T, watched.evaluations)
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,5 +113,5 @@ class Nid(Viewing):
             T = found
             if near:
                 break
-            watched.score, watched.best = self.score(features, T), -np.inf
-        return watched.outcome(T)
+            watched.score = self.score(features, T)
+        return Outcome(T, watched.evaluations)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -14,9 +13,9 @@ from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.score.point_score import FastScore, LevelScore, Score
+from calib_ros.registration.score.point_score import FastScore, LevelScore
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import Extracting, Outcome, TracePoint
+from calib_ros_evaluation.methods.method import Extracting, Outcome
 
 Matrix = NDArray[np.float64]
 LINEARISATION = 4  # evaluations: a slope looks the maps up four times, a value once
@@ -37,30 +36,25 @@ class Own(Extracting):
 
     def optimise(self, features: Sequence[FrameFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Calibrator.estimate. Its evaluations are counted one by one, whether of all points or of some, also those of its
-        judgement after the optimum; a linearisation counts as LINEARISATION. The trace holds what was better on the finest level
-        after the search and after each level of the optimisation. Too few points near the image are a refusal, with no
-        score (NaN)."""
+        judgement after the optimum; a linearisation counts as LINEARISATION. Too few points near the image are a refusal."""
         try:
-            trace = _Trace(self.score(features, T), T)
+            self.score(features, T)
         except TooFewFeaturesError as error:
-            return Outcome(T, np.nan, 0, (TracePoint(0, 0.0, T),), str(error))
-        calibrator = Calibrator(features[0].camera, self._extraction.config, self._extraction.segmentation, trace)
+            return Outcome(T, 0, str(error))
+        count = _Count()
+        calibrator = Calibrator(features[0].camera, self._extractors.config, self._segmentation, count)
         if calibrator.classes_in_doubt_only:
             plain = [f.plain or f for f in features]
             result = calibrator.estimate_in_doubt(plain, lambda: (features, ()), T, reach)
         else:
             result = calibrator.estimate(features, T, reach)
-        refused = "" if result.converged else result.reason
-        score = result.score if result.converged else result.initial_score
-        return Outcome(result.T_camera_lidar, score, trace.evaluations, tuple(trace.steps), refused)
+        return Outcome(result.T_camera_lidar, count.evaluations, "" if result.converged else result.reason)
 
 
-class _Trace:
-    """An observer that counts evaluations and notes extrinsics that are better by a score of its own, which does not count."""
+class _Count:
+    """An observer that counts evaluations."""
 
-    def __init__(self, score: Score, T: Matrix) -> None:
-        self._score, self._best, self._started = score, score.value(T), time.process_time()
-        self.evaluations, self.steps = 0, [TracePoint(0, 0.0, T)]
+    evaluations = 0
 
     def evaluated(self, count: int) -> None:
         """See Observer."""
@@ -72,7 +66,3 @@ class _Trace:
 
     def reached(self, T: Matrix) -> None:
         """See Observer."""
-        spent, value = time.process_time() - self._started, self._score.value(T)
-        if value > self._best:
-            self._best = value
-            self.steps.append(TracePoint(self.evaluations, spent, T))

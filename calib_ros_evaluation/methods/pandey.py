@@ -95,4 +95,4 @@ class Pandey(Viewing):
         watched = Watched(self.score(features, T))
         step = max(self.step_share * reach.reach[0], 2 * self.epsilon_deg)
         found, _ = barzilai_borwein(watched, T, step, self.epsilon_deg, self.evaluations, search_limits(T, reach))
-        return watched.outcome(found)
+        return Outcome(found, watched.evaluations)

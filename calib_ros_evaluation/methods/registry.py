@@ -14,21 +14,13 @@ from calib_ros_evaluation.methods.pandey import Pandey
 from calib_ros_evaluation.methods.thesis import Thesis
 
 # In the order of the thesis's table 4.2, then what came after it.
-NAMES = ("pandey", "levinson", "castorena", "mulfeat", "thesis", "nid", "ours")
+METHODS = (Pandey, Levinson, Castorena, Mulfeat, Thesis, Nid, Own)
+NAMES = tuple(method.name for method in METHODS)
 
 
 def methods(config: Config) -> dict[str, Method]:
     """Name -> method, in the order of NAMES; all work with this configuration."""
-    made: tuple[Method, ...] = (
-        Pandey(config=config),
-        Levinson(config=config),
-        Castorena(config=config),
-        Mulfeat(config=config),
-        Thesis(config=config),
-        Nid(config=config),
-        Own(config=config),
-    )
-    return {method.name: method for method in made}
+    return {method.name: method(config=config) for method in METHODS}
 
 
 def check_names(names: tuple[str, ...]) -> None:

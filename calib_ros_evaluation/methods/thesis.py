@@ -41,15 +41,14 @@ class Thesis(Extracting):
 
     def _scores(self, features: Sequence[FrameFeatures], T_prior: Matrix) -> ThesisScore:
         own = [f.own for f in features]
-        return ThesisScore(own, T_prior, self._extraction.config, frame_weights([f.importance for f in own]).tolist())
+        return ThesisScore(own, T_prior, self._extractors.config, frame_weights([f.importance for f in own]).tolist())
 
     def optimise(self, features: Sequence[FrameFeatures], T: Matrix, reach: SearchBox) -> Outcome:
-        """Smoothing after smoothing. The trace holds what was better on the smoothing of its time; the outcome's score is that
-        on the last one."""
+        """Smoothing after smoothing."""
         scores, limits = self._scores(features, T), search_limits(T, reach)
         step, evaluations = self.first_step * typical_step_deg(reach), thesis_of(self.config).evaluations
         watched = Watched(scores.at(0))
         for level in range(scores.n_levels):
-            watched.score, watched.best = scores.at(level), -np.inf
+            watched.score = scores.at(level)
             T, _ = nelder_mead(watched, T, step / 2**level, evaluations, limits=limits)
-        return watched.outcome(T)
+        return Outcome(T, watched.evaluations)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.io import write_atomically
-from calib_ros_evaluation.csv_files import TRIALS, as_csv, write_trials
+from calib_ros_evaluation.csv_files import as_csv
 from calib_ros_evaluation.protocols.definitions import MISCALIBRATION, Protocol, Size
 from calib_ros_evaluation.protocols.detection import INCONCLUSIVE, RIGHT, RIGHT_SET, WRONG, Decision
 from calib_ros_evaluation.protocols.published import ACCURACIES, CAVEATS, INTRODUCTIONS, OURS, TITLES, Published, rows_of
 from calib_ros_evaluation.report.sections import Section
 from calib_ros_evaluation.report.statistics import median, wilson
-from calib_ros_evaluation.report.table import NONE, Cell, Rows, Table, degrees, number, table
+from calib_ros_evaluation.report.table import NONE, Rows, Table, degrees, number, percent, table
 from calib_ros_evaluation.results import Trial
 
 DECISIONS = "decisions.csv"
@@ -38,36 +38,26 @@ def trial_section(protocol: Protocol, trials: Sequence[Trial]) -> Section:
 def size_table(protocol: Protocol, size: Size, trials: Sequence[Trial]) -> Table:
     """Published rows, then a row for each of our sources and numbers of frames. wrong: accepted, but beyond the limits."""
     rows: Rows = [_published(row) for row in rows_of(protocol.name, size)]
-    for scene, count in cells(size, trials):
-        rows.append([THIS, scene, str(count), *_figures(protocol, _of(trials, size, scene, count))])
+    cells: dict[tuple[str, int], list[Trial]] = {}
+    for trial in trials:
+        if (trial.start_deg, trial.start_m) == (size.deg, size.m):
+            cells.setdefault((trial.scene, len(trial.frames)), []).append(trial)
+    rows += [[THIS, scene, str(count), *_figures(protocol, own)] for (scene, count), own in cells.items()]
     return table(f"From {size.words}", HEADER, rows)
 
 
-def cells(size: Size, trials: Sequence[Trial]) -> list[tuple[str, int]]:
-    """Sources and numbers of frames that there are trials of, in their order."""
-    return list(dict.fromkeys((t.scene, len(t.frames)) for t in trials if _is_of(t, size)))
-
-
-def _is_of(trial: Trial, size: Size) -> bool:
-    return (trial.start_deg, trial.start_m) == (size.deg, size.m)
-
-
-def _of(trials: Sequence[Trial], size: Size, scene: str, count: int) -> list[Trial]:
-    return [t for t in trials if _is_of(t, size) and (t.scene, len(t.frames)) == (scene, count)]
-
-
-def _published(row: Published) -> list[Cell | str]:
+def _published(row: Published) -> list[str]:
     system = f"{row.system} ({'learned' if row.learned else 'classical'})"
-    errors = _deg(row.rotation_deg), _cm(row.translation_m)
-    return [system, row.data, str(row.frames or NONE), NONE, _percent(row.success), *([NONE] * 5), *errors]
+    errors = degrees(row.rotation_deg), number(100 * row.translation_m, 2)
+    return [system, row.data, str(row.frames or NONE), NONE, percent(row.success, 1), *([NONE] * 5), *errors]
 
 
-def _figures(protocol: Protocol, own: Sequence[Trial]) -> list[Cell | str]:
+def _figures(protocol: Protocol, own: Sequence[Trial]) -> list[str]:
     n, succeeded = len(own), sum(map(protocol.succeeded, own))
     accepted = [t for t in own if t.status == "done"]
     return [
         str(n),
-        _percent(succeeded / n),
+        percent(succeeded / n, 1),
         _interval(succeeded, n),
         str(n - len(accepted)),
         str(sum(map(protocol.wrong, own))),
@@ -76,11 +66,12 @@ def _figures(protocol: Protocol, own: Sequence[Trial]) -> list[Cell | str]:
     ]
 
 
-def _means(trials: Sequence[Trial]) -> list[Cell | str]:
+def _means(trials: Sequence[Trial]) -> list[str]:
     """Mean errors. A refused trial ends at its start, and counts with its error."""
     if not trials:
         return [NONE, NONE]
-    return [_deg(float(np.mean([t.rotation_deg for t in trials]))), _cm(float(np.mean([t.translation_m for t in trials])))]
+    deg, m = np.mean([(t.rotation_deg, t.translation_m) for t in trials], axis=0).tolist()
+    return [degrees(deg), number(100 * m, 2)]
 
 
 def _cpu(trials: Sequence[Trial]) -> str:
@@ -90,12 +81,6 @@ def _cpu(trials: Sequence[Trial]) -> str:
         f"{median(own):.1f} s (mean {np.mean(own):.1f} s) with {count} frame{'s' if count > 1 else ''}" for count, own in medians
     ]
     return f"median of a trial without features {', '.join(parts)}"
-
-
-def write_protocol_trials(folder: Path, protocol: Protocol, trials: Sequence[Trial]) -> Path:
-    """trials.csv, its column success by the protocol's limits."""
-    write_trials(folder / TRIALS, trials, protocol.succeeded)
-    return folder / TRIALS
 
 
 def detection_section(found: Sequence[Decision]) -> Section:
@@ -138,14 +123,14 @@ def accuracy_table(found: Sequence[Decision], counts: Sequence[int]) -> Table:
         alarms = [one for one in own if one.set_name == RIGHT_SET]
         shares = [_right(own, name) for name in ("rot_hard", "trans_easy")]
         false = f"{sum(one.kind == WRONG for one in alarms)} of {len(alarms)}"
-        rows.append([THIS, str(count), str(len(own)), _percent(right / len(own)), _interval(right, len(own)), *shares, false])
+        rows.append([THIS, str(count), str(len(own)), percent(right / len(own), 1), _interval(right, len(own)), *shares, false])
     header = ("system", "frames", "decisions", "all", "95 %", "rot_hard", "trans_easy", "false alarms")
     return table("Share of right decisions", header, rows)
 
 
-def _right(found: Sequence[Decision], name: str) -> Cell:
+def _right(found: Sequence[Decision], name: str) -> str:
     own = [one for one in found if one.set_name == name]
-    return _percent(sum(one.kind == RIGHT for one in own) / len(own) if own else math.nan)
+    return percent(sum(one.kind == RIGHT for one in own) / len(own) if own else math.nan, 1)
 
 
 def _check_cpu(found: Sequence[Decision], counts: Sequence[int]) -> str:
@@ -164,10 +149,6 @@ def write_decisions(folder: Path, found: Sequence[Decision]) -> Path:
     return folder / DECISIONS
 
 
-def _percent(share: float) -> Cell:
-    return Cell(NONE if math.isnan(share) else f"{100 * share:.1f} %", share)
-
-
 def _stated(share: float) -> str:
     """With the digits that are published: 99.97 % is not 100.0 %."""
     return f"{100 * share:.4g} %"
@@ -176,11 +157,3 @@ def _stated(share: float) -> str:
 def _interval(successes: int, n: int) -> str:
     low, high = wilson(successes, n)
     return f"{100 * low:.0f} to {100 * high:.0f} %"
-
-
-def _deg(value: float) -> Cell:
-    return degrees(value)
-
-
-def _cm(value_m: float) -> Cell:
-    return number(100 * value_m, 2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,14 +9,12 @@ from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros_check.page import page_template
 from calib_ros_evaluation.rendering import empty_figure
-from calib_ros_evaluation.report.pictures import Picture, jpeg
 from calib_ros_evaluation.report.sections import Section, sections
 from calib_ros_evaluation.report.table import as_markdown, escaped
 from calib_ros_evaluation.results import Results
 
 PAGE, TEXT, PLOTS = "report.html", "report.md", "plots"
 TITLE = "Camera-LiDAR calibration: methods compared"
-PLOT_LINK = re.compile(rf"\]\({PLOTS}/([a-z0-9_]+\.png)\)")
 
 # The parts of the page that differ from that of the steps.
 TEMPLATE = """\
@@ -29,7 +26,6 @@ TEMPLATE = """\
 .sheet td, .sheet th { text-align: right; padding: .2rem 0 .2rem 1.4rem; }
 .sheet td.text, .sheet th.text { text-align: left; white-space: normal; min-width: 6rem; }
 .sheet td:first-child, .sheet th:first-child { padding-left: 0; white-space: nowrap; }
-.sheet td.best { font-weight: 700; color: var(--accent); }
 figure .scroll { padding: 0; }
 figure .scroll img { max-width: none; margin: 0 auto; background: #ffffff; }
 figure.wide .scroll img { min-width: 46rem; }
@@ -70,10 +66,9 @@ nav { display: block; }
 <div class="sheet">
 <h3>{{ table.title }}</h3>
 <div class="scroll"><table>
-<tr>{% for cell in table.header %}<th class="{{ table.css_classes(-1, loop.index0) }}">{{ cell }}</th>{% endfor %}</tr>
+<tr>{% for cell in table.header %}<th{% if table.words(loop.index0) %} class="text"{% endif %}>{{ cell }}</th>{% endfor %}</tr>
 {% for row in table.rows %}
-{% set r = loop.index0 %}
-<tr>{% for cell in row %}<td class="{{ table.css_classes(r, loop.index0) }}">{{ cell }}</td>{% endfor %}</tr>
+<tr>{% for cell in row %}<td{% if table.words(loop.index0) %} class="text"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}
 </table></div>
 {% for note in table.notes %}
@@ -83,17 +78,10 @@ nav { display: block; }
 {% endfor %}
 <div class="grid">
 {% for plot in section.plots %}
-<figure{% if plot.wide %} class="wide"{% endif %}>
+<figure class="wide">
 <div class="scroll"><img src="data:image/png;base64,{{ plot.png|base64 }}" width="{{ plot.size[0] }}" height="{{ plot.size[1] }}"
  alt="{{ plot.title }}"></div>
 <figcaption><b>{{ plot.title }}</b>{{ plot.caption }}</figcaption>
-</figure>
-{% endfor %}
-{% for picture in section.pictures %}
-<figure>
-<img src="data:image/jpeg;base64,{{ picture|jpeg|base64 }}" width="{{ picture.image.shape[1] }}"
- height="{{ picture.image.shape[0] }}" alt="{{ picture.title }}">
-<figcaption><b>{{ picture.title }}</b>{{ picture.caption }}</figcaption>
 </figure>
 {% endfor %}
 </div>
@@ -105,7 +93,7 @@ nav { display: block; }
 
 def check_report(folder: Path) -> None:
     """What write_report would find out too late: MissingDependencyError, or BadInputError for a folder where a file is to be."""
-    page_template(TEMPLATE, jpeg=jpeg)
+    page_template(TEMPLATE)
     empty_figure(1, 1)
     for path in (folder / PAGE, folder / TEXT):
         if path.is_dir():
@@ -114,40 +102,25 @@ def check_report(folder: Path) -> None:
         raise BadInputError(f"{folder / PLOTS} is a file, where plots are to be; choose another --out")
 
 
-def write_report(
-    folder: Path, results: Results, facts: Mapping[str, str], configuration: str, pictures: Sequence[Picture] = ()
-) -> list[Path]:
+def write_report(folder: Path, results: Results, facts: Mapping[str, str], configuration: str) -> list[Path]:
     """Write report.html, report.md and plots/*.png; returns them, the page first. The same results give the same bytes.
 
-    facts: the page's head. configuration: as YAML. Plots of an earlier report in the folder go. Nothing is written if anything
-    cannot be drawn: MissingDependencyError without Jinja2 or matplotlib, BadInputError for a picture that is none, or if the
-    folder cannot be written.
+    facts: the page's head. configuration: as YAML. Nothing is written if anything
+    cannot be drawn: MissingDependencyError without Jinja2 or matplotlib, BadInputError if the folder cannot be written.
     """
-    return write_sections(folder, TITLE, facts, configuration, sections(results, pictures))
+    return write_sections(folder, TITLE, facts, configuration, sections(results))
 
 
 def write_sections(folder: Path, title: str, facts: Mapping[str, str], configuration: str, made: Sequence[Section]) -> list[Path]:
     """`write_report` of sections that are made already, whatever they are about."""
-    template = page_template(TEMPLATE, jpeg=jpeg)
+    template = page_template(TEMPLATE)
     page = template.render(command="evaluate", title=title, facts=facts, configuration=configuration, sections=made)
     text = document(title, facts, made, PLOTS)
-    before = _plots_of(folder / TEXT)
     files = {folder / PLOTS / f"{plot.name}.png": plot.png for section in made for plot in section.plots}
-    # The text last: it names the plots, so that a later report knows which of them to remove.
     files = {folder / PAGE: page.encode(), **files, folder / TEXT: text.encode()}
     for path, data in files.items():
         write_atomically(path, data)
-    for path in before:
-        if path not in files:
-            path.unlink(missing_ok=True)
     return list(files)
-
-
-def _plots_of(text: Path) -> list[Path]:
-    """Those that an earlier report's text names."""
-    if not text.is_file():
-        return []
-    return [text.parent / PLOTS / name for name in PLOT_LINK.findall(text.read_text(encoding="utf-8", errors="replace"))]
 
 
 def document(title: str, facts: Mapping[str, str], sections: Sequence[Section], folder: str) -> str:
@@ -160,5 +133,4 @@ def document(title: str, facts: Mapping[str, str], sections: Sequence[Section], 
         parts += ["\n".join(listed)] if listed else []
         parts += [as_markdown(one) for one in section.tables]
         parts += [f"![{escaped(plot.title)}]({folder}/{plot.name}.png)\n\n{escaped(plot.caption)}" for plot in section.plots]
-        parts += [f"{escaped(picture.title)}: {escaped(picture.caption)}" for picture in section.pictures]
     return "\n\n".join(part for part in parts if part) + "\n"

@@ -1,10 +1,9 @@
-"""Plots of the report: style of each method, plots of scores, drives and cost."""
+"""Plots of the report: loss curves, errors per axis, success against the start, errors against frames."""
 
 from __future__ import annotations
 
 import io
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 
 from calib_ros_evaluation.curves import AXES, Curves
 from calib_ros_evaluation.rendering import COLORS, empty_figure, six_axes
-from calib_ros_evaluation.report.statistics import OURS
-from calib_ros_evaluation.results import Averaging, HeatMap, Similarity
+from calib_ros_evaluation.report.statistics import OURS, axis_errors, errors, quantile, start_sizes, wilson
+from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Trial
 
 Matrix = NDArray[np.float64]
 # Okabe and Ito: distinct for colour-blind eyes too. Their yellow cannot be seen on white, brown stands for it.
@@ -22,23 +21,21 @@ OUR_COLOR, BAD, GOOD = COLORS
 OTHERS = ("#e69f00", "#56b4e9", GOOD, "#cc79a7", BAD, "#333333", "#8c510a")
 DASHES: tuple[Any, ...] = ("--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)))
 MARKERS = ("s", "^", "D", "v", "P", "X", "*")
-SINGLE = (OTHERS[0], OTHERS[2], "#9467bd")  # orange, green, purple, as figure 4.16 has them
-MOST_NUMBERS = 16  # frames; more figures could not be read
-COLUMNS = 4  # histograms side by side
-BGR = {"blue": "#0072b2", "green": "#009e73", "red": "#d55e00"}
 LONGEST = 70  # letters of a name in a plot
+LIMITS = (SUCCESS_DEG, 100 * SUCCESS_M)  # deg, cm
+DODGE = 0.62  # of the gap between two positions, shared by the methods that stand side by side
+PAPER = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1}  # behind text
 
 
 @dataclass(frozen=True)
 class Plot:
-    """name: of its file, without suffix. png: the file. size: its width and height, px. wide: needs the page's width."""
+    """name: of its file, without suffix. png: the file. size: its width and height, px."""
 
     name: str
     title: str
     caption: str
     png: bytes
     size: tuple[int, int]
-    wide: bool = True
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ def method_styles(names: Sequence[str]) -> dict[str, LineStyle]:
     return out
 
 
-def finished(figure: Any, name: str, title: str, caption: str, wide: bool = True) -> Plot:
+def finished(figure: Any, name: str, title: str, caption: str) -> Plot:
     """The figure as a file; the same figure gives the same bytes."""
     from PIL import Image  # comes with matplotlib, which writes its own files by it
 
@@ -78,7 +75,7 @@ def finished(figure: Any, name: str, title: str, caption: str, wide: bool = True
     stream = io.BytesIO()
     # 256 colours are enough to the eye, and the file is a third as large.
     picture.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
-    return Plot(name, title, caption, stream.getvalue(), picture.size, wide)
+    return Plot(name, title, caption, stream.getvalue(), picture.size)
 
 
 def plain(text: str) -> str:
@@ -87,22 +84,12 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def legend(figure: Any, handles: Iterable[Any], columns: int = 8) -> None:
-    """Above all axes."""
-    handles = list(handles)
-    if handles:
-        figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), columns), frameon=False, fontsize=11)
-
-
-def method_legend(figure: Any, own: dict[str, LineStyle], markers: bool = False) -> None:
-    """Names and lines of methods above all axes."""
+def method_legend(figure: Any, own: Mapping[str, LineStyle]) -> None:
+    """Names, lines and marks of methods above all axes."""
     from matplotlib.lines import Line2D
 
-    lines = [
-        Line2D([], [], label=plain(name), marker=style.marker if markers else "", markersize=6, **style.line)
-        for name, style in own.items()
-    ]
-    legend(figure, lines)
+    lines = [Line2D([], [], label=plain(name), marker=style.marker, markersize=6, **style.line) for name, style in own.items()]
+    figure.legend(handles=lines, loc="outside upper center", ncols=min(len(lines), 8), frameon=False, fontsize=11)
 
 
 def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], styles: Mapping[str, LineStyle]) -> Plot:
@@ -115,7 +102,7 @@ def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves
             axes.plot(found.offsets[axis], found.scaled()[axis], **style.line)
             if np.isfinite(found.values[axis]).all():
                 axes.plot(found.peaks[axis], 1, style.marker, color=style.color, markersize=7, zorder=style.layer, clip_on=False)
-    method_legend(figure, own, markers=True)
+    method_legend(figure, own)
     return finished(figure, name, title, caption)
 
 
@@ -127,160 +114,115 @@ def mean_curves(curves: Sequence[Curves]) -> Curves:
     return Curves(offsets, np.mean(values, axis=0))
 
 
-def averaging(name: str, one: Averaging) -> Plot:
-    """Figure 4.16: thin lines are single frames."""
-    figure = empty_figure(13, 6.8)
-    handles: list[Any] = []
-    for axis, axes in enumerate(six_axes(figure, "score, scaled")):
-        lines = []
-        for k, (label, weight, curves) in enumerate(zip(one.labels, one.weights, one.single, strict=True)):
-            text = plain(f"{label} (w = {weight:.2f})")
-            lines += axes.plot(curves.offsets[axis], curves.scaled()[axis], color=SINGLE[k % 3], linewidth=1.2, label=text)
-        for text, curves, dash in (("weighted", one.weighted, "-"), ("unweighted", one.unweighted, (0, (4, 2)))):
-            lines += axes.plot(
-                curves.offsets[axis], curves.scaled()[axis], color=OUR_COLOR, linewidth=2.4, linestyle=dash, label=text
-            )
-        handles = handles or lines
-    legend(figure, handles, columns=3)
+def boxes(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
+    """Errors per axis as figures 4.14 and 4.15 have them; what lies outside the drawn range is counted. Each method needs a trial
+    with a finite end."""
+    figure = empty_figure(13, 7.2)
+    own = {method: axis_errors(found) for method, found in trials.items()}
+    for axis, label in enumerate(AXES):
+        axes = figure.add_subplot(2, 3, axis + 1)
+        columns = [E[:, axis] for E in own.values()]
+        half = _half_range(columns, LIMITS[axis // 3])
+        drawn = axes.boxplot(columns, patch_artist=True, widths=0.6, flierprops={"marker": ".", "markersize": 4, "alpha": 0.5})
+        for part, median, method in zip(drawn["boxes"], drawn["medians"], own, strict=True):
+            part.set(facecolor=styles[method].color, alpha=0.75, linewidth=1.6 if method == OURS else 0.9)
+            median.set(color="black", linewidth=1.6)
+        for k, values in enumerate(columns, start=1):
+            outside = int((np.abs(values) > half).sum())
+            if outside:
+                axes.text(k, 0.96 * half, f"{outside} out", ha="center", va="top", fontsize=8, color="0.25", bbox=PAPER)
+        axes.axhspan(-LIMITS[axis // 3], LIMITS[axis // 3], color="0.93", zorder=0)
+        axes.axhline(0, color="0.6", linewidth=1, zorder=0.5)
+        axes.set(title=f"${label}$", ylim=(-half, half), ylabel="error, deg" if axis < 3 else "error, cm")
+        axes.set_xticks(range(1, len(own) + 1), [plain(method) for method in own], rotation=30, ha="right")
     caption = (
-        f"{one.method} on {one.scene}. Thin: single frames; thick: their averages. Every curve is scaled to 0..1. "
-        f"Weights: {one.classes}."
+        "Signed error at the end of all trials. Box: quartiles, line: median, whiskers: up to 1.5 box lengths, dots: trials "
+        "beyond. "
+        '"out": so many trials lie outside the drawn range. Grey band: the limit of success.'
     )
-    return finished(figure, name, f"Weighted and unweighted averages, {one.scene}", caption)
+    return finished(figure, "single_boxes", "Errors of single frames per axis", caption)
 
 
-def heat_maps(name: str, label: str, maps: Mapping[str, Sequence[HeatMap]]) -> Plot:
-    """Method -> its maps: a row of planes, rotations first."""
-    figure = empty_figure(7.6, 0.3 + 3.05 * len(maps))
-    figure.set_layout_engine("compressed")  # panels keep their shape and move together
-    grid = figure.subplots(len(maps), 2, squeeze=False)
-    shown: Any = None
-    for row, (method, own) in zip(grid, maps.items(), strict=True):
-        for column, axes in enumerate(row):
-            found = next((m for m in own if (max(m.axes) >= 3) == bool(column)), None)
-            if found is None:
-                axes.set_axis_off()
-                continue
-            shown = _heat_map(axes, found)
-            unit = "cm" if column else "deg"
-            axes.set(xlabel=f"${AXES[found.axes[0]]}$, {unit}", ylabel=f"${AXES[found.axes[1]]}$, {unit}", aspect="equal")
-            axes.set_title(plain(method), fontsize=11)
-    if shown is not None:
-        bar = figure.colorbar(shown, ax=grid, location="right", aspect=40, shrink=min(2 / len(maps), 1), ticks=[0, 0.5, 1])
-        bar.set_label("score, each map scaled to 0..1")
-    caption = f"{label}. White cross: the reference; black dot: the highest score."
-    return finished(figure, name, f"Heat maps, {label}", caption, wide=False)
+def _half_range(columns: Sequence[Matrix], limit: float) -> float:
+    """Half the drawn range: where the whiskers of half of the methods end, so that one that is far off does not flatten all the
+    others; at least twice the limit of success."""
+    ends = []
+    for values in columns:
+        low, high = np.quantile(values, [0.25, 0.75])
+        inside = values[(values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))]
+        ends.append(float(np.abs(inside).max()))
+    return max(1.15 * float(np.median(ends)), 2 * limit)
 
 
-def _heat_map(axes: Any, found: HeatMap) -> Any:
-    values = np.asarray(found.values, float)
-    finite = np.isfinite(values)
-    low, high = (values[finite].min(), values[finite].max()) if finite.any() else (0.0, 1.0)
-    scaled = (values - low) / max(high - low, 1e-12)
-    mesh = axes.pcolormesh(found.x, found.y, scaled, shading="nearest", cmap="viridis", vmin=0, vmax=1, rasterized=True)
-    for width, color in ((5, "black"), (2, "white")):
-        axes.plot(0, 0, "+", color=color, markersize=14 if width == 2 else 16, markeredgewidth=width)
-    if finite.any():
-        y, x = np.unravel_index(np.nanargmax(values), values.shape)
-        axes.plot(found.x[x], found.y[y], "o", color="black", markeredgecolor="white", markersize=7, clip_on=False)
-    return mesh
-
-
-def histograms(name: str, one: Similarity) -> Plot:
-    """Figure 3.22: brightness of a few frames, per channel."""
-    shown = list(one.histograms.items())
-    rows, columns = math.ceil(len(shown) / COLUMNS), min(len(shown), COLUMNS)
-    figure = empty_figure(13 if columns > 1 else 6.5, 0.8 + 2.7 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
-    # A few saturated levels may stand out of the picture; else they would flatten all others.
-    top = 130 * max(float(np.sort(share, axis=1)[:, -3].max()) for _, share in shown)
-    for axes, (frame, shares) in zip(grid, shown, strict=False):
-        x = np.linspace(0, 255, shares.shape[1])
-        channels = BGR if len(shares) == 3 else {"grey": "0.3"}
-        for share, (label, color) in zip(shares, channels.items(), strict=True):
-            axes.fill_between(x, 100 * share, color=color, alpha=0.12, linewidth=0)
-            axes.plot(x, 100 * share, color=color, linewidth=1.5, label=label)
-        axes.set(title=plain(frame), xlim=(0, 255), ylim=(0, max(top, 1.0)), xticks=[0, 64, 128, 192, 255])
-        axes.grid(color="0.92")
-    for axes in grid[len(shown) :]:
-        axes.set_axis_off()
-    for axes in grid[::columns]:
-        axes.set_ylabel("pixels, %")
-    legend(figure, grid[0].get_lines())
-    figure.supxlabel("brightness", fontsize=10)
-    return finished(figure, name, f"Histograms, {one.scene}", "Share of pixels per four levels of brightness, by channel.")
-
-
-def matrix(name: str, one: Similarity) -> Plot:
-    """Figure 3.23: similarity of every frame with every other."""
-    n = len(one.names)
-    figure = empty_figure(6.8, 6)
+def starts(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
+    """Success against the size of the start error."""
+    figure = empty_figure(13, 5.2)
     axes = figure.add_subplot()
-    # Similarities of one drive fill the upper part only: the scale begins below the lowest.
-    low = math.floor(10 * float(np.min(one.matrix))) / 10
-    shown = axes.imshow(one.matrix, cmap="viridis", vmin=low, vmax=1)
-    if n <= MOST_NUMBERS:
-        for (y, x), value in np.ndenumerate(one.matrix):
-            dark = value < low + 0.6 * (1 - low)
-            axes.text(
-                x, y, f"{value:.2f}", ha="center", va="center", fontsize=8 if n > 10 else 9, color="white" if dark else "black"
-            )
-        names = [name if len(name) <= 12 else f"…{name[-11:]}" for name in one.names]
-        axes.set_xticks(range(n), map(plain, names), rotation=60, ha="right", fontsize=8)
-        axes.set_yticks(range(n), map(plain, names), fontsize=8)
-    else:
-        axes.set(xlabel="position of the frame", ylabel="position of the frame")
-    figure.colorbar(shown, ax=axes, shrink=0.85, label="similarity ρ, 1 = the same")
-    caption = f"ρ of eq. 3.15, mean of the channels. The scale begins at {low:.1f}."
-    return finished(figure, name, f"Histogram similarity, {one.scene}", caption, wide=False)
+    sizes = start_sizes(t for own in trials.values() for t in own)
+    places = np.arange(len(sizes), dtype=float)
+    for place, (method, own) in zip(_dodged(places, len(trials)), trials.items(), strict=True):
+        found = [[t.success for t in own if (t.start_deg, t.start_m) == size] for size in sizes]
+        kept = [k for k, good in enumerate(found) if good]
+        share = np.array([np.mean(found[k]) for k in kept])
+        ends = np.array([wilson(sum(found[k]), len(found[k])) for k in kept]).reshape(-1, 2)
+        _with_bars(axes, place[kept], 100 * share, 100 * ends.T, styles[method])
+    axes.set_xticks(places, [f"±{deg:g} deg\n±{100 * m:g} cm" for deg, m in sizes])
+    axes.set(xlabel="start error per axis", ylabel="success, %", ylim=(-3, 103), yticks=range(0, 101, 20))
+    axes.grid(axis="y", color="0.9")
+    method_legend(figure, {method: styles[method] for method in trials})
+    caption = "Bars: 95 % intervals (Wilson). Methods stand side by side only so that their bars can be seen."
+    return finished(figure, "starts", "Success by size of the start error", caption)
 
 
-def keyframes(name: str, one: Similarity) -> Plot:
-    """Similarity to the last keyframe over the drive, for each rule by which keyframes are selected."""
-    rules = {f"algorithm 6, threshold {th:g}": (th, chosen) for th, chosen in one.keyframes.items()}
-    rules["the node"] = (one.online_threshold, one.online)
-    figure = empty_figure(7.6, 0.6 + 1.9 * len(rules))
-    grid = figure.subplots(len(rules), 1, squeeze=False, sharex=True, sharey=True).ravel()
-    for axes, (rule, (threshold, chosen)) in zip(grid, rules.items(), strict=True):
-        rho = to_last_keyframe(one.matrix, chosen)
-        at = np.array(chosen, int)
-        axes.plot(one.stamps, rho, color=OUR_COLOR, linewidth=1.4, marker=".", markersize=4)
-        axes.axhline(threshold, color="0.4", linewidth=1, linestyle="--")
-        axes.plot(one.stamps[at], rho[at], "D", color=BAD, markersize=6, clip_on=False, zorder=4)
-        axes.set_title(plain(f"{rule}: {len(chosen)} of {len(one.names)} frames"), fontsize=10)
-        axes.set_ylabel("ρ")
-        axes.grid(color="0.92")
-    grid[-1].set_xlabel("time, s")
-    caption = "Similarity of each frame to the keyframe before it. Diamonds: keyframes; dashed: the threshold."
-    return finished(figure, name, f"Keyframes over the drive, {one.scene}", caption, wide=False)
+def frames(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
+    """Errors against the number of frames."""
+    figure = empty_figure(13, 5.2)
+    numbers = sorted({len(t.frames) for own in trials.values() for t in own})
+    places = np.arange(len(numbers), dtype=float)
+    for k, (label, limit) in enumerate(zip(("rotation error, deg", "translation error, cm"), LIMITS, strict=True)):
+        axes = figure.add_subplot(1, 2, k + 1)
+        drawn = []
+        for place, (method, own) in zip(_dodged(places, len(trials)), trials.items(), strict=True):
+            groups = [errors([t for t in own if len(t.frames) == n])[k] for n in numbers]
+            found = np.array([[quantile(g, share) for share in (0.25, 0.5, 0.75)] for g in groups])
+            kept = np.isfinite(found[:, 1])
+            drawn.append(found)
+            # A quartile of infinity, more than a quarter without an end, is drawn beyond the axis.
+            _with_bars(axes, place[kept], found[kept, 1], np.nan_to_num(found[kept][:, [0, 2]].T, posinf=1e6), styles[method])
+        axes.axhline(limit, color="0.5", linewidth=1, linestyle=(0, (2, 3)), zorder=1)
+        axes.set_yscale("log")
+        decimal(axes.yaxis)
+        axes.set_ylim(*_seen(drawn, limit))
+        axes.set_xticks(places, [str(n) for n in numbers])
+        axes.set(xlabel="frames", ylabel=f"{label} (logarithmic)")
+        axes.grid(axis="y", color="0.9")
+    method_legend(figure, {method: styles[method] for method in trials})
+    caption = "Median over all trials, bars from quartile to quartile; dotted: the limit of success."
+    return finished(figure, "frames", "Errors by number of frames", caption)
 
 
-def to_last_keyframe(matrix: Matrix, chosen: Sequence[int]) -> Matrix:
-    """(n,) similarity of each frame to the last keyframe before it, 1 for the first; matrix: (n, n)."""
-    n = len(matrix)
-    before = np.searchsorted(np.asarray(chosen, int), np.arange(n), side="left") - 1
-    last = np.array([0, *chosen], int)[before + 1]
-    return np.asarray(matrix[last, np.arange(n)])
+def _with_bars(axes: Any, x: Matrix, y: Matrix, ends: Matrix, style: LineStyle) -> None:
+    """Line through (x, y), bars between ends (2, n)."""
+    off = np.maximum(np.stack([y - ends[0], ends[1] - y]), 0)
+    axes.errorbar(x, y, off, marker=style.marker, markersize=6, elinewidth=1, capsize=2.5, **style.line)
 
 
-def cost(name: str, panels: dict[str, dict[str, float]], styles: dict[str, LineStyle]) -> Plot:
-    """Panel -> method -> figure, as horizontal bars on a logarithmic axis."""
-    most = max(len(values) for values in panels.values())
-    figure = empty_figure(13, 1.3 + 0.36 * most)
-    grid = figure.subplots(1, len(panels), squeeze=False).ravel()
-    for axes, (title, values) in zip(grid, panels.items(), strict=True):
-        shown = {method: value for method, value in values.items() if math.isfinite(value) and value > 0}
-        for k, (method, value) in enumerate(shown.items()):
-            axes.barh(k, value, color=styles[method].color, height=0.65)
-            axes.text(value, k, f" {value:.3g}", va="center", ha="left", fontsize=9)
-        axes.set_yticks(range(len(shown)), [plain(method) for method in shown])
-        axes.set_xscale("log")
-        if shown:
-            # Room for the shortest bar and, at the right, for the figure beside the longest.
-            low, high = min(shown.values()), max(shown.values())
-            axes.set_xlim(low / 4, high * max(4.0, (high / low) ** 0.35))
-        axes.invert_yaxis()
-        axes.set_title(title, fontsize=10)
-        axes.spines[["top", "right"]].set_visible(False)
-    caption = "Logarithmic axes: compare the figures, not the lengths."
-    return finished(figure, name, "Cost of the methods", caption)
+def _dodged(places: Matrix, n: int) -> list[Matrix]:
+    """Places of n methods side by side."""
+    return [places + DODGE * ((k + 0.5) / n - 0.5) for k in range(n)]
+
+
+def _seen(drawn: Sequence[Matrix], limit: float) -> tuple[float, float]:
+    """Range of a logarithmic axis that shows all that is drawn, and the limit of success."""
+    kept = np.concatenate([limit * np.ones(1), *(values.ravel() for values in drawn)])
+    kept = kept[np.isfinite(kept) & (kept > 0)]
+    return float(max(kept.min() / 1.3, 1e-4)), float(1.3 * kept.max())
+
+
+def decimal(axis: Any) -> None:
+    """Ticks at 1, 2 and 5, written out."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=30))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

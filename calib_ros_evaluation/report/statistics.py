@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.methods.levinson import Distribution, fitted, probability_right
+from calib_ros_evaluation.methods.levinson import fitted, probability_right
 from calib_ros_evaluation.results import Results, Trial, Trust
 
 Matrix = NDArray[np.float64]
@@ -115,14 +115,11 @@ def called_right(trusts: Sequence[Trust], size: tuple[float, float] | None) -> f
         return float("nan")
     said: list[bool] = []
     for k, own in enumerate(trusts):
-        R, W = _learned([t for n, t in enumerate(trusts) if n != k])
+        others = [t for n, t in enumerate(trusts) if n != k]
+        R, W = fitted([t.right for t in others]), fitted([share for t in others for _, _, share in t.wrong])
         shares = [own.right] if size is None else [share for deg, m, share in own.wrong if (deg, m) == size]
         said += [probability_right([share], R, W) > 0.5 for share in shares]
     return float(np.mean(said))
-
-
-def _learned(trusts: Sequence[Trust]) -> tuple[Distribution, Distribution]:
-    return fitted([t.right for t in trusts]), fitted([share for t in trusts for _, _, share in t.wrong])
 
 
 def in_order(results: Results, found: Iterable[str]) -> list[str]:
@@ -133,7 +130,7 @@ def in_order(results: Results, found: Iterable[str]) -> list[str]:
 
 def all_methods(results: Results) -> list[str]:
     """Every method that has a title or a result."""
-    parts = (results.trials, results.curves, results.heat_maps, results.costs, results.averagings)
+    parts = (results.trials, results.curves, results.costs)
     return in_order(results, [*results.titles, *(item.method for part in parts for item in part)])
 
 

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks import events_study as er
 from benchmarks.events import (
     Covered,
     Drift,
     EmptyRoad,
-    Event,
     EventSource,
     LateCamera,
     LostClouds,
@@ -21,7 +21,7 @@ from benchmarks.events import (
     drive_times,
     mount,
 )
-from benchmarks.events_recorded import ThereAndBack, turned_image
+from benchmarks.events_recorded import ThereAndBack
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
@@ -83,7 +83,6 @@ def test_displaced_camera_sees_like_one_mounted_there() -> None:
         np.testing.assert_array_equal(frame.image, expected.image)
         np.testing.assert_array_equal(frame.cloud.xyz, expected.cloud.xyz)
         np.testing.assert_allclose(frame.reference, expected.reference, atol=1e-12)
-        np.testing.assert_array_equal(source.truth(i), frame.reference)
     np.testing.assert_array_equal(source.reference, base.reference)
     assert se3.rotation_error_deg(base.reference, source[4].reference) == pytest.approx(2.0)
 
@@ -103,27 +102,22 @@ def test_a_late_camera_sees_the_street_of_before() -> None:
 
 def test_a_covered_lens_shows_nothing() -> None:
     base = Plain(SyntheticDrive(3, frames=6, **SMALL))
-    looks = {look: EventSource(base, [Covered(0.2, 0.5, look)]) for look in ("dark", "white", "frozen")}
-    for source in looks.values():
-        for i in (0, 1, 5):
-            same(source[i], base[i])
-        for i in (2, 3, 4):
-            np.testing.assert_array_equal(source[i].cloud.xyz, base[i].cloud.xyz)
-            assert source[i].stamp == base[i].stamp
-    dark, white = (looks[look][3].image.astype(float) for look in ("dark", "white"))
-    assert dark.mean() < 10
-    assert white.mean() > 245
-    assert 1 < dark.std() < 3
-    assert not np.array_equal(dark, looks["dark"][4].image)
+    source = EventSource(base, [Covered(0.2, 0.5)])
+    for i in (0, 1, 5):
+        same(source[i], base[i])
     for i in (2, 3, 4):
-        np.testing.assert_array_equal(looks["frozen"][i].image, base[1].image)
-    rendered = EventSource(base.drive, [Covered(0.2, 0.5, "dark")])[3]
-    np.testing.assert_array_equal(rendered.image, looks["dark"][3].image)
+        np.testing.assert_array_equal(source[i].cloud.xyz, base[i].cloud.xyz)
+        assert source[i].stamp == base[i].stamp
+    dark = source[3].image.astype(float)
+    assert dark.mean() < 10
+    assert 1 < dark.std() < 3
+    assert not np.array_equal(dark, source[4].image)
+    np.testing.assert_array_equal(EventSource(base.drive, [Covered(0.2, 0.5)])[3].image, source[3].image)
 
 
 def test_lost_clouds_are_missing_frames() -> None:
     drive = SyntheticDrive(3, frames=120, **SMALL)
-    source = EventSource(drive, [LostClouds(2.0, 12.0)], seed=4)
+    source = EventSource(drive, [LostClouds(2.0, 12.0)])
     lost = np.setdiff1d(np.arange(120), source.positions)
     assert len(lost) == 20
     assert len(source) == len(source.times) == 100
@@ -131,14 +125,10 @@ def test_lost_clouds_are_missing_frames() -> None:
     np.testing.assert_allclose(np.diff(source.times).max(), 0.1 * np.diff(source.positions).max())
     i = int(np.searchsorted(source.positions, 50))
     assert source[i].stamp == drive[int(source.positions[i])].stamp
-    again, other = (EventSource(drive, [LostClouds(2.0, 12.0)], seed=seed) for seed in (4, 5))
-    np.testing.assert_array_equal(again.positions, source.positions)
-    assert not np.array_equal(other.positions, source.positions)
+    np.testing.assert_array_equal(EventSource(drive, [LostClouds(2.0, 12.0)]).positions, source.positions)
     assert source[-1].stamp == drive[119].stamp
     with pytest.raises(IndexError):
         source[100]
-    with pytest.raises(BadInputError, match="leave no frame"):
-        EventSource(drive, [LostClouds(0, 12, share=1.0)])
 
 
 def test_an_empty_road_has_nothing_in_sight_and_the_rest_of_the_street_stays() -> None:
@@ -156,21 +146,12 @@ def test_an_empty_road_has_nothing_in_sight_and_the_rest_of_the_street_stays() -
     np.testing.assert_array_equal(emptied.reference, base.reference)
     with pytest.raises(BadInputError, match=r"empty=\(5, 5\)"):
         SyntheticDrive(3, empty=(5, 5))
-    with pytest.raises(BadInputError, match="only a synthetic drive"):
-        EventSource(Plain(base), [EmptyRoad(60, 90)])
 
 
-LENSES = {
-    "pinhole": Camera(np.array([[360.0, 0, 304], [0, 360, 87], [0, 0, 1]]), 620, 188),
-    "plumb_bob": Camera(
-        np.array([[360.0, 0, 304], [0, 360, 87], [0, 0, 1]]), 620, 188, "plumb_bob", np.array([-0.2, 0.05, 1e-3, 0, 0])
-    ),
-}
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_points_hit_the_same_grey_values_in_a_turned_image(name: str) -> None:
-    drive = SyntheticDrive(2, 6, 32, speed=0, noise=0, camera=LENSES[name])
+def test_points_hit_the_same_grey_values_in_a_turned_image() -> None:
+    K = np.array([[360.0, 0, 304], [0, 360, 87], [0, 0, 1]])
+    camera = Camera(K, 620, 188, "plumb_bob", np.array([-0.2, 0.05, 1e-3, 0, 0]))
+    drive = SyntheticDrive(2, 6, 32, speed=0, noise=0, camera=camera)
     displacement = MountDisplacement(0.5, deg=2.0, m=0.05)
     source = EventSource(Plain(drive), [displacement])
     before, after = drive[5], source[5]
@@ -191,17 +172,6 @@ def test_points_hit_the_same_grey_values_in_a_turned_image(name: str) -> None:
     wrong = after.camera.project(se3.transform(before.reference, after.cloud.xyz))[0][seen].astype(np.float32)
     missed = cv2.remap(after.image.mean(axis=2).astype(np.float32), *wrong.T[:, :, None], cv2.INTER_LINEAR)
     assert np.percentile(np.abs(grey[0] - missed), 90) > 20
-
-
-def test_a_turned_image_is_that_of_a_turned_camera() -> None:
-    drive = SyntheticDrive(2, 20, 16, speed=0, noise=0, width=620, height=188)
-    D = se3.exp([*np.deg2rad([0.5, -1.0, 0.7]), 0, 0, 0])
-    rendered = drive.moved(5, D @ drive.reference).image.astype(float)
-    turned = turned_image(drive[5].image, drive.camera, D[:3, :3])
-    inner = np.s_[30:-30, 30:-30]
-    difference = np.abs(turned.astype(float) - rendered)[inner]
-    assert np.median(difference) <= 1
-    assert difference.mean() < 0.25 * np.abs(drive[5].image.astype(float) - rendered)[inner].mean()
 
 
 def test_a_shifted_lidar_moves_as_the_car_carries_it() -> None:
@@ -254,16 +224,7 @@ def test_there_and_back_goes_on_in_time() -> None:
         ThereAndBack(Plain(drive, [5, 5, 6, 7]), 1.0)
 
 
-@pytest.mark.parametrize("kind", [Covered, LateCamera, LostClouds, EmptyRoad])
-def test_events_of_one_kind_must_not_overlap(kind: type[Event]) -> None:
-    drive = SyntheticDrive(3, frames=2, **SMALL)
-    with pytest.raises(BadInputError, match="overlap"):
-        EventSource(drive, [kind(1.0, 3.0), kind(2.0, 4.0)])
-
-
 def test_alarms_recoveries_and_false_claims_are_counted() -> None:
-    from benchmarks import events_replay as er
-
     def moment(t: float) -> er.Moment:
         status, deg, news = "converged", 0.1, t % 1 == 0
         if 10 <= t < 17:
@@ -271,7 +232,7 @@ def test_alarms_recoveries_and_false_claims_are_counted() -> None:
         if 18 <= t < 19:
             deg = 0.4  # not wrong, but not right yet
         six = np.zeros(6)
-        return er.Moment(t, f"{t}", six, six, six, status, "", 1.0, 0.0, deg, 2.0, True, news, news, "", "")
+        return er.Moment(t, six, six, six, status, deg, 2.0, news, news)
 
     moments, displacement = [moment(k / 2) for k in range(60)], MountDisplacement(10.0)
     assert er.alarm(moments, displacement, 30.0) == "1.5 s, moved"

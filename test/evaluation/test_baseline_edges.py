@@ -20,12 +20,10 @@ from calib_ros_evaluation.methods.castorena import (
     slopes,
 )
 from calib_ros_evaluation.methods.levinson import (
-    Distribution,
     Levinson,
     LevinsonFeatures,
     edge_image,
     edginess,
-    fitted,
     grid_search,
     probability_right,
     spread,
@@ -51,10 +49,6 @@ class Bowl:
 def pinhole(width: int, height: int, focal: float = 1.0) -> Camera:
     """Principal point at pixel (0, 0): a point (x, y, z) lies on pixel (focal x / z, focal y / z)."""
     return Camera(np.diag([focal, focal, 1.0]), width, height)
-
-
-def off(scene, by) -> np.ndarray:
-    return se3.exp(np.concatenate([np.deg2rad(by[:3]), by[3:]])) @ scene.truth
 
 
 # --- Levinson and Thrun: eq. 4.2 ---
@@ -121,7 +115,6 @@ def test_grid_search_finds_the_top_of_a_bowl_and_stays_in_its_box():
     found = grid_search(score, watched, T, width, finest)
     assert np.all(np.abs(se3.log(found @ se3.inverse(top))) <= finest)
     assert watched.evaluations > 729
-    assert watched.trace[0].T is T
     beyond = Bowl(se3.exp(width * [3, 0, 0, 0, 0, 0]))
     found = grid_search(beyond, Watched(beyond), T, width, finest)
     assert np.allclose(se3.log(found) / width, [1, 0, 0, 0, 0, 0], atol=0.03)
@@ -131,35 +124,20 @@ def test_grid_search_finds_the_top_of_a_bowl_and_stays_in_its_box():
 
 def test_share_of_worse_neighbours():
     top = Bowl(np.eye(4))
-    assert worse_share(top, np.eye(4), 0.2, 0.04) == 1
+    assert worse_share(top, np.eye(4)) == 1
     # Far off along one axis: of 728 neighbours the 243 towards the top are better, the 243 away from it worse, and the 242 in
     # between, off to the side, a little worse.
-    assert worse_share(top, se3.exp([0.3, 0, 0, 0, 0, 0]), 0.2, 0.04) == pytest.approx(485 / 728, abs=0.01)
+    assert worse_share(top, se3.exp([0.3, 0, 0, 0, 0, 0])) == pytest.approx(485 / 728, abs=0.01)
 
 
 def test_probability_that_a_calibration_is_right():
-    right, wrong = Distribution(0.9, 0.1), Distribution(0.5, 0.2)
+    right, wrong = (0.9, 0.1), (0.5, 0.2)
     # At 0.7 both are off by 2 and 1 deviations: exp(-2) / 0.1 = 1.3534 and exp(-0.5) / 0.2 = 3.0327; 1.3534 / 4.3860 = 0.3086.
     assert probability_right([0.7], right, wrong) == pytest.approx(0.3086, abs=1e-4)
     # Two frames: the densities multiply; 1.3534^2 / (1.3534^2 + 3.0327^2) = 1.8316 / 11.0286 = 0.1661.
     assert probability_right([0.7, 0.7], right, wrong) == pytest.approx(0.1661, abs=1e-4)
     assert probability_right([0.95, 0.9, 1.0], right, wrong) > 0.99
     assert probability_right([], right, wrong) == 0.5
-
-
-@pytest.mark.slow
-def test_right_and_wrong_calibrations_are_told_apart(scene):
-    method = Levinson()
-    scores = [method.score([method.features(f)], scene.truth) for f in scene.frames]
-    truths = [scene.truth] * len(scores)
-    errors = [se3.exp(e) for e in ([0.009, 0, 0, 0, 0, 0], [0, -0.009, 0, 0, 0, 0], [0, 0, 0, 0.1, 0, 0])]
-    right = fitted([worse_share(s, T) for s, T in zip(scores, truths, strict=True)])
-    wrong = fitted([worse_share(s, E @ T) for s, T in zip(scores, truths, strict=True) for E in errors])
-    assert right.mean > 0.85
-    assert wrong.mean < right.mean - 2 * right.deviation
-    other = off(scene, [0.3, -0.3, 0.3, 0.05, 0.05, -0.05])
-    assert probability_right([worse_share(s, scene.truth) for s in scores], right, wrong) > 0.9
-    assert probability_right([worse_share(s, other) for s in scores], right, wrong) < 0.1
 
 
 # --- Castorena et al.: eq. 4.4 and 4.5 ---
@@ -226,6 +204,3 @@ def test_fista_finds_the_optimum_within_its_box():
     assert np.allclose(se3.log(found) / width, [1, 0, 0, 0, 0, 0], atol=0.02)
     fixed = width * [1, 1, 1, 0, 0, 0]
     assert np.allclose(se3.log(fista(score, T, fixed, 0.01, 600)[0])[3:], 0, atol=1e-12)
-
-
-# --- Both on a synthetic street ---

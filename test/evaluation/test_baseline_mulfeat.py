@@ -47,12 +47,8 @@ def test_the_score_by_hand(three):
     # With E^C >= 0.2 an edge, both match: 2/2 * 0.51. With P >= 0.05, three are edges, and two match: 2/3 * 0.51.
     assert MulfeatScore([three], 1 / 6, 0.2).value(IDENTITY) == pytest.approx(0.51, rel=1e-6)
     assert MulfeatScore([three], 0.05, 0.3).value(IDENTITY) == pytest.approx(0.34, rel=1e-6)
-
-
-def test_one_pixel_to_the_right_by_hand(three):
-    """0.2 m to the right at 10 m is one pixel: (4, 2), (11, 5), (21, 8) hold E^C = 0, 0.4, 0. J = 1/2 (0.25 * 0.4) = 0.05."""
-    T = se3.from_parts(np.eye(3), [0.2, 0, 0])
-    assert MulfeatScore([three], 1 / 6, 0.3).value(T) == pytest.approx(0.05, rel=1e-6)
+    # 0.2 m to the right at 10 m is one pixel: (4, 2), (11, 5), (21, 8) hold E^C = 0, 0.4, 0. J = 1/2 (0.25 * 0.4) = 0.05.
+    assert score.value(se3.from_parts(np.eye(3), [0.2, 0, 0])) == pytest.approx(0.05, rel=1e-6)
 
 
 # ---- the cylinder -------------------------------------------------------------------------------------------------------

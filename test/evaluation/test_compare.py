@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.compare import MEASURES, ClusterBootstrap, Comparison, PairedChange, as_text, compare, interval
+from calib_ros_evaluation.compare import ClusterBootstrap, Comparison, PairedChange, as_text, compare, interval
 from calib_ros_evaluation.csv_files import read_trials, write_trials
 from calib_ros_evaluation.results import COLUMNS, Trial
 
@@ -150,29 +150,13 @@ def test_the_interval_knows_that_trials_on_the_same_frames_belong_together() -> 
     assert only(compare([replace(t, scene=str(t.seed)) for t in a], [replace(t, scene=str(t.seed)) for t in b])).pairs == 300
 
 
-def test_medians_of_samples_are_those_of_numpy() -> None:
-    rng = np.random.default_rng(1)
-    cluster = rng.permutation(np.repeat(np.arange(7), [1, 4, 2, 2, 3, 1, 4]))
-    numbers = rng.normal(size=17)
-    bootstrap = ClusterBootstrap(cluster, 3, 50)
-    assert (bootstrap.drawn.sum(axis=1) == 7).all()
-    drawn = [np.repeat(numbers, row[cluster]) for row in bootstrap.drawn]
-    np.testing.assert_allclose(bootstrap.medians(numbers), [np.median(one) for one in drawn])
-    np.testing.assert_allclose(bootstrap.means(numbers), [np.mean(one) for one in drawn])
-
-
 def test_identical_tables_show_no_difference() -> None:
     a = table(np.random.default_rng(2).uniform(0, 2, 40))
     found = only(compare(a, list(a)))
     assert (found.only_a, found.only_b, found.gained, found.lost) == (0, 0, 0, 0)
-    for one in [found.estimates[name] for name in MEASURES if name != "cpu"]:
-        assert (one.change, one.low, one.high, one.verdict) == (0, 0, 0, "no difference shown")
-    assert (
-        found.estimates["cpu"].change,
-        found.estimates["cpu"].low,
-        found.estimates["cpu"].high,
-        found.estimates["cpu"].verdict,
-    ) == (1, 1, 1, "no difference shown")
+    for name, one in found.estimates.items():
+        none = 1 if name == "cpu" else 0
+        assert (one.change, one.low, one.high, one.verdict) == (none, none, none, "no difference shown")
     assert not any(word in as_text([found], "a", "b").split("\n\n")[1] for word in ("better", "worse", "*"))
 
 
@@ -189,24 +173,6 @@ def test_the_order_of_rows_does_not_matter() -> None:
     assert found[0].estimates["rotation_mean"].verdict == "better"
     assert found[1].estimates["rotation_mean"].verdict == "worse"
     assert found != compare(a, b, seed=1)
-
-
-def test_more_successes_are_better() -> None:
-    a, b = table([0.7] * 10 + [0.2] * 10), table([0.2] * 19 + [0.7])
-    found = only(compare(a, b))
-    assert (found.gained, found.lost) == (10, 1)
-    assert values(found.estimates["success"]) == pytest.approx((0.5, 0.95, 0.45))
-    assert found.estimates["success"].verdict == "better"
-    assert found.estimates["rotation_mean"].verdict == "better"
-
-
-def test_the_median_sees_what_a_few_wild_trials_hide_from_the_mean() -> None:
-    rng = np.random.default_rng(4)
-    base = rng.uniform(0.5, 0.6, 60)
-    wild = np.where(np.arange(60) < 3, rng.uniform(20, 60, 60), base - 0.2)
-    found = only(compare(table(base), table(wild)))
-    assert found.estimates["rotation_median"].verdict == "better"
-    assert found.estimates["rotation_mean"].verdict != "better"
 
 
 def test_values_that_are_no_numbers_are_left_out_pair_by_pair() -> None:

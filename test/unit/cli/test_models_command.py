@@ -140,7 +140,7 @@ def test_failing_model_is_reported_and_the_others_are_tried(capsys, files, tmp_p
     assert code == 2
     assert "set semantics.segment_anything_decoder" in err
     lines = Mock(side_effect=ValueError("two lines\nof somebody's library"))
-    monkeypatch.setattr("calib_ros_semantics.models.image_classes.ImageNetwork.segment", lines)
+    monkeypatch.setattr("calib_ros_semantics.models.image_classes.ImageNetwork.__call__", lines)
     code, out, err = run(capsys, SMALL, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
     assert (code, err) == (2, "calib-ros: semantics.image_classes: unexpected ValueError: two lines of somebody's library\n")
     assert any(line.startswith("points: ") for line in parts(out)["cloud_classes"])
