@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import numpy_sampler
 import pytest
 from numpy_sampler import NumpySampler
 
@@ -128,10 +127,3 @@ def test_without_a_kernel_of_these_sources_it_is_said_how_to_build_one(monkeypat
     (tmp_path / f"kernel{sampling.EXTENSION_SUFFIXES[0]}").write_bytes(b"\x7fELF, but not for us")
     with pytest.raises(MissingDependencyError, match="was built from other sources or for another machine"):
         load_kernel()
-
-
-def test_more_points_than_a_picture_may_be_wide(monkeypatch):
-    compiled, reference = samplers(PINHOLE)
-    monkeypatch.setattr(numpy_sampler, "MAX_SIDE", 1000)
-    T = transforms(5)
-    assert reference.values(T, 1) == pytest.approx(compiled.values(T, 1), abs=1e-4)
