@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import cos, pi, sin
 
-from calib_ros_synthetic.solids import Kind
 from training.world import looks
 from training.world.stage import TREE, Cover, Stage
 
@@ -15,26 +15,21 @@ def _bark(stage: Stage) -> int:
     return stage.add(looks.Finish(colour, looks.scaled(colour, 0.5), looks.Pattern.BLOTCH, (0.15, 0.5), fine=0.3, grain=40))
 
 
-def _leaves(
-    stage: Stage, centre: tuple[float, float, float], half: tuple[float, float, float], finish: int, openness: float
-) -> None:
-    rng = stage.rng
-    stage.put(Kind.ELLIPSOID, Cover.LEAF, TREE, centre, half, finish, openness=openness, tint=rng.uniform(0.7, 1.3))
+def _leaves(stage: Stage, centre: Sequence[float], half: Sequence[float], finish: int, openness: float) -> None:
+    stage.ellipsoid(TREE, centre, half, finish, cover=Cover.LEAF, openness=openness, tint=stage.rng.uniform(0.7, 1.3))
 
 
-def broadleaf(stage: Stage, size: float = 1.0) -> None:
+def broadleaf(stage: Stage, size: float) -> None:
     """A tree of several clumps; how open they are differs from tree to tree, up to bare twigs."""
     rng = stage.rng
     r, trunk = rng.uniform(0.08, 0.32) * size, rng.uniform(1.4, 3.6) * (0.6 + 0.4 * size)
     spread, tall = rng.uniform(1.3, 3.4) * size, rng.uniform(0.8, 1.7)
-    bark, openness = (
-        _bark(stage),
-        float(rng.choice([rng.uniform(0.2, 0.7), rng.uniform(0.7, 1.2), rng.uniform(1.2, 1.6)], p=[0.45, 0.4, 0.15])),
-    )
+    bark = _bark(stage)
+    openness = float(rng.choice([rng.uniform(0.2, 0.7), rng.uniform(0.7, 1.2), rng.uniform(1.2, 1.6)], p=[0.45, 0.4, 0.15]))
     leaf = stage.add(looks.foliage(rng))
     lean = rng.normal(0, 0.06)
-    stage.put(Kind.CYLINDER, Cover.PLAIN, TREE, (0, 0, 0.6 * trunk + 0.3), (r, r, 0.6 * trunk + 0.3), bark)
-    stage.put(Kind.ELLIPSOID, Cover.PLAIN, TREE, (0, 0, trunk + 0.5 * spread), (r * 0.7, r * 0.7, 0.9 * spread * tall), bark)
+    stage.cylinder(TREE, (0, 0, 0.6 * trunk + 0.3), (r, r, 0.6 * trunk + 0.3), bark)
+    stage.ellipsoid(TREE, (0, 0, trunk + 0.5 * spread), (r * 0.7, r * 0.7, 0.9 * spread * tall), bark)
     count = int(rng.integers(7, 16))
     for k in range(count):
         a, reach = k * 4.4 * pi / count + rng.uniform(-0.5, 0.5), 0.0 if k == count - 1 else spread * rng.uniform(0.2, 0.95)
@@ -49,20 +44,13 @@ def bare(stage: Stage) -> None:
     rng = stage.rng
     r, trunk, tall = rng.uniform(0.1, 0.3), rng.uniform(1.5, 3), rng.uniform(3, 7)
     bark = _bark(stage)
-    stage.put(Kind.CYLINDER, Cover.PLAIN, TREE, (0, 0, trunk / 2), (r, r, trunk / 2), bark)
+    stage.cylinder(TREE, (0, 0, trunk / 2), (r, r, trunk / 2), bark)
     colour = looks.hsv(rng.uniform(0.03, 0.12), rng.uniform(0.1, 0.5), rng.uniform(0.03, 0.2))
     twig = stage.add(looks.Finish(colour, looks.scaled(colour, 0.5), looks.Pattern.BLOTCH, (0.3, 1), fine=0.4, grain=20))
     for _ in range(int(rng.integers(3, 7))):
         a, reach = rng.uniform(0, 2 * pi), rng.uniform(0.1, 1.3)
         z = trunk + tall * rng.uniform(0.25, 0.45)
-        stage.put(
-            Kind.ELLIPSOID,
-            Cover.PLAIN,
-            TREE,
-            (reach * cos(a), reach * sin(a), z),
-            (0.05, 0.05, tall * rng.uniform(0.25, 0.45)),
-            bark,
-        )
+        stage.ellipsoid(TREE, (reach * cos(a), reach * sin(a), z), (0.05, 0.05, tall * rng.uniform(0.25, 0.45)), bark)
     for _ in range(int(rng.integers(4, 8))):
         a, reach = rng.uniform(0, 2 * pi), rng.uniform(0.2, 1.8)
         centre = (reach * cos(a), reach * sin(a), trunk + tall * rng.uniform(0.2, 0.8))
@@ -75,7 +63,7 @@ def conifer(stage: Stage) -> None:
     rng = stage.rng
     height, width = rng.uniform(3, 15), rng.uniform(0.7, 2.4)
     leaf, layers = stage.add(looks.foliage(rng)), int(rng.integers(2, 6))
-    stage.put(Kind.CYLINDER, Cover.PLAIN, TREE, (0, 0, 0.6), (0.16, 0.16, 0.6), _bark(stage))
+    stage.cylinder(TREE, (0, 0, 0.6), (0.16, 0.16, 0.6), _bark(stage))
     openness = rng.uniform(0.2, 1.0)
     for k in range(layers):
         w = width * (1 - 0.85 * k / layers)
@@ -86,13 +74,11 @@ def palm(stage: Stage) -> None:
     """A bare stem with a tuft."""
     rng = stage.rng
     high, leaf = rng.uniform(3, 9), stage.add(looks.foliage(rng))
-    stage.put(Kind.CYLINDER, Cover.PLAIN, TREE, (0, 0, high / 2), (0.17, 0.17, high / 2), _bark(stage))
+    stage.cylinder(TREE, (0, 0, high / 2), (0.17, 0.17, high / 2), _bark(stage))
     for k in range(7):
         a = k * 2 * pi / 7
         stage.shift(0, 0, a)
-        stage.put(
-            Kind.ELLIPSOID, Cover.LEAF, TREE, (0.9, 0, high + rng.uniform(-0.5, 0.4)), (1.0, 0.25, 0.25), leaf, openness=0.4
-        )
+        stage.ellipsoid(TREE, (0.9, 0, high + rng.uniform(-0.5, 0.4)), (1.0, 0.25, 0.25), leaf, cover=Cover.LEAF, openness=0.4)
         stage.shift(0, 0, -a)
 
 
@@ -111,9 +97,7 @@ def hedge(stage: Stage, length: float) -> None:
     rng = stage.rng
     leaf, high, deep = stage.add(looks.foliage(rng)), rng.uniform(0.3, 1.3), rng.uniform(0.25, 0.7)
     openness = rng.uniform(0, 0.9)
-    stage.put(
-        Kind.BOX, Cover.LEAF, TREE, (0, 0, high), (length / 2, deep, high), leaf, openness=openness, tint=rng.uniform(0.7, 1.3)
-    )
+    stage.box(TREE, (0, 0, high), (length / 2, deep, high), leaf, cover=Cover.LEAF, openness=openness, tint=rng.uniform(0.7, 1.3))
     if rng.random() < 0.5:
         for k in range(int(length / 1.2)):
             size = rng.uniform(0.4, 0.8)
@@ -124,11 +108,7 @@ def hedge(stage: Stage, length: float) -> None:
 def any_tree(stage: Stage, winter: float) -> None:
     """winter: share of bare ones."""
     kind = stage.rng.random()
-    if kind < winter:
-        bare(stage)
-    elif kind < winter + 0.12:
-        conifer(stage)
-    elif kind < winter + 0.13:
-        palm(stage)
+    if kind < winter + 0.13:
+        (bare if kind < winter else conifer if kind < winter + 0.12 else palm)(stage)
     else:
         broadleaf(stage, float(stage.rng.choice([0.5, 1.0, 1.5], p=[0.2, 0.5, 0.3])))

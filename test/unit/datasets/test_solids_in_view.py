@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +11,9 @@ import pytest
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros_synthetic import rays, wide, windows
-from calib_ros_synthetic.rays import SKY, Jobs, Rays, cast
+from calib_ros_synthetic.rays import ORIGIN, Jobs, Rays, cast, unmet
 from calib_ros_synthetic.rigs import OPTICAL, RIGS
-from calib_ros_synthetic.scanners import scanner
+from calib_ros_synthetic.scanners import PLAIN, PlainScanner, scanner
 from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Solids
 from calib_ros_synthetic.wide import WideView
@@ -20,7 +21,6 @@ from calib_ros_synthetic.wide import WideView
 BARREL = np.array([-0.3, 0.09, 1e-3, -5e-4, -0.01])
 LENS = Camera(np.array([[45.0, 0, 39.6], [0, 45.2, 30.3], [0, 0, 1]]), 80, 60, "plumb_bob", BARREL)
 Cast = tuple[Rays, Jobs, np.ndarray | bool]  # and the rays that the sensor shows
-ZERO = tuple(np.zeros((1, 1), np.float32) for _ in range(3))
 
 
 def directions(R: np.ndarray, beams: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -48,19 +48,17 @@ def scanner_rays(solids: Solids) -> Iterator[Cast]:
         for name in ("vlp16", "mid360"):
             device = scanner(name, 200.0)
             beams, _ = device.beams()
-            yield Rays(ZERO, directions(pose[:3, :3], beams)), device.jobs(solids, beams, pose, 0.0, 0.0), True  # type: ignore[arg-type]
+            yield Rays(ORIGIN, directions(pose[:3, :3], beams)), device.jobs(solids, beams, pose, 0.0, 0.0), True  # type: ignore[arg-type]
 
 
 def grid_rays(solids: Solids) -> Iterator[Cast]:
     """Of the scanner of the plain drive: rows of one elevation, columns that start at different places."""
-    elevation, firings = np.deg2rad(np.linspace(12, -25, 14)), 240
-    e, a = elevation[:, None], ((np.arange(firings) + 0.5) * 2 * np.pi / firings - np.pi)[None]
-    beams = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e) + 0 * a])
-    R = se3.rotation_from_euler(0.4, 0.02, -0.015)
-    origin = tuple(np.random.default_rng(0).uniform(-0.2, 0.2, (1, firings)).astype(np.float32) for _ in range(3))
-    tilt = float(np.arccos(R[2, 2]))
-    jobs = windows.lidar_jobs(solids, elevation, firings, 0.4, (0.35, tilt, 1.5 * tilt))
-    yield Rays(origin, directions(R, beams)), jobs, True  # type: ignore[arg-type]
+    device = PlainScanner(replace(PLAIN[16], firings=240))
+    beams, _ = device.beams()
+    pose = se3.from_parts(se3.rotation_from_euler(0.4, 0.02, -0.015), np.zeros(3))
+    origin = tuple(np.random.default_rng(0).uniform(-0.2, 0.2, (1, 240)).astype(np.float32) for _ in range(3))
+    jobs = device.jobs(solids, beams, pose, 0.35, 0.0)
+    yield Rays(origin, directions(pose[:3, :3], beams)), jobs, True  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("sensor", [camera_rays, fisheye_rays, scanner_rays, grid_rays])
@@ -71,11 +69,9 @@ def test_no_solid_is_hit_outside_its_window(sensor, monkeypatch: pytest.MonkeyPa
     x, y, _ = street.path.place(30.0, street.lane)
     solids = street.around(30.0).moved(-np.array([x, y, 1.7]))
     for own, jobs, seen in sensor(solids):
-        (rows, columns), n = own.shape, len(solids)
-        whole = np.stack([np.arange(n), np.zeros(n), np.full(n, rows), np.zeros(n), np.full(n, columns)], 1).astype(np.int32)
         found = []
-        for tried in (jobs, Jobs(whole, np.zeros(n))):
-            t, ids = np.full(own.shape, np.inf, np.float32), np.full(own.shape, SKY, np.int32)
+        for tried in (jobs, Jobs.whole(len(solids), own.shape)):
+            t, ids = unmet(own.shape)
             cast(own, solids, tried, t, ids)
             found.append(np.where(seen, t, 0))
         assert np.isfinite(t).mean() > 0.1

@@ -16,9 +16,9 @@ from calib_ros.frame import SemanticClass as Label
 from calib_ros_synthetic import rays
 from calib_ros_synthetic.camera import Scene, render
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_synthetic.lidar import MODELS, PERIOD
 from calib_ros_synthetic.rays import Rays, intersect
-from calib_ros_synthetic.solids import Builder, Kind, Solids, Surface
+from calib_ros_synthetic.scanners import PERIOD, plain_scanner
+from calib_ros_synthetic.solids import Builder, Kind, Solids
 from calib_ros_synthetic.street import Street
 
 SMALL = {"rings": 16, "width": 160, "height": 96}
@@ -91,8 +91,10 @@ def test_a_cloud_is_sorted_as_in_kitti_and_its_time_follows_the_azimuth(rings: i
     assert ring is not None
     assert time is not None
     assert intensity is not None
-    degrees, firings = MODELS[rings]
-    assert len(cloud) > 0.4 * rings * firings
+    model = plain_scanner(rings).model
+    assert model.table is not None
+    degrees = model.table()[0]
+    assert len(cloud) > 0.4 * rings * model.firings
     elevation = np.rad2deg(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
     np.testing.assert_allclose(elevation, degrees[ring], atol=1e-3)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
@@ -151,7 +153,7 @@ def test_a_distorted_image_fits_camera_project(name: str) -> None:
 
 def box(centre: tuple[float, float, float], half: tuple[float, float, float], kind: Kind = Kind.BOX, **more: object) -> Solids:
     b = Builder()
-    b.add(kind, Surface.PLAIN, Label.OTHER, centre, half, (0.02, 0.02, 0.02), **more)  # type: ignore[arg-type]
+    b.add(kind, Label.OTHER, centre, half, (0.02, 0.02, 0.02), **more)  # type: ignore[arg-type]
     return b.solids()
 
 
