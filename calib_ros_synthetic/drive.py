@@ -235,7 +235,7 @@ class SyntheticDrive:
     def pose(self, index: int) -> Floats:
         """T_world_lidar (4, 4) at the frame's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
         ride = self._ride.pose(self._station(self._position(index)))
-        return ride if self._installed is None else self._installed.frame_pose(ride)
+        return ride if self._installed is None else self._installed.pose(ride, self._installed.T_base_frame)
 
     def twist(self, index: int) -> Floats:
         """The velocity (rx, ry, rz, tx, ty, tz) in rad/s and m/s of the frame that clouds are given in, at the frame's stamp.
@@ -243,7 +243,7 @@ class SyntheticDrive:
         It is constant during a scan: at `time` the scanner stands at pose(index) @ se3.exp(twist * time).
         """
         ride = self._ride_twist(self._position(index))
-        return ride if self._installed is None else self._installed.frame_twist(ride)
+        return ride if self._installed is None else self._installed.twist(ride, self._installed.T_base_frame)
 
     def describe(self) -> dict[str, str]:
         """Facts for people."""
@@ -290,7 +290,8 @@ class SyntheticDrive:
         ride, ride_twist = self._ride.pose(station), self._ride_twist(index)
         T_world_lidar, twist, own = ride, ride_twist, None
         if installed is not None:
-            T_world_lidar, twist, own = installed.lidar_pose(ride), installed.lidar_twist(ride_twist), installed.own_returns
+            mount, own = installed.T_base_lidar, installed.own_returns
+            T_world_lidar, twist = installed.pose(ride, mount), installed.twist(ride_twist, mount)
         solids = self._street.around(station)
         # Everything is cast relative to the sensor: far from the world's origin float32 would be too coarse.
         cloud, hit = scan(
@@ -305,7 +306,7 @@ class SyntheticDrive:
             stamp += round(installed.image_delay * NANOSECONDS)
             rng = np.random.default_rng([self.seed, 9, index])
             cloud, kept = installed.delivered(cloud, twist, self._fields, rng)
-            hit, twist = hit[kept], installed.frame_twist(ride_twist)
+            hit, twist = hit[kept], installed.twist(ride_twist, installed.T_base_frame)
         period = PERIOD if installed is None else 1 / installed.rig.rate
         cloud_stamp, cloud = self._stamps.cloud(cloud_stamp, cloud, period)
         stamp = self._stamps.image(stamp, index)
@@ -329,7 +330,7 @@ class SyntheticDrive:
         R_vehicle, own = None, None
         if installed is not None:
             R_vehicle = T_world_frame[:3, :3]
-            T_world_frame = installed.frame_pose(T_world_frame)
+            T_world_frame = installed.pose(T_world_frame, installed.T_base_frame)
             later = self.twist(index) * installed.image_delay
             if later.any():
                 T_world_frame = T_world_frame @ se3.exp(later)

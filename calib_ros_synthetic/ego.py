@@ -95,7 +95,7 @@ class OwnLayer:
         xyz = self.directions * self.t
         here = surfaces.spots(None, self.solids, self.ids, xyz, np.array([0.0, 0.0, height]))
         lit = np.ones(len(self.ids), np.float32)
-        light = surfaces.light(self.solids, self.ids, xyz, here, lit, sun, lighting)
+        light = surfaces.light(self.solids, self.ids, xyz, here, lit, sun, lighting, None)
         grey = surfaces.display(light * np.float32(lighting.exposure))
         out = np.stack([np.bincount(self.ray, self.weight * g, len(self.pixels)) for g in grey])
         return np.asarray(out, np.float32)

@@ -15,8 +15,9 @@ from calib_ros_synthetic.rays import ORIGIN, OWN, SKY, Ints, Jobs, Rays, cast, c
 from calib_ros_synthetic.scanners import SpinningScanner
 from calib_ros_synthetic.solids import Float32, Floats, Solids
 from calib_ros_synthetic.street import Street
-from calib_ros_synthetic.surfaces import spots
+from calib_ros_synthetic.surfaces import Bytes, spots
 
+At = tuple[NDArray[np.intp], ...]  # rows and columns
 DROPPED = 0.004  # share of returns that are lost for no reason
 MIXED = 0.15  # share of returns at an edge that fall between foreground and background
 MIXED_STEP = 2.0  # m; across larger steps the two echoes are told apart
@@ -97,8 +98,8 @@ def scan(
 
 
 def _surface(
-    street: Street | None, solids: Solids, rays: Rays, t: Float32, ids: Ints, at: tuple[NDArray[np.intp], ...], origin: Floats
-) -> tuple[NDArray[np.uint8], Float32, Float32]:
+    street: Street | None, solids: Solids, rays: Rays, t: Float32, ids: Ints, at: At, origin: Floats
+) -> tuple[Bytes, Float32, Float32]:
     """Material, reflectivity and cosine of the incidence, each (n,), of the rays at the rows and columns `at`."""
     what = ids[at]
     xyz = np.stack([np.broadcast_to(o, t.shape)[at] + t[at] * d[at] for o, d in zip(rays.origin, rays.direction, strict=True)])
@@ -129,19 +130,12 @@ class OwnReturns:
     """Rays that meet the own vehicle: distance t (rows, columns) m, inf for the others; material, reflectivity, cosine."""
 
     t: Float32
-    part: NDArray[np.uint8]
+    part: Bytes
     rho: Float32
     cosine: Float32
 
 
-def _scatter(
-    t: Float32,
-    at: tuple[NDArray[np.intp], NDArray[np.intp]],
-    part: NDArray[np.uint8],
-    clock: float,
-    noise: float,
-    rng: np.random.Generator,
-) -> Float32:
+def _scatter(t: Float32, at: At, part: Bytes, clock: float, noise: float, rng: np.random.Generator) -> Float32:
     """Errors of the range (n,): noise of the clock (m), echoes from within foliage, and beams that hit two things at an edge."""
     n = len(part)
     error = np.float32(clock) * rng.standard_normal(n, np.float32)

@@ -19,7 +19,7 @@ OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # a vehicle's axes fr
 
 
 class Fields(Enum):
-    """Which fields a cloud has beside xyz: drivers give all, bare data sets less."""
+    """Which fields a cloud has beside xyz: all that drivers give, and one less from each to the next, as bare data sets."""
 
     ALL = "all"
     NO_TIME = "xyzir"
@@ -51,12 +51,6 @@ class Mount:
         """T_base_sensor (4, 4), for a sensor with x forward, y left, z up."""
         R = se3.rotation_from_euler(*np.deg2rad([self.yaw, self.pitch, self.roll]))
         return se3.from_parts(R, [self.x, self.y, self.z])
-
-    def camera_pose(self) -> Floats:
-        """T_base_camera (4, 4), for a camera's optical frame."""
-        T = self.pose()
-        T[:3, :3] = T[:3, :3] @ OPTICAL
-        return T
 
 
 @dataclass(frozen=True)
@@ -117,22 +111,12 @@ class Rig:
     triggered: bool = False
     top_speed: float = 30.0
 
-    def T_base_lidar(self) -> Floats:
-        """Pose (4, 4) of the scanner on the vehicle."""
-        return self.lidar.pose()
-
     def T_base_camera(self, seed: int, tilt_deg: float) -> Floats:
         """Pose (4, 4) of the camera, turned from its mount by tilt_deg about an axis that depends on the seed."""
         axis = np.random.default_rng([seed, 7]).standard_normal(3)
-        T = self.camera.camera_pose()
-        T[:3, :3] = T[:3, :3] @ se3.exp(np.r_[np.deg2rad(tilt_deg) * axis / np.linalg.norm(axis), 0, 0, 0])[:3, :3]
+        T = self.camera.pose()
+        T[:3, :3] = T[:3, :3] @ OPTICAL @ se3.exp(np.r_[np.deg2rad(tilt_deg) * axis / np.linalg.norm(axis), 0, 0, 0])[:3, :3]
         return T
-
-    @property
-    def distance(self) -> float:
-        """Metres from the scanner to the camera."""
-        a, b = self.lidar, self.camera
-        return float(np.linalg.norm([a.x - b.x, a.y - b.y, a.z - b.z]))
 
 
 NARROW = Lens(34.0, 720, 540, D=(-0.08, 0.12, 4e-4, -3e-4, 0.0))

@@ -197,13 +197,8 @@ class Highway(Street):
 
 
 SCENES: dict[str, type[Street]] = {
-    "street": Street,
-    "trees": Trees,
-    "park": Park,
-    "car_park": CarPark,
-    "warehouse": Warehouse,
-    "highway": Highway,
-}
+    "street": Street, "trees": Trees, "park": Park, "car_park": CarPark, "warehouse": Warehouse, "highway": Highway,
+}  # fmt: skip
 
 
 def _overhead(rng: Rng) -> Floats:

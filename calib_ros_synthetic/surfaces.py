@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib_ros_synthetic import grounds
 from calib_ros_synthetic.materials import ALBEDO, CONTRAST, GLOSS, GRAIN, OWN_COLOUR, Part
-from calib_ros_synthetic.rays import CURB, ROAD
+from calib_ros_synthetic.rays import CURB, ROAD, Ints
 from calib_ros_synthetic.solids import Float32, Floats, Kind, Solids, Surface, cell, noise2
 from calib_ros_synthetic.street import Street
 
@@ -54,7 +54,7 @@ class Spots:
     v: Float32
 
 
-def spots(street: Street | None, solids: Solids, ids: NDArray[np.int32], xyz: Float32, origin: Floats) -> Spots:
+def spots(street: Street | None, solids: Solids, ids: Ints, xyz: Float32, origin: Floats) -> Spots:
     """Materials of hits: ids (n,) as `cast` writes them, xyz (3, n) relative to origin (3,) in the world."""
     n = len(ids)
     out = Spots(np.zeros(n, np.uint8), np.zeros((3, n), np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32))
@@ -74,11 +74,11 @@ def spots(street: Street | None, solids: Solids, ids: NDArray[np.int32], xyz: Fl
     return out
 
 
-def _of(values: Floats, ids: NDArray[np.int32]) -> Float32:
+def _of(values: Floats, ids: Ints) -> Float32:
     return np.asarray(values.astype(np.float32).take(ids))
 
 
-def faces(solids: Solids, ids: NDArray[np.int32], q: Float32) -> tuple[Bytes, list[Float32], Float32, Float32]:
+def faces(solids: Solids, ids: Ints, q: Float32) -> tuple[Bytes, list[Float32], Float32, Float32]:
     """Axis of the face (n,), normal (three (n,), of any length), u and v (n,) m of places q (3, n), -1..1, on solids ids (n,).
 
     Axes and normals are the solids' own.
@@ -111,7 +111,7 @@ def faces(solids: Solids, ids: NDArray[np.int32], q: Float32) -> tuple[Bytes, li
     return face, normal, u, v
 
 
-def _bodies(solids: Solids, ids: NDArray[np.int32], xyz: Float32, out: Spots, where: NDArray[np.intp]) -> None:
+def _bodies(solids: Solids, ids: Ints, xyz: Float32, out: Spots, where: NDArray[np.intp]) -> None:
     c, s = _of(np.cos(solids.yaw), ids), _of(np.sin(solids.yaw), ids)
     x, y, z = (xyz[k] - _of(solids.centre[:, k], ids) for k in range(3))
     half = [_of(solids.half[:, k], ids) for k in range(3)]
@@ -222,7 +222,7 @@ def display(linear: Float32) -> Float32:
     return np.asarray(np.sqrt(np.clip(linear, 0, 1)) * np.float32(255))
 
 
-def sky(direction: Float32, seed: int, lighting: Lighting = DAY) -> Float32:
+def sky(direction: Float32, seed: int, lighting: Lighting) -> Float32:
     """Light (3, n) from the directions (3, n) of any length: gradient, clouds, and woods at the horizon."""
     x, y, z = direction / np.sqrt((direction * direction).sum(axis=0))
     up = np.clip(z, 0, 1)
@@ -242,14 +242,7 @@ def sky(direction: Float32, seed: int, lighting: Lighting = DAY) -> Float32:
 
 
 def light(
-    solids: Solids,
-    ids: NDArray[np.int32],
-    xyz: Float32,
-    here: Spots,
-    lit: Float32,
-    sun: Floats,
-    lighting: Lighting = DAY,
-    forward: Floats | None = None,
+    solids: Solids, ids: Ints, xyz: Float32, here: Spots, lit: Float32, sun: Floats, lighting: Lighting, forward: Floats | None
 ) -> Float32:
     """Light (3, n) that reaches the lens from hits at xyz (3, n) relative to the lens. lit: (n,) share of the sun seen.
 

@@ -16,27 +16,17 @@ def facade_style(stage: Stage, rng: Rng) -> int:
     door = stage.add(looks.plain(rng, gloss=0.05))
     pane = looks.hsv(rng.uniform(0.4, 0.7), rng.uniform(0, 0.5), rng.uniform(0.01, 0.12))
     glass = stage.add(looks.plain(rng, pane, rng.uniform(0.05, 0.5), 0.4))
-    stage.facades.append(
-        {
-            "pitch": rng.uniform(1.3, 4.5),
-            "storey": storey,
-            "wide": rng.uniform(0.14, 0.42),
-            "sill": sill,
-            "lintel": storey - rng.uniform(0.2, 0.7),
-            "frame": rng.choice([0.0, rng.uniform(0.03, 0.09), rng.uniform(0.1, 0.22)], p=[0.15, 0.6, 0.25]),
-            "shop": rng.random() < 0.35,
-            "shutter": rng.uniform(0.2, 0.5) if rng.random() < 0.2 else 0.0,
-            "bars_x": rng.integers(0, 4),
-            "bars_y": rng.integers(0, 4),
-            "doors": rng.uniform(0.0, 0.35),
-            "band": rng.choice([0.0, rng.uniform(0.08, 0.3)]),
-            "blind": rng.choice([0.02, rng.uniform(0.05, 0.5)]),
-            "curtain": rng.uniform(0, 0.6),
-            **{"glass": glass, "trim": trim, "door": door},
-            "ribbon": rng.random() < 0.15,  # windows without wall in between
-            "lit": rng.uniform(0.0, 0.5),
-        }
-    )
+    stage.facades.append({
+        "pitch": rng.uniform(1.3, 4.5), "storey": storey, "wide": rng.uniform(0.14, 0.42), "sill": sill,
+        "lintel": storey - rng.uniform(0.2, 0.7),
+        "frame": rng.choice([0.0, rng.uniform(0.03, 0.09), rng.uniform(0.1, 0.22)], p=[0.15, 0.6, 0.25]),
+        "shop": rng.random() < 0.35, "shutter": rng.uniform(0.2, 0.5) if rng.random() < 0.2 else 0.0,
+        "bars_x": rng.integers(0, 4), "bars_y": rng.integers(0, 4), "doors": rng.uniform(0.0, 0.35),
+        "band": rng.choice([0.0, rng.uniform(0.08, 0.3)]), "blind": rng.choice([0.02, rng.uniform(0.05, 0.5)]),
+        "curtain": rng.uniform(0, 0.6), "glass": glass, "trim": trim, "door": door,
+        "ribbon": rng.random() < 0.15,  # windows without wall in between
+        "lit": rng.uniform(0.0, 0.5),
+    })  # fmt: skip
     return len(stage.facades) - 1
 
 
