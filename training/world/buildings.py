@@ -30,9 +30,8 @@ def facade_style(stage: Stage, rng: Rng) -> int:
     return len(stage.facades) - 1
 
 
-def house(stage: Stage, length: float, depth: float, storeys: int) -> None:
+def house(stage: Stage, rng: Rng, length: float, depth: float, storeys: int) -> None:
     """A building whose front faces -y, centred on the frame: walls, roof, chimneys, balconies, bays, steps, gutters."""
-    rng = stage.rng
     style = facade_style(stage, rng) if rng.random() < 0.6 or not stage.facades else int(rng.integers(len(stage.facades)))
     height = storeys * stage.facades[style]["storey"] + rng.uniform(0, 0.8)
     wall = looks.wall(rng)
@@ -41,10 +40,10 @@ def house(stage: Stage, length: float, depth: float, storeys: int) -> None:
     if rng.random() < 0.4:  # a base of another material
         base = rng.uniform(0.3, 1.1)
         stage.box(BUILDING, (0, 0, base / 2), (length / 2 + 0.04, depth / 2 + 0.04, base / 2), stage.add(looks.wall(rng)))
-    _roof(stage, length, depth, height, storeys, stage.darker(wall, 0.8))
+    _roof(stage, rng, length, depth, height, storeys, stage.darker(wall, 0.8))
     front = -depth / 2
     if rng.random() < 0.35 and storeys > 1:
-        _balconies(stage, length, front, storeys, stage.facades[style]["storey"])
+        _balconies(stage, rng, length, front, storeys, stage.facades[style]["storey"])
     if rng.random() < 0.25:
         wide, top = rng.uniform(0.7, 1.6), min(height, rng.uniform(2.8, 7))
         x = rng.uniform(-0.3, 0.3) * length
@@ -60,14 +59,13 @@ def house(stage: Stage, length: float, depth: float, storeys: int) -> None:
     if rng.random() < 0.2:
         _garage(stage, length, depth)
     if stage.facades[style]["shop"]:
-        _shop(stage, length, front)
+        _shop(stage, rng, length, front)
     for _ in range(int(rng.integers(0, 4)) if rng.random() < 0.15 else 0):  # air conditioners
         where = (rng.uniform(-0.45, 0.45) * length, front - 0.2, rng.uniform(0.3, 0.9) * height)
         stage.box(BUILDING, where, (0.42, 0.2, 0.3), stage.finish["white"])
 
 
-def _roof(stage: Stage, length: float, depth: float, height: float, storeys: int, flat: int) -> None:
-    rng = stage.rng
+def _roof(stage: Stage, rng: Rng, length: float, depth: float, height: float, storeys: int, flat: int) -> None:
     if rng.random() < (0.75 if storeys < 4 else 0.3):
         rise, tiles = rng.uniform(0.8, 2.6), stage.add(looks.roof(rng))
         over = rng.uniform(0.1, 0.6)
@@ -88,8 +86,7 @@ def _roof(stage: Stage, length: float, depth: float, height: float, storeys: int
         stage.box(BUILDING, where, (rng.uniform(0.5, 2), rng.uniform(0.5, 2), 1.0), flat)
 
 
-def _balconies(stage: Stage, length: float, front: float, storeys: int, storey: float) -> None:
-    rng = stage.rng
+def _balconies(stage: Stage, rng: Rng, length: float, front: float, storeys: int, storey: float) -> None:
     deep, wide = rng.uniform(0.6, 1.5), rng.uniform(1.0, 2.2)
     slab, rail = stage.add(looks.plain(rng, looks.wall_colour(rng))), stage.add(looks.plain(rng))
     solid = rng.random() < 0.5
@@ -108,9 +105,8 @@ def _garage(stage: Stage, length: float, depth: float) -> None:
     stage.box(BUILDING, (x, -depth / 4 - depth / 3 - 0.02, 1.1), (1.3, 0.03, 1.1), door)
 
 
-def _shop(stage: Stage, length: float, front: float) -> None:
+def _shop(stage: Stage, rng: Rng, length: float, front: float) -> None:
     """A fascia with lettering, an awning, a sign on a bracket."""
-    rng = stage.rng
     wide = length * rng.uniform(0.3, 0.49)
     fascia = stage.add(looks.poster(rng))
     stage.box(BUILDING, (0, front - 0.08, rng.uniform(2.7, 3.4)), (wide, 0.08, rng.uniform(0.2, 0.45)), fascia)
@@ -123,9 +119,8 @@ def _shop(stage: Stage, length: float, front: float) -> None:
         stage.box(SIGN, where, (0.06, 0.45, rng.uniform(0.25, 0.9)), stage.add(looks.poster(rng)))
 
 
-def hall(stage: Stage, length: float, depth: float, height: float) -> None:
+def hall(stage: Stage, rng: Rng, length: float, depth: float, height: float) -> None:
     """A supermarket, a works or an office of few storeys, with gates and lettering; its front faces -y."""
-    rng = stage.rng
     style = facade_style(stage, rng)
     cover = Cover.FACADE if rng.random() < 0.5 else Cover.PLAIN
     wall = stage.add(looks.wall(rng))
@@ -145,9 +140,8 @@ def hall(stage: Stage, length: float, depth: float, height: float) -> None:
             stage.cylinder(POLE, (x * length, front - deep + 0.2, z / 2), (0.08, 0.08, z / 2), stage.finish["metal"])
 
 
-def border(stage: Stage, length: float) -> None:
+def border(stage: Stage, rng: Rng, length: float) -> None:
     """Wall, fence, rails or mesh along x, centred on the frame."""
-    rng = stage.rng
     kind, high = rng.random(), rng.uniform(0.35, 1.0)
     if kind < 0.3:
         stage.box(BUILDING, (0, 0, high), (length / 2, rng.uniform(0.08, 0.25), high), stage.add(looks.wall(rng)))
@@ -169,9 +163,8 @@ def border(stage: Stage, length: float) -> None:
         stage.box(FENCE, (-length / 2 + k * step, 0, high + 0.06), (0.04, 0.04, high + 0.06), finish)
 
 
-def kiosk(stage: Stage) -> None:
+def kiosk(stage: Stage, rng: Rng) -> None:
     """A bus shelter or a kiosk."""
-    rng = stage.rng
     finish, wide = stage.add(looks.plain(rng)), rng.uniform(1.2, 2.4)
     stage.box(BUILDING, (0, 0, 2.45), (wide, 0.8, 0.08), finish)
     for x in (-wide, 0, wide):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from training.world import looks
+from training.world.looks import Rng
 from training.world.stage import FENCE, OTHER, POLE, SIGN, Cover, Stage
 
 SHAPES = 6  # of plates: oblong, disc, triangle, triangle on its head, octagon, diamond; as paint.py cuts them
@@ -12,17 +13,15 @@ def _post(stage: Stage, radius: float, height: float, finish: int, x: float = 0.
     stage.cylinder(POLE, (x, y, height / 2), (radius, radius, height / 2), finish)
 
 
-def _metal(stage: Stage) -> int:
-    rng = stage.rng
+def _metal(stage: Stage, rng: Rng) -> int:
     if rng.random() < 0.25:
         return stage.add(looks.plain(rng, gloss=0.05))
     return stage.add(looks.plain(rng, looks.hsv(rng.uniform(0.2, 0.7), rng.uniform(0, 0.25), rng.uniform(0.03, 0.6)), 0.05))
 
 
-def lamp(stage: Stage) -> None:
+def lamp(stage: Stage, rng: Rng) -> None:
     """A street lamp with an arm, a globe or two heads; or a mast of wood."""
-    rng = stage.rng
-    height, r, finish = rng.uniform(3, 10), rng.uniform(0.045, 0.14), _metal(stage)
+    height, r, finish = rng.uniform(3, 10), rng.uniform(0.045, 0.14), _metal(stage, rng)
     _post(stage, r, height, finish)
     _post(stage, 1.6 * r, rng.uniform(0.3, 1.3), finish)
     if height > 5 and rng.random() < 0.8:
@@ -33,21 +32,19 @@ def lamp(stage: Stage) -> None:
         stage.ellipsoid(POLE, (0, 0, height + 0.2), (0.22, 0.22, 0.28), stage.finish["lit" if rng.random() < 0.5 else "white"])
 
 
-def mast(stage: Stage) -> None:
+def mast(stage: Stage, rng: Rng) -> None:
     """A mast of wood, concrete or steel without anything, or with a cross-bar."""
-    rng = stage.rng
     height, r = rng.uniform(4, 11), rng.uniform(0.06, 0.2)
     steel = rng.random() < 0.5
-    finish = _metal(stage) if steel else stage.add(looks.plain(rng, looks.hsv(0.08, 0.4, rng.uniform(0.05, 0.3)), 0, 0.2))
+    finish = _metal(stage, rng) if steel else stage.add(looks.plain(rng, looks.hsv(0.08, 0.4, rng.uniform(0.05, 0.3)), 0, 0.2))
     _post(stage, r, height, finish)
     if rng.random() < 0.4:
         stage.box(POLE, (0, 0, height - 0.6), (0.05, rng.uniform(0.6, 1.3), 0.05), finish)
 
 
-def sign(stage: Stage) -> None:
+def sign(stage: Stage, rng: Rng) -> None:
     """One to three plates on a post, seen from either side of the road."""
-    rng = stage.rng
-    height, finish = rng.uniform(1.8, 3.2), _metal(stage)
+    height, finish = rng.uniform(1.8, 3.2), _metal(stage, rng)
     _post(stage, rng.uniform(0.025, 0.06), height + 0.1, finish)
     z, facing = height, rng.choice([-1.0, 1.0], p=[0.75, 0.25])
     for _ in range(int(rng.choice([1, 2, 3], p=[0.6, 0.3, 0.1]))):
@@ -67,10 +64,9 @@ def sign(stage: Stage) -> None:
             break
 
 
-def traffic_light(stage: Stage) -> None:
+def traffic_light(stage: Stage, rng: Rng) -> None:
     """A signal on a post, perhaps another one above the road on an arm."""
-    rng = stage.rng
-    finish, height = _metal(stage), rng.uniform(2.6, 3.4)
+    finish, height = _metal(stage, rng), rng.uniform(2.6, 3.4)
     arm = rng.random() < 0.35
     _post(stage, rng.uniform(0.05, 0.1), 5.8 if arm else height, finish)
     case = stage.add(looks.plain(rng, looks.hsv(rng.uniform(0.1, 0.5), rng.uniform(0, 0.5), rng.uniform(0.01, 0.1))))
@@ -83,20 +79,18 @@ def traffic_light(stage: Stage) -> None:
         stage.box(SIGN, (x - 0.08, y, z), (0.12, 0.16, 0.46), case, cover=Cover.LIGHTS, variant=int(rng.integers(3)))
 
 
-def board(stage: Stage) -> None:
+def board(stage: Stage, rng: Rng) -> None:
     """A poster, a direction board or a banner on legs."""
-    rng = stage.rng
     wide, high, low = rng.uniform(0.5, 2.2), rng.uniform(0.4, 1.3), rng.uniform(0.2, 2.4)
-    finish = _metal(stage)
+    finish = _metal(stage, rng)
     for y in (-0.7, 0.7):
         _post(stage, 0.05, low + high, finish, 0.0, y * wide)
     stage.box(SIGN, (0, 0, low + high), (0.06, wide, high), stage.add(looks.poster(rng)))
 
 
-def gantry(stage: Stage, half: float) -> None:
+def gantry(stage: Stage, rng: Rng, half: float) -> None:
     """A beam with boards across the road; half m to either side of the frame."""
-    rng = stage.rng
-    finish, high = _metal(stage), rng.uniform(5.2, 6.5)
+    finish, high = _metal(stage, rng), rng.uniform(5.2, 6.5)
     for y in (-half, half):
         stage.box(POLE, (0, y, high / 2), (0.15, 0.15, high / 2), finish)
     stage.box(POLE, (0, 0, high), (0.15, half, 0.25), finish)
@@ -106,9 +100,8 @@ def gantry(stage: Stage, half: float) -> None:
         stage.box(SIGN, (-0.3, rng.uniform(-0.8, 0.8) * half, high), (0.05, rng.uniform(0.8, 2), rng.uniform(0.5, 1.2)), plate)
 
 
-def clutter(stage: Stage) -> None:
+def clutter(stage: Stage, rng: Rng) -> None:
     """A bin, a box, a bench, a stone, a plant pot: nothing that has a class."""
-    rng = stage.rng
     kind, finish = rng.integers(4), stage.add(looks.plain(rng))
     if kind == 0:
         half = (rng.uniform(0.2, 0.6), rng.uniform(0.18, 0.4), rng.uniform(0.35, 0.75))
@@ -124,11 +117,10 @@ def clutter(stage: Stage) -> None:
         stage.ellipsoid(OTHER, (0, 0, 0.2 * size), (size, size * 0.8, 0.7 * size), finish)
 
 
-def bollard(stage: Stage) -> None:
+def bollard(stage: Stage, rng: Rng) -> None:
     """A short post."""
-    rng = stage.rng
     r, high = rng.uniform(0.04, 0.14), rng.uniform(0.35, 0.6)
-    finish = _metal(stage)
+    finish = _metal(stage, rng)
     stage.cylinder(POLE, (0, 0, high), (r, r, high), finish)
     if rng.random() < 0.5:
         band = stage.finish["white" if rng.random() < 0.5 else "red"]
@@ -137,7 +129,7 @@ def bollard(stage: Stage) -> None:
 
 def rail(stage: Stage, length: float) -> None:
     """A guard rail along x."""
-    finish = _metal(stage)
+    finish = _metal(stage, stage.rng)
     stage.box(FENCE, (0, 0, 0.6), (length / 2, 0.04, 0.16), finish)
     for k in range(int(length / 2)):
         stage.box(FENCE, (-length / 2 + 2 * k, -0.08, 0.35), (0.05, 0.05, 0.35), finish)

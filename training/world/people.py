@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from training.world import looks
+from training.world.looks import Rng
 from training.world.stage import CYCLIST, OTHER, PEDESTRIAN, Cover, Stage
 
 
-def person(stage: Stage) -> None:
+def person(stage: Stage, rng: Rng) -> None:
     """Someone who stands or walks; a child now and then, with a bag, a skirt or a long coat."""
-    rng = stage.rng
     k = rng.uniform(0.6, 0.85) if rng.random() < 0.1 else rng.uniform(0.9, 1.1)
     stout = rng.uniform(0.85, 1.3)
     stride = rng.choice([rng.uniform(0.0, 0.08), rng.uniform(0.12, 0.34)])
@@ -27,31 +27,28 @@ def person(stage: Stage) -> None:
     stage.ellipsoid(PEDESTRIAN, (0, 0, 1.17 * k), half, coat)
     if rng.random() < 0.25:  # a skirt or a long coat
         stage.frustum(PEDESTRIAN, (0, 0, 0.7 * k), (0.2, 0.24, 0.24 * k), coat, taper=(0.3, 0.3))
-    _head(stage, PEDESTRIAN, 0.02, 1.58 * k, 0.0)
+    _head(stage, rng, PEDESTRIAN, 0.02, 1.58 * k, 0.0)
     if rng.random() < 0.35:
         bag = stage.add(looks.plain(rng))
         where = (-0.2, 0, 1.2 * k) if rng.random() < 0.5 else (0.05, 0.33, 0.75 * k)
         stage.box(PEDESTRIAN, where, (0.1, 0.13, 0.2), bag)
 
 
-def group(stage: Stage) -> None:
+def group(stage: Stage, rng: Rng) -> None:
     """Some people beside each other."""
-    rng = stage.rng
     for _ in range(int(rng.integers(1, 5))):
         stage.shift(rng.normal(0, 0.5), rng.uniform(0.4, 0.9), rng.normal(0, 0.3))
-        person(stage)
+        person(stage, rng)
 
 
-def cyclist(stage: Stage) -> None:
+def cyclist(stage: Stage, rng: Rng) -> None:
     """A rider on a bicycle; the bicycle belongs to the class."""
-    rng = stage.rng
-    bicycle(stage, CYCLIST)
-    _rider(stage, rng.uniform(0.05, 0.3), 0.38)
+    bicycle(stage, rng, CYCLIST)
+    _rider(stage, rng, rng.uniform(0.05, 0.3), 0.38)
 
 
-def bicycle(stage: Stage, label: int = OTHER) -> None:
+def bicycle(stage: Stage, rng: Rng, label: int = OTHER) -> None:
     """A bicycle that stands."""
-    rng = stage.rng
     paint, dark = stage.add(looks.plain(rng, gloss=0.05)), stage.finish["dark"]
     for x in (-0.52, 0.52):
         stage.wheel(label, (x, 0, 0.34), (0.34, 0.025, 0.34), dark, cover=Cover.SPOKES)
@@ -63,9 +60,8 @@ def bicycle(stage: Stage, label: int = OTHER) -> None:
     stage.ellipsoid(label, (-0.2, 0, 0.9), (0.14, 0.09, 0.04), dark)
 
 
-def motorcyclist(stage: Stage) -> None:
+def motorcyclist(stage: Stage, rng: Rng) -> None:
     """A motorcycle or a scooter, mostly with a rider."""
-    rng = stage.rng
     paint, dark = stage.add(looks.paint(rng)), stage.finish["dark"]
     for x in (-0.65, 0.65):
         stage.wheel(CYCLIST, (x, 0, 0.32), (0.32, 0.07, 0.32), dark, cover=Cover.WHEEL, variant=5)
@@ -75,11 +71,10 @@ def motorcyclist(stage: Stage) -> None:
     stage.box(CYCLIST, (0.55, 0, 1.0), (0.05, 0.35, 0.03), dark)
     stage.ellipsoid(CYCLIST, (0.68, 0, 0.85), (0.1, 0.12, 0.12), stage.finish["lamp"])
     if rng.random() < 0.8:
-        _rider(stage, rng.uniform(0.0, 0.2), 0.3)
+        _rider(stage, rng, rng.uniform(0.0, 0.2), 0.3)
 
 
-def _rider(stage: Stage, lean: float, seat: float) -> None:
-    rng = stage.rng
+def _rider(stage: Stage, rng: Rng, lean: float, seat: float) -> None:
     trousers, coat = stage.add(looks.cloth(rng)), stage.add(looks.cloth(rng))
     for side in (-1, 1):
         up = rng.uniform(-0.12, 0.12) * side
@@ -87,11 +82,10 @@ def _rider(stage: Stage, lean: float, seat: float) -> None:
         stage.ellipsoid(CYCLIST, (0.2, side * 0.11, 0.22 + seat + up), (0.08, 0.07, 0.26), trousers)
         stage.ellipsoid(CYCLIST, (0.25 + lean, side * 0.23, 0.86 + seat), (0.22, 0.06, 0.12), coat)
     stage.ellipsoid(CYCLIST, (-0.1 + 0.5 * lean, 0, 0.82 + seat), (0.17, 0.2, 0.32), coat)
-    _head(stage, CYCLIST, 0.05 + lean, 1.22 + seat, 0.5)
+    _head(stage, rng, CYCLIST, 0.05 + lean, 1.22 + seat, 0.5)
 
 
-def _head(stage: Stage, label: int, x: float, z: float, helmet: float) -> None:
-    rng = stage.rng
+def _head(stage: Stage, rng: Rng, label: int, x: float, z: float, helmet: float) -> None:
     skin = stage.add(looks.plain(rng, looks.hsv(rng.uniform(0.03, 0.07), rng.uniform(0.3, 0.6), rng.uniform(0.08, 0.65))))
     stage.ellipsoid(label, (x, 0, z), (0.1, 0.085, 0.13), skin, cover=Cover.HEAD)
     if rng.random() < max(helmet, 0.2):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from training.world import looks
+from training.world.looks import Rng
 from training.world.stage import CAR, Cover, Stage
 
 
-def _style(stage: Stage, length: float, tall: float, radius: float, axles: tuple[float, float]) -> int:
+def _style(stage: Stage, rng: Rng, length: float, tall: float, radius: float, axles: tuple[float, float]) -> int:
     """A new style of lower parts; its number. x, z as shares of half the length and height, -1 to 1."""
-    rng = stage.rng
     low = rng.uniform(-0.1, 0.3)
     # Nothing paints belt and chrome, but they are drawn: without them every picture of a seed would be another one.
     stage.bodies.append({
@@ -30,9 +30,8 @@ def _wheels(stage: Stage, axles: tuple[float, ...], width: float, radius: float,
             stage.wheel(CAR, where, (radius, broad, radius), tyre, cover=Cover.WHEEL, variant=variant)
 
 
-def car(stage: Stage) -> None:
+def car(stage: Stage, rng: Rng) -> None:
     """A small car, hatchback, saloon, estate, off-road vehicle or sports car."""
-    rng = stage.rng
     tall = rng.random() < 0.3
     length, width = rng.uniform(3.3, 5.0), rng.uniform(1.6, 1.95)
     height = rng.uniform(1.58, 1.95) if tall else rng.uniform(1.25, 1.6)
@@ -40,7 +39,7 @@ def car(stage: Stage) -> None:
     radius = rng.uniform(0.27, 0.38)
     axles = (-length * rng.uniform(0.28, 0.34), length * rng.uniform(0.28, 0.34))
     body = (waist - floor) / 2
-    style, paint = _style(stage, length, 2 * body, radius, axles), stage.add(looks.paint(rng))
+    style, paint = _style(stage, rng, length, 2 * body, radius, axles), stage.add(looks.paint(rng))
     shape = (rng.uniform(0.0, 0.06), rng.uniform(0.02, 0.1))
     stage.frustum(CAR, (0, 0, floor + body), (length / 2, width / 2, body), paint, cover=Cover.BODY, taper=shape, variant=style)
     rear, front = rng.choice([0.01, 0.05, 0.17]) + rng.uniform(0, 0.04), rng.uniform(0.2, 0.3)
@@ -70,15 +69,14 @@ def car(stage: Stage) -> None:
         stage.frustum(CAR, (middle, 0, height + 0.2), (0.8, 0.4, 0.15), stage.add(looks.plain(rng)), taper=(0.2, 0.2))
 
 
-def van(stage: Stage) -> None:
+def van(stage: Stage, rng: Rng) -> None:
     """A van, a minibus or a camper."""
-    rng = stage.rng
     length, width, height = rng.uniform(4.2, 6.5), rng.uniform(1.75, 2.1), rng.uniform(1.8, 2.9)
     floor, radius = rng.uniform(0.2, 0.35), rng.uniform(0.3, 0.38)
     waist = rng.uniform(1.0, 1.35)
     axles = (-length * 0.31, length * 0.33)
     body, nose = (waist - floor) / 2, rng.uniform(0.08, 0.2)
-    style, paint = _style(stage, length, 2 * body, radius, axles), stage.add(looks.paint(rng))
+    style, paint = _style(stage, rng, length, 2 * body, radius, axles), stage.add(looks.paint(rng))
     half = (length / 2, width / 2, body)
     stage.frustum(CAR, (0, 0, floor + body), half, paint, cover=Cover.BODY, taper=(0.03, 0.03), variant=style)
     half = (length * (1 - nose) / 2, width / 2 * 0.99, (height - waist) / 2)
@@ -99,12 +97,11 @@ def van(stage: Stage) -> None:
         stage.box(CAR, (x, y * (width / 2 + 0.1), waist + 0.2), (0.06, 0.1, 0.17), stage.finish["dark"])
 
 
-def bus(stage: Stage) -> None:
+def bus(stage: Stage, rng: Rng) -> None:
     """A bus or a coach; seldom with two decks, or a tram."""
-    rng = stage.rng
     length, width, height = rng.uniform(8, 14), rng.uniform(2.4, 2.6), rng.uniform(2.8, 3.4)
     decks = 2 if rng.random() < 0.15 else 1
-    paint, style = looks.paint(rng), _style(stage, length, 1.0, 0.48, (-length * 0.25, length * 0.27))
+    paint, style = looks.paint(rng), _style(stage, rng, length, 1.0, 0.48, (-length * 0.25, length * 0.27))
     finish = stage.add(paint)
     for deck in range(decks):
         z = 0.35 + height * (0.5 + 0.75 * deck)
@@ -118,16 +115,15 @@ def bus(stage: Stage) -> None:
     stage.box(CAR, (length / 2, 0, height + 0.05), (0.03, width * 0.35, 0.15), stage.add(looks.poster(rng)))
 
 
-def lorry(stage: Stage) -> None:
+def lorry(stage: Stage, rng: Rng) -> None:
     """A cab with a box, a flat bed, a tank, or a pick-up."""
-    rng = stage.rng
     small = rng.random() < 0.4
     width, radius = (1.9, 0.36) if small else (2.5, 0.5)
     length, cab = (rng.uniform(4.8, 6.5), 0.9) if small else (rng.uniform(6.5, 14), 1.1)
     top = rng.uniform(1.7, 2.4) if small else rng.uniform(2.4, 3.4)
     paint = stage.add(looks.paint(rng))
     front = length / 2 - cab
-    style = _style(stage, 2 * cab, 1.0, radius, (-2 * cab, 0.0))
+    style = _style(stage, rng, 2 * cab, 1.0, radius, (-2 * cab, 0.0))
     z = radius + (top - radius) * 0.28
     stage.box(CAR, (front, 0, z), (cab, width / 2, (top - radius) * 0.28), paint, cover=Cover.BODY, variant=style)
     half = (cab, width / 2, (top - radius) * 0.24)
@@ -148,7 +144,7 @@ def lorry(stage: Stage) -> None:
     _wheels(stage, axles, width, radius, 0.15)
 
 
-def any_vehicle(stage: Stage, large: float = 0.08) -> None:
+def any_vehicle(stage: Stage, rng: Rng, large: float = 0.08) -> None:
     """Mostly a car. large: share of buses and lorries."""
-    kind = stage.rng.random()
-    (bus if kind < large / 2 else lorry if kind < large else van if kind < large + 0.14 else car)(stage)
+    kind = rng.random()
+    (bus if kind < large / 2 else lorry if kind < large else van if kind < large + 0.14 else car)(stage, rng)
