@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import pickle
 import tempfile
@@ -70,6 +71,19 @@ class RenderedDrive(SyntheticDrive):
             self._rendered[k] = super().__getitem__(k)
         frame = self._rendered[k]
         return replace(deepcopy(frame), camera=frame.camera)  # a test may draw on its frame
+
+
+def on_pixels_of_their_class(drive: SyntheticDrive, index: int, T: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Classes (n,) of a frame's points in the picture, and whether a pixel within `reach` px has the same one."""
+    labels = drive.labels(index)
+    uv, inside = drive.camera.project(se3.transform(T, drive[index].cloud.xyz))
+    u, v = np.rint(uv[inside]).astype(int).T
+    own = labels.points[inside]
+    same = np.zeros(len(own), bool)
+    for dv, du in itertools.product(range(-reach, reach + 1), repeat=2):
+        row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
+        same |= labels.image[row, column] == own
+    return own, same
 
 
 class Scene:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import RenderedDrive
+from scenes import RenderedDrive, on_pixels_of_their_class
 
 from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
@@ -28,17 +28,9 @@ SPINNING = [name for name, model in MODELS.items() if model.table is not None]
 
 def agreement(drive: SyntheticDrive, index: int, T: np.ndarray) -> float:
     """Share of a frame's points that fall on a pixel of their own class, within a pixel."""
-    labels = drive.labels(index)
-    uv, inside = drive.camera.project(se3.transform(T, drive[index].cloud.xyz.astype(float)))
-    inside &= labels.points != UNLABELLED
-    u, v = np.rint(uv[inside]).astype(int).T
-    same = np.zeros(len(u), bool)
-    for dv in (-1, 0, 1):
-        for du in (-1, 0, 1):
-            row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
-            same |= labels.image[row, column] == labels.points[inside]
-    assert len(same) > 100
-    return float(same.mean())
+    own, same = on_pixels_of_their_class(drive, index, T, 1)
+    assert np.sum(own != UNLABELLED) > 100
+    return float(same[own != UNLABELLED].mean())
 
 
 @pytest.mark.parametrize("name", SPINNING)

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from scenes import RenderedDrive
+from scenes import RenderedDrive, on_pixels_of_their_class
 
 from calib_ros import se3
 from calib_ros.camera import Camera
@@ -29,15 +29,7 @@ def agreement(drive: SyntheticDrive, frames: range, T: np.ndarray, reach: int = 
     """Class -> share of its points that fall on a pixel of the same class, or within `reach` pixels of one."""
     good, count = np.zeros(10), np.zeros(10)
     for i in frames:
-        labels, cloud = drive.labels(i), drive[i].cloud
-        uv, inside = drive.camera.project(se3.transform(T, cloud.xyz))
-        u, v = np.rint(uv[inside]).astype(int).T
-        own = labels.points[inside]
-        same = np.zeros(len(own), bool)
-        steps = range(-reach, reach + 1)
-        for dv, du in itertools.product(steps, steps):
-            row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
-            same |= labels.image[row, column] == own
+        own, same = on_pixels_of_their_class(drive, i, T, reach)
         good += np.bincount(own[same], minlength=10)
         count += np.bincount(own, minlength=10)
     return {k: good[k] / count[k] for k in range(10) if count[k] > 30}
