@@ -200,6 +200,15 @@ PRISMS = 121.567, -77.731  # turns per second; no common period within a drive
 PRISM_FIELD = float(np.deg2rad(80.0))  # diameter of their field of view, rad
 
 
+def _by_footprint(window: NDArray[np.int32], solids: Solids, shift: float) -> Jobs:
+    """Of two surfaces at the same distance, that of the solid whose footprint is nearer is met first."""
+    c, s, (x, y, _) = np.cos(solids.yaw), np.sin(solids.yaw), solids.centre.T
+    beside = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x])) - solids.half[:, :2].T, 0)
+    near = np.maximum(np.hypot(*beside) - shift, 0.1)[window[:, 0]]
+    order = np.lexsort((window[:, 0], near))
+    return Jobs(window[order], near[order])
+
+
 @dataclass(frozen=True, eq=False)
 class PlainScanner(SpinningScanner):
     """Lasers above each other that fire together, in a head that is nearly upright; stored as in KITTI's files.
@@ -223,7 +232,8 @@ class PlainScanner(SpinningScanner):
         tilt = float(np.arccos(np.clip(pose[2, 2], -1, 1)))
         # A tilt of the head also turns its azimuth a little where beams are steep.
         corners = solids.corners() @ level
-        return grid_windows(corners, self._table[0], self.firings, shift, turn + 1.5 * tilt, 0.0, no_thin=True)
+        window = grid_windows(corners, self._table[0], self.firings, shift, turn + 1.5 * tilt, 0.0, no_thin=True).window
+        return _by_footprint(window, solids, shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,6 +245,10 @@ class PrismScanner(RosetteScanner):
         first, second = (2 * np.pi * turns * times for turns in PRISMS)
         reach = PRISM_FIELD / 4  # each prism bends the beam by this angle
         return reach * (np.cos(first) + np.cos(second)), reach * (np.sin(first) + np.sin(second))
+
+    def jobs(self, solids: Solids, beams: Float32, pose: Floats, shift: float, turn: float) -> Jobs:
+        """As of any rosette, in the order of the plain scanners."""
+        return _by_footprint(RosetteScanner.jobs(self, solids, beams, pose, shift, turn).window, solids, shift)
 
     def describe(self) -> str:
         """For people."""
