@@ -21,7 +21,7 @@ from calib_ros import se3
 from calib_ros.datasets.source import Source
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_synthetic.lidar import PERIOD
+from calib_ros_synthetic.scanners import PERIOD
 
 Floats = NDArray[np.float64]
 Axis = tuple[float, float, float]

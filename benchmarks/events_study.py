@@ -34,7 +34,7 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import CONVERGED
-from calib_ros_synthetic.lidar import PERIOD
+from calib_ros_synthetic.scanners import PERIOD
 
 SYNTHETIC = {"seed": "11", "stride": "1", "width": "828", "height": "250", "rings": "64"}
 OF_THE_RIG = ("width", "height", "rings")

@@ -14,6 +14,7 @@ from calib_ros_synthetic.ego import OwnLayer
 from calib_ros_synthetic.materials import Part
 from calib_ros_synthetic.rays import (
     OWN,
+    SAMPLES,
     SKY,
     CameraView,
     Ints,
@@ -22,8 +23,10 @@ from calib_ros_synthetic.rays import (
     RowMotion,
     cast,
     cast_ground,
+    changes,
     intersect,
     nearest_first,
+    unmet,
 )
 from calib_ros_synthetic.solids import Float32, Floats, Solids, Surface
 from calib_ros_synthetic.street import Street
@@ -31,8 +34,6 @@ from calib_ros_synthetic.surfaces import DAY, Lighting, spots
 
 AHEAD, SIDE, TEXEL = 55.0, 13.0, 0.07  # m that the map reaches ahead and to either side; m per texel
 Ids = NDArray[np.int32]
-# Sub-pixel rays, in pixels from the centre. Symmetric about it, so that averaging moves no edge.
-SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
 BLUR = 0.5  # px, standard deviation of the lens and the sensor
 READ_NOISE = 1.8  # grey levels
 SHADED = 1 << 16  # rays at a time: larger arrays do not fit the cache
@@ -66,8 +67,7 @@ def render(
     spoilt: what happens to the picture; its lighting, readout and noise are the scene's and the caller's.
     """
     rays = view.rays(scene.R, scene.motion)
-    t = np.full(rays.shape, np.inf, np.float32)
-    ids = np.full(rays.shape, SKY, np.int32)
+    t, ids = unmet(rays.shape)
     if scene.own is not None:  # nothing is seen through the own vehicle
         whole = scene.own.pixels[scene.own.cover == 1]
         t.ravel()[whole], ids.ravel()[whole] = 0, OWN
@@ -78,7 +78,7 @@ def render(
     # Clumps of one crown grow through each other; only the crown's outline is a silhouette.
     part = part.reshape(ids.shape)
     key = np.where(part == Part.LEAF, SKY - 100, ids * 64 + part)
-    edge = np.flatnonzero(_borders(key))
+    edge = np.flatnonzero(changes(key))
     colour[:, edge] = _antialias(scene, shadows, view, ids, edge)
     if scene.own is not None:
         _cover(scene, scene.own, colour, ids)
@@ -98,7 +98,7 @@ def render(
 def _flow(view: CameraView, t: Float32, ids: Ids, twist: Floats) -> Float32:
     """How fast what each pixel sees moves over the picture, (H, W, 2) px/s; the own vehicle stands still."""
     far = np.minimum(t, np.float32(FAR))
-    x, y, z = view.x * far, view.y * far, far if view.z is None else view.z * far
+    x, y, z = view.x * far, view.y * far, view.z * far
     (wx, wy, wz), (vx, vy, vz) = (
         a * np.float32(FLOW_STEP / 2) for a in (twist[:3].astype(np.float32), twist[3:].astype(np.float32))
     )
@@ -112,7 +112,7 @@ def _flow(view: CameraView, t: Float32, ids: Ids, twist: Floats) -> Float32:
 def _cover(scene: Scene, own: OwnLayer, colour: Float32, ids: Ids) -> None:
     """Lays the own vehicle over the grey levels (3, n) and writes OWN to ids (H, W), in place."""
     R = np.eye(3) if scene.R_vehicle is None else scene.R_vehicle
-    over = own.colour(R.T @ scene.street.sun, scene.street.seed, scene.lighting, float(scene.origin[2]))
+    over = own.colour(R.T @ scene.street.sun, scene.lighting, float(scene.origin[2]))
     colour[:, own.pixels] += own.cover * (over - colour[:, own.pixels])
     ids.ravel()[own.pixels[own.cover > 0.5]] = OWN
 
@@ -136,22 +136,10 @@ def _shade(scene: Scene, shadows: Shadows, rays: Rays, t: Float32, ids: Ids) -> 
         here = spots(scene.street, scene.solids, what, xyz, scene.origin)
         facing = here.normal[0] * sun[0] + here.normal[1] * sun[1] + here.normal[2] * sun[2] > 0
         lit = shadows.lit(xyz, what, facing)
-        colour[:, hit] = surfaces.light(
-            *(scene.solids, what, xyz, here, lit, scene.street.sun, scene.street.seed, scene.lighting, forward)
-        )
+        colour[:, hit] = surfaces.light(scene.solids, what, xyz, here, lit, scene.street.sun, scene.lighting, forward)
         part[hit] = here.part
     colour[:, ids == OWN] = 0
     return surfaces.display(colour * np.float32(scene.lighting.exposure)), part
-
-
-def _borders(key: Ids) -> NDArray[np.bool_]:
-    """Pixels (H, W) with another key beside, above or below them."""
-    out = np.zeros(key.shape, bool)
-    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        differs = key[a] != key[b]
-        out[a] |= differs
-        out[b] |= differs
-    return out
 
 
 def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge: NDArray[np.intp]) -> Float32:
@@ -162,9 +150,7 @@ def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge:
     """
     rows, columns = np.divmod(edge, ids.shape[1])
     rays = view.between(edge, SAMPLES, scene.R, scene.motion)
-    t = np.full(rays.shape, np.inf, np.float32)
-    found = np.full(rays.shape, SKY, np.int32)
-
+    t, found = unmet(rays.shape)
     padded = np.pad(ids, 1, mode="edge")
     around: list[Ids] = []
     pixels, candidates = [], []
@@ -183,7 +169,7 @@ def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge:
     for group in np.split(np.arange(len(pixel)), np.flatnonzero(np.diff(candidate)) + 1):
         if len(group):
             which, i = pixel[group], int(candidate[group[0]])
-            some = rays.pick(which)
+            some = rays.window(np.s_[:], which)
             new_t, old_t, old = intersect(scene.solids, i, some), t[:, which], found[:, which]
             hit = new_t < old_t
             t[:, which], found[:, which] = np.where(hit, new_t, old_t), np.where(hit, np.int32(i), old)
@@ -198,13 +184,9 @@ class Shadows:
     def __init__(self, solids: Solids, sun: Floats, forward: Floats, height: float) -> None:
         """solids: relative to the lens. sun, forward: towards the sun and along the view (3,). height: of the lens, m."""
         forward = forward[:2] / (np.linalg.norm(forward[:2]) + 1e-9)
-        left = np.array([-forward[1], forward[0]])
-        box = [[*(a * forward + b * left), z] for a in (0.0, AHEAD) for b in (-SIDE, SIDE) for z in (-height, 5.0)]
-        self._view = SunView(sun, np.array(box), TEXEL)
-        rays = self._view.rays()
-        self._depth = np.full(self._view.shape, np.inf, np.float32)
-        self._ids = np.full(self._view.shape, SKY, np.int32)
-        cast(rays, solids, self._view.jobs(solids), self._depth, self._ids)
+        self._view = SunView(sun, forward, (0.0, AHEAD), SIDE, (-height, 5.0), TEXEL)
+        self._depth, self._ids = unmet(self._view.shape)
+        cast(self._view.rays(), solids, self._view.jobs(solids), self._depth, self._ids)
         d = self._depth
         d = np.minimum(d, np.roll(d, -1, axis=1))
         self._first = np.minimum(d, np.roll(d, -1, axis=0))  # of the four texels around a place
@@ -237,10 +219,14 @@ class Shadows:
 
 
 class SunView:
-    """Parallel rays from the sun on a grid of texels that covers given points, so that shadows can be looked up."""
+    """Parallel rays from the sun on a grid of texels that covers a box, so that shadows can be looked up."""
 
-    def __init__(self, sun: Floats, receivers: Floats, texel: float) -> None:
-        """sun: unit vector towards it (3,). receivers: (n, 3) metres, to be covered. texel: metres."""
+    def __init__(
+        self, sun: Floats, forward: Floats, ahead: tuple[float, float], side: float, up: tuple[float, float], texel: float
+    ) -> None:
+        """sun: unit vector towards it (3,). forward: level unit vector (2,). ahead, up: from, to; side: to either; texel: m."""
+        left = np.array([-forward[1], forward[0]])
+        receivers = np.array([[*(a * forward + b * left), z] for a in ahead for b in (-side, side) for z in up])
         e1 = np.cross([0.0, 0.0, 1.0], sun)
         e1 /= np.linalg.norm(e1)
         self.axes = np.stack([e1, np.cross(sun, e1), -sun])  # columns, rows, distance from the sun

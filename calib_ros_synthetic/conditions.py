@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import BadInputError
 from calib_ros_synthetic.surfaces import DAY, LAMPS, Lighting
 
 Picture = NDArray[np.float32]
@@ -53,16 +52,7 @@ CONDITIONS: dict[str, Conditions] = {
     "rolling": Conditions(readout=0.030),  # a CMOS sensor read row by row in 30 ms
     "jpeg": Conditions(noise=1.5, jpeg=25),  # blocks of 8 x 8
 }
-
-
 CLEAR = CONDITIONS["clear"]
-
-
-def conditions(name: str) -> Conditions:
-    """The conditions of a name. Raises BadInputError naming all of them for an unknown one."""
-    if name not in CONDITIONS:
-        raise BadInputError(f"synthetic drive: condition={name} is not known; choose one of {', '.join(CONDITIONS)}")
-    return CONDITIONS[name]
 
 
 def motion_blurred(image: Picture, flow: Picture, exposure: float) -> Picture:

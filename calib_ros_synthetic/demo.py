@@ -65,10 +65,8 @@ def run(out: str, seed: int) -> bool:
     print(f"writing the bag {folder / 'bag'}: {FRAMES} frames of a synthetic street", flush=True)
     with progress_bar("rendering") as step:
         write_bag(drive, folder / "bag", "mcap", progress=step)
-    Result(start, "initial", "wrong on purpose", camera_frame=drive.camera_frame, lidar_frame=drive.lidar_frame).save(
-        folder / "initial.json"
-    )
-
+    initial = Result(start, "initial", "wrong on purpose", camera_frame=drive.camera_frame, lidar_frame=drive.lidar_frame)
+    initial.save(folder / "initial.json")
     domain = random.SystemRandom().randrange(1, 101)  # so that a demo beside a running system does not meet it
     env = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(domain)}
     os.environ.update({key: env[key] for key in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DOMAIN_ID")})
@@ -80,10 +78,11 @@ def run(out: str, seed: int) -> bool:
         ExtrinsicClient(domain_id=domain) as client,
     ):
         client.get_extrinsic(timeout_s=IDLE_S)  # the node is up
-        with _Process("player", _player_command(folder), env, folder / "player.log") as player:
+        play = [sys.executable, "-m", "calib_ros", "play", str(folder / "bag"), "--loop", "--follow", "/calib_ros"]
+        with _Process("player", play, env, folder / "player.log") as player:
             result, drift = _drive(client, node, player)
         node.must_stop()
-    return _report(folder, drive, start, result, drift, client.overlay, client.overlays)
+    return _report(folder, drive, start, result, drift, client)
 
 
 def _drive(client: ExtrinsicClient, node: _Process, player: _Process) -> tuple[Result, float]:
@@ -108,15 +107,9 @@ def _drive(client: ExtrinsicClient, node: _Process, player: _Process) -> tuple[R
 
 
 def _report(
-    folder: Path,
-    drive: SyntheticDrive,
-    start: NDArray[np.float64],
-    result: Result,
-    drift: float,
-    overlay: NDArray[np.uint8] | None,
-    overlays: int,
+    folder: Path, drive: SyntheticDrive, start: NDArray[np.float64], result: Result, drift: float, client: ExtrinsicClient
 ) -> bool:
-    truth = drive.reference
+    truth, overlay = drive.reference, client.overlay
     before = se3.rotation_error_deg(truth, start), se3.translation_error_m(truth, start)
     after = se3.rotation_error_deg(truth, result.T_camera_lidar), se3.translation_error_m(truth, result.T_camera_lidar)
     result = dataclasses.replace(result, reference_error=after, initial=start)
@@ -127,16 +120,12 @@ def _report(
     print(f"start    {before[0]:.3f} deg  {100 * before[1]:.2f} cm  from the truth")
     print(f"answer   {after[0]:.3f} deg  {100 * after[1]:.2f} cm  from the truth")
     print(f"{result.status}: {result.frames_used} keyframes, score {result.score:.3f}")
-    print(f"overlays received over ROS: {overlays}")
+    print(f"overlays received over ROS: {client.overlays}")
     print(f"left in {folder}: bag/ {' '.join(LEFT_BEHIND)}")
     recovered = result.converged and after[0] <= GOAL_DEG and after[1] <= GOAL_M and overlay is not None
     verdict = "recovered" if recovered else f"not recovered; see {folder / 'node.log'}"
     print(f"{verdict}: the goal was converged, {GOAL_DEG} deg and {100 * GOAL_M:g} cm, and an overlay over ROS")
     return recovered
-
-
-def _player_command(folder: Path) -> list[str]:
-    return [sys.executable, "-m", "calib_ros", "play", str(folder / "bag"), "--loop", "--follow", "/calib_ros"]
 
 
 def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:
@@ -161,8 +150,7 @@ def _fresh_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         ours = ("bag", *LEFT_BEHIND)
-        foreign = [name for name in ours if (folder / name).exists() and not marker.exists()]
-        if foreign:
+        if foreign := [name for name in ours if (folder / name).exists() and not marker.exists()]:
             raise BadInputError(f"{folder} holds {foreign[0]}, which no demo made; choose another --out")
         shutil.rmtree(folder / "bag", ignore_errors=True)
         for name in LEFT_BEHIND:
@@ -185,7 +173,7 @@ class _Process:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.running():
+        if self._child.poll() is None:
             self._child.send_signal(signal.SIGINT)
             try:
                 self._child.wait(STOP_S)
@@ -194,13 +182,9 @@ class _Process:
                 self._child.wait()
         self._log.close()
 
-    def running(self) -> bool:
-        """True while the process lives."""
-        return self._child.poll() is None
-
     def must_run(self) -> None:
         """CalibrationError with the end of the log if the process has ended."""
-        if not self.running():
+        if self._child.poll() is not None:
             raise self._failed(f"ended with code {self._child.returncode}")
 
     def must_stop(self) -> None:

@@ -1,18 +1,16 @@
 """A drive through a ray-cast street or another scene with a known extrinsic: the embedded data of the demo and of the tests.
 
-Everything follows from the parameters and the number of the frame, not from the order of access.
-The world stands still and the sun does not move; only the vehicle does. The image and the scan see the same surfaces: the
-image through a lens, with shadows, textures and reflections that no LiDAR sees; the scan with range noise, lost returns
-and, while the vehicle moves, with the distortion of the motion.
+Everything follows from the parameters and the number of the frame, not from the order of access. Only the vehicle moves.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any
+from inspect import signature
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,15 +21,15 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as Label
 from calib_ros_synthetic.camera import Scene, render
-from calib_ros_synthetic.conditions import conditions
+from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.ego import OwnLayer
 from calib_ros_synthetic.installation import Installation
-from calib_ros_synthetic.lidar import MODELS, PERIOD, Pattern, Scanner, scan
+from calib_ros_synthetic.lidar import scan
 from calib_ros_synthetic.rays import CameraView, row_motion
 from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, StampErrors, Timetable
-from calib_ros_synthetic.rigs import Fields, rig_of
-from calib_ros_synthetic.scanners import in_frame
-from calib_ros_synthetic.scenes import scene_type
+from calib_ros_synthetic.rigs import RIGS, Fields
+from calib_ros_synthetic.scanners import PERIOD, PLAIN, SpinningScanner, in_frame, plain_scanner
+from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Floats, Solids
 from calib_ros_synthetic.street import BLOCK, VIEW_AHEAD
 
@@ -55,6 +53,7 @@ LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
     "image_late_ms": (float, -500.0, 500.0),
     "jitter_ms": (float, 0.0, 100.0),
 }
+V = TypeVar("V")
 NAMED = ("rig", "scene", "condition", "fields", "ride", "stamp_at", "spin")  # parameters whose value is a name
 
 
@@ -68,13 +67,13 @@ class Labels:
 
 def _checked(name: str, value: Any) -> Any:
     kind, low, high = LIMITS[name]
-    allowed = "one of " + ", ".join(map(str, sorted(MODELS))) if name == "rings" else f"from {low:g} to {high:g}"
+    allowed = "one of " + ", ".join(map(str, sorted(PLAIN))) if name == "rings" else f"from {low:g} to {high:g}"
     try:
         number = float(value)
         good = low <= number <= high and (kind is float or number == int(number)) and not isinstance(value, bool)
     except (TypeError, ValueError, OverflowError):
         good = False
-    if not good or (name == "rings" and int(number) not in MODELS):
+    if not good or (name == "rings" and int(number) not in PLAIN):
         what = "a whole number" if kind is int else "a number"
         raise BadInputError(f"synthetic drive: {name}={value} is not allowed; it must be {what} {allowed}")
     return kind(number)
@@ -133,50 +132,37 @@ class SyntheticDrive:
         stamp_at: str = "middle",
         spin: str = "clockwise",
     ) -> None:
-        world = scene_type(scene)
-        model = None if rig is None else rig_of(rig)
+        values = locals()
+        given = {name: values[name] for name in (*LIMITS, *NAMED)}
+        world = _named("scene", scene, SCENES)
+        model = None if rig is None else _named("rig", rig, RIGS)
         cruise = world.cruise if model is None else min(world.cruise, model.top_speed)
-        size: tuple[int | None, ...] = (64, 1242, 375) if model is None else (None, None, None)
         if model is not None and rings is not None:
             raise BadInputError(
                 f"synthetic drive: rings={rings} does not go with rig={rig}, which has its own scanner; leave it out"
             )
-        self._defaults: dict[str, Any] = {
-            "frames": 20,
-            "rings": size[0],
-            "width": size[1],
-            "height": size[2],
-            "speed": cruise,
-            "stride": 10,
-        }
-        self._defaults |= {"noise": 1.0, "tilt_deg": 2.0, "rig": None, "scene": "street", "condition": None, "fields": None}
-        self._defaults |= {"ride": STEADY, "image_late_ms": 0.0, "jitter_ms": 0.0, "stamp_at": "middle", "spin": "clockwise"}
-        given = {"seed": seed, "frames": frames, "rings": rings, "width": width, "height": height, "speed": speed}
-        given |= {"stride": stride, "noise": noise, "tilt_deg": tilt_deg}
-        given |= {"image_late_ms": image_late_ms, "jitter_ms": jitter_ms}
-        p: dict[str, Any] = {}
-        for name, value in given.items():
-            p[name] = self._defaults[name] if value is None else _checked(name, value)
-        _check_name("ride", ride, RIDES)
-        _check_name("stamp_at", stamp_at, STAMP_AT)
-        _check_name("spin", spin, SPINS)
-        named = {"rig": rig, "scene": scene, "condition": condition, "fields": fields, "ride": ride, "stamp_at": stamp_at}
-        named["spin"] = spin
-        self._parameters = p | named
+        self._defaults = {name: p.default for name, p in signature(SyntheticDrive).parameters.items() if name in given}
+        self._defaults |= {"speed": cruise} | ({"rings": 64, "width": 1242, "height": 375} if model is None else {})
+        p: dict[str, Any] = {name: self._defaults[name] if value is None else value for name, value in given.items()}
+        p |= {name: _checked(name, given[name]) for name in LIMITS if given[name] is not None}
+        for name, known in (("ride", RIDES), ("stamp_at", STAMP_AT), ("spin", SPINS)):
+            _named(name, p[name], dict.fromkeys(known))
+        self._parameters = p
         self.seed: int = p["seed"]
         self.rings: int | None = p["rings"]
         self.stride: int = p["stride"]
         self.speed: float = p["speed"]
         self.noise: float = p["noise"]
         self._frames: int = p["frames"]
-        self._fields = _fields(fields, Fields.ALL if model is None else model.fields)
-        self._condition = conditions(condition or ("clear" if model is None else model.condition))
+        usual = Fields.ALL if model is None else model.fields
+        self._fields = usual if fields is None else _named("fields", fields, {f.value: f for f in Fields})
+        self._condition = _named("condition", condition or ("clear" if model is None else model.condition), CONDITIONS)
         self._installed = None if model is None else Installation(model, self.seed, p["tilt_deg"], p["width"], p["height"])
         if self._installed is None:
             self.lidar_frame = "velodyne"
             self.camera = camera or _default_camera(p["width"], p["height"])
             self.reference: Floats = _default_extrinsic(self.seed, p["tilt_deg"])
-            self._scanner: Pattern = Scanner(self.rings or 0)
+            self._scanner: SpinningScanner = plain_scanner(self.rings or 0)
         else:
             self.lidar_frame = self._installed.frame
             self.camera = camera or self._installed.camera
@@ -249,7 +235,7 @@ class SyntheticDrive:
     def pose(self, index: int) -> Floats:
         """T_world_lidar (4, 4) at the frame's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
         ride = self._ride.pose(self._station(self._position(index)))
-        return ride if self._installed is None else self._installed.frame_pose(ride)
+        return ride if self._installed is None else self._installed.pose(ride, self._installed.T_base_frame)
 
     def twist(self, index: int) -> Floats:
         """The velocity (rx, ry, rz, tx, ty, tz) in rad/s and m/s of the frame that clouds are given in, at the frame's stamp.
@@ -257,7 +243,7 @@ class SyntheticDrive:
         It is constant during a scan: at `time` the scanner stands at pose(index) @ se3.exp(twist * time).
         """
         ride = self._ride_twist(self._position(index))
-        return ride if self._installed is None else self._installed.frame_twist(ride)
+        return ride if self._installed is None else self._installed.twist(ride, self._installed.T_base_frame)
 
     def describe(self) -> dict[str, str]:
         """Facts for people."""
@@ -273,7 +259,7 @@ class SyntheticDrive:
             "noise": f"{self.noise:g} x the default",
             "reference": f"{tilt:.2f} deg from looking straight ahead, translation {t[0]:.3f} {t[1]:.3f} {t[2]:.3f} m",
         }
-        return facts if rig is None else facts | {"rig": f"{rig}: {rig_of(rig).why}"}
+        return facts if rig is None else facts | {"rig": f"{rig}: {RIGS[rig].why}"}
 
     def _station(self, index: int) -> float:
         return self._timetable.station(index * self.stride * PERIOD)
@@ -304,11 +290,12 @@ class SyntheticDrive:
         ride, ride_twist = self._ride.pose(station), self._ride_twist(index)
         T_world_lidar, twist, own = ride, ride_twist, None
         if installed is not None:
-            T_world_lidar, twist, own = installed.lidar_pose(ride), installed.lidar_twist(ride_twist), installed.own_returns
+            mount, own = installed.T_base_lidar, installed.own_returns
+            T_world_lidar, twist = installed.pose(ride, mount), installed.twist(ride_twist, mount)
         solids = self._street.around(station)
         # Everything is cast relative to the sensor: far from the world's origin float32 would be too coarse.
         cloud, hit = scan(
-            self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),  # type: ignore[type-var]
+            self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),
             T_world_lidar, twist, self.noise, np.random.default_rng([self.seed, 5, index]),
             visibility=self._condition.visibility, own=own, reverse=self._parameters["spin"] != SPINS[0],
         )  # fmt: skip
@@ -319,7 +306,7 @@ class SyntheticDrive:
             stamp += round(installed.image_delay * NANOSECONDS)
             rng = np.random.default_rng([self.seed, 9, index])
             cloud, kept = installed.delivered(cloud, twist, self._fields, rng)
-            hit, twist = hit[kept], installed.frame_twist(ride_twist)
+            hit, twist = hit[kept], installed.twist(ride_twist, installed.T_base_frame)
         period = PERIOD if installed is None else 1 / installed.rig.rate
         cloud_stamp, cloud = self._stamps.cloud(cloud_stamp, cloud, period)
         stamp = self._stamps.image(stamp, index)
@@ -343,7 +330,7 @@ class SyntheticDrive:
         R_vehicle, own = None, None
         if installed is not None:
             R_vehicle = T_world_frame[:3, :3]
-            T_world_frame = installed.frame_pose(T_world_frame)
+            T_world_frame = installed.pose(T_world_frame, installed.T_base_frame)
             later = self.twist(index) * installed.image_delay
             if later.any():
                 T_world_frame = T_world_frame @ se3.exp(later)
@@ -363,17 +350,10 @@ class SyntheticDrive:
         return render(scene, view, noise, np.random.default_rng([self.seed, 6, index]), self._condition)
 
 
-def _fields(name: str | None, usual: Fields) -> Fields:
-    if name is None:
-        return usual
-    if name not in {f.value for f in Fields}:
-        raise BadInputError(f"synthetic drive: fields={name} is not known; choose one of {', '.join(f.value for f in Fields)}")
-    return Fields(name)
-
-
-def _check_name(parameter: str, name: str, known: Iterable[str]) -> None:
+def _named(parameter: str, name: str, known: Mapping[str, V]) -> V:
     if name not in known:
         raise BadInputError(f"synthetic drive: {parameter}={name} is not known; choose one of {', '.join(known)}")
+    return known[name]
 
 
 def _nominal() -> Floats:

@@ -13,53 +13,51 @@ import numpy as np
 
 from calib_ros.frame import SemanticClass as Label
 from calib_ros_synthetic import surfaces
-from calib_ros_synthetic.rays import SKY, CameraView, Ints, Jobs, cast
-from calib_ros_synthetic.solids import Builder, Float32, Floats, Kind, Solids, Surface
+from calib_ros_synthetic.rays import SAMPLES, SKY, CameraView, Ints, Jobs, cast, changes, unmet
+from calib_ros_synthetic.solids import Builder, Float32, Floats, Solids, Surface
 from calib_ros_synthetic.surfaces import Lighting
 
-# Sub-pixel rays at the outline, in pixels from the centre: as those of the street.
-SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
 SILVER, WHITE, BLACK = (0.42, 0.42, 0.42), (0.66, 0.66, 0.66), (0.04, 0.04, 0.04)
 
 
 def _car(b: Builder) -> None:
     """A tall car of 4.7 m: bonnet 1 m high, roof 1.62 m high from 1.9 m behind to 0.5 m before the middle, with rails."""
     V, style = Label.VEHICLE, (0.5, 0.5, 0.5, 0.5)
-    b.add(Kind.FRUSTUM, Surface.BODY, V, (0, 0, 0.6), (2.35, 0.93, 0.38), SILVER, taper=(0.03, 0.05), style=style)
-    b.add(Kind.FRUSTUM, Surface.PLAIN, V, (1.55, 0, 0.99), (0.72, 0.80, 0.035), SILVER, taper=(0.10, 0.12))
-    b.add(Kind.FRUSTUM, Surface.CABIN, V, (-0.65, 0, 1.29), (1.55, 0.88, 0.33), SILVER, taper=(0.26, 0.20), style=style)
+    b.frustum(V, (0, 0, 0.6), (2.35, 0.93, 0.38), SILVER, Surface.BODY, taper=(0.03, 0.05), style=style)
+    b.frustum(V, (1.55, 0, 0.99), (0.72, 0.80, 0.035), SILVER, taper=(0.10, 0.12))
+    b.frustum(V, (-0.65, 0, 1.29), (1.55, 0.88, 0.33), SILVER, Surface.CABIN, taper=(0.26, 0.20), style=style)
     for y in (-0.62, 0.62):
-        b.add(Kind.BOX, Surface.METAL, V, (-0.65, y, 1.66), (1.0, 0.03, 0.04), BLACK)
-        b.add(Kind.ELLIPSOID, Surface.PLAIN, V, (0.75, y * 1.62, 1.08), (0.09, 0.13, 0.09), SILVER)
+        b.box(V, (-0.65, y, 1.66), (1.0, 0.03, 0.04), BLACK, Surface.METAL)
+        b.ellipsoid(V, (0.75, y * 1.62, 1.08), (0.09, 0.13, 0.09), SILVER)
 
 
 def _truck(b: Builder) -> None:
     """The cab of a truck, 3 m high, its front 1.5 m before the middle, with mirrors on arms."""
     V, style = Label.VEHICLE, (0.5, 0.5, 0.5, 0.5)
-    b.add(Kind.BOX, Surface.BODY, V, (0.4, 0, 0.85), (1.1, 1.22, 0.45), WHITE, style=style)
-    b.add(Kind.FRUSTUM, Surface.CABIN, V, (0.35, 0, 2.15), (1.1, 1.22, 0.85), WHITE, taper=(0.08, 0.05), style=style)
-    b.add(Kind.BOX, Surface.POSTER, V, (-6.0, 0, 2.4), (4.8, 1.25, 1.5), WHITE, style=style)
+    b.box(V, (0.4, 0, 0.85), (1.1, 1.22, 0.45), WHITE, Surface.BODY, style=style)
+    b.frustum(V, (0.35, 0, 2.15), (1.1, 1.22, 0.85), WHITE, Surface.CABIN, taper=(0.08, 0.05), style=style)
+    b.box(V, (-6.0, 0, 2.4), (4.8, 1.25, 1.5), WHITE, Surface.POSTER, style=style)
     for y in (-1.45, 1.45):
-        b.add(Kind.BOX, Surface.PLAIN, V, (1.25, y, 2.0), (0.08, 0.13, 0.28), BLACK)
+        b.box(V, (1.25, y, 2.0), (0.08, 0.13, 0.28), BLACK)
 
 
 def _robot(b: Builder) -> None:
     """A wheeled platform 0.7 m long and 0.35 m high with a mast."""
     other = Label.OTHER
-    b.add(Kind.BOX, Surface.PLAIN, other, (0, 0, 0.22), (0.36, 0.27, 0.13), BLACK)
-    b.add(Kind.BOX, Surface.METAL, other, (0, 0, 0.36), (0.34, 0.25, 0.012), SILVER)
+    b.box(other, (0, 0, 0.22), (0.36, 0.27, 0.13), BLACK)
+    b.box(other, (0, 0, 0.36), (0.34, 0.25, 0.012), SILVER, Surface.METAL)
     for x in (-0.28, 0.28):
         for y in (-0.16, 0.16):
-            b.add(Kind.CYLINDER, Surface.METAL, other, (x, y, 0.42), (0.02, 0.02, 0.05), SILVER)
+            b.cylinder(other, (x, y, 0.42), (0.02, 0.02, 0.05), SILVER, Surface.METAL)
 
 
 def _forklift(b: Builder) -> None:
     """An automated forklift: its mast before the sensors, and a protective roof."""
     other = Label.OTHER
-    b.add(Kind.BOX, Surface.PLAIN, other, (-0.6, 0, 0.75), (0.8, 0.5, 0.6), (0.05, 0.45, 0.68))
+    b.box(other, (-0.6, 0, 0.75), (0.8, 0.5, 0.6), (0.05, 0.45, 0.68))
     for y in (-0.42, 0.42):
-        b.add(Kind.BOX, Surface.METAL, other, (0.55, y, 1.3), (0.06, 0.05, 1.2), BLACK)
-        b.add(Kind.BOX, Surface.METAL, other, (1.2, y * 0.8, 0.12), (0.55, 0.06, 0.03), BLACK)
+        b.box(other, (0.55, y, 1.3), (0.06, 0.05, 1.2), BLACK, Surface.METAL)
+        b.box(other, (1.2, y * 0.8, 0.12), (0.55, 0.06, 0.03), BLACK, Surface.METAL)
 
 
 BODIES: dict[str, Callable[[Builder], None]] = {"car": _car, "truck": _truck, "robot": _robot, "forklift": _forklift}
@@ -92,12 +90,12 @@ class OwnLayer:
     ids: Ints
     solids: Solids
 
-    def colour(self, sun: Floats, seed: int, lighting: Lighting, height: float) -> Float32:
+    def colour(self, sun: Floats, lighting: Lighting, height: float) -> Float32:
         """Grey levels (3, m). sun: in the vehicle's frame. height: of the lens, m."""
         xyz = self.directions * self.t
         here = surfaces.spots(None, self.solids, self.ids, xyz, np.array([0.0, 0.0, height]))
         lit = np.ones(len(self.ids), np.float32)
-        light = surfaces.light(self.solids, self.ids, xyz, here, lit, sun, seed, lighting)
+        light = surfaces.light(self.solids, self.ids, xyz, here, lit, sun, lighting, None)
         grey = surfaces.display(light * np.float32(lighting.exposure))
         out = np.stack([np.bincount(self.ray, self.weight * g, len(self.pixels)) for g in grey])
         return np.asarray(out, np.float32)
@@ -111,21 +109,17 @@ def own_layer(solids: Solids, view: CameraView, T_base_camera: Floats) -> OwnLay
     jobs = view.jobs(around, R)
     if not len(jobs.window):
         return None
-    t = np.full(rays.shape, np.inf, np.float32)
-    ids = np.full(rays.shape, SKY, np.int32)
+    t, ids = unmet(rays.shape)
     cast(rays, around, jobs, t, ids)
     hit = (ids != SKY) & view.seen
-    border = _border(hit) & view.seen
+    border = changes(hit) & view.seen
     if not (hit | border).any():
         return None
     inner = np.flatnonzero(hit & ~border)
     outline = np.flatnonzero(border)
     fine = view.between(outline, SAMPLES, R)
-    ft = np.full(fine.shape, np.inf, np.float32)
-    fids = np.full(fine.shape, SKY, np.int32)
-    n, (rows, columns) = len(around), fine.shape
-    window = np.stack([np.arange(n), np.zeros(n), np.full(n, rows), np.zeros(n), np.full(n, columns)], 1).astype(np.int32)
-    cast(fine, around, Jobs(window, np.zeros(n)), ft, fids)
+    ft, fids = unmet(fine.shape)
+    cast(fine, around, Jobs.whole(len(around), fine.shape), ft, fids)
     met = fids != SKY
     cover = met.mean(axis=0)
     some = np.flatnonzero(cover > 0)
@@ -143,13 +137,3 @@ def own_layer(solids: Solids, view: CameraView, T_base_camera: Floats) -> OwnLay
         np.r_[ids.ravel()[inner], fids[sample, some[which]]],
         around,
     )
-
-
-def _border(hit: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) beside, above or below one that differs."""
-    out = np.zeros(hit.shape, bool)
-    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        differs = hit[a] != hit[b]
-        out[a] |= differs
-        out[b] |= differs
-    return out

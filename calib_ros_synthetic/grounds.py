@@ -10,14 +10,9 @@ from numpy.typing import NDArray
 from calib_ros_synthetic.materials import Part
 from calib_ros_synthetic.rays import CURB, PAVEMENT, ROAD
 from calib_ros_synthetic.solids import Float32, cell, noise2
-from calib_ros_synthetic.street import Ground, Street
+from calib_ros_synthetic.street import Street
 
 Bytes = NDArray[np.uint8]
-
-
-def ground_parts(street: Street, ids: NDArray[np.int32], s: Float32, d: Float32) -> Bytes:
-    """Materials (n,) of the ground ids (n,) at stations s and offsets d (n,) in metres."""
-    return PAINTERS[street.ground](street, ids, s, d)
 
 
 def _street(street: Street, ids: NDArray[np.int32], s: Float32, d: Float32) -> Bytes:
@@ -105,11 +100,7 @@ def _highway(street: Street, ids: NDArray[np.int32], s: Float32, d: Float32) -> 
     return np.where(np.abs(d) < half, road, np.where(np.abs(d) < half + 0.8, Part.GRAVEL, Part.GRASS)).astype(np.uint8)
 
 
-PAINTERS: dict[Ground, Callable[[Street, NDArray[np.int32], Float32, Float32], Bytes]] = {
-    Ground.STREET: _street,
-    Ground.COUNTRY: _country,
-    Ground.PATH: _path,
-    Ground.PARKING: _parking,
-    Ground.HALL: _hall,
-    Ground.HIGHWAY: _highway,
-}
+# Materials (n,) of ground ids (n,) at stations and offsets (n,) m.
+PAINTERS: dict[str, Callable[[Street, NDArray[np.int32], Float32, Float32], Bytes]] = {
+    "street": _street, "country": _country, "path": _path, "parking": _parking, "hall": _hall, "highway": _highway,
+}  # fmt: skip

@@ -36,7 +36,7 @@ class Installation:
         self.rig = rig
         self.camera: Camera = rig.lens.camera(width, height)
         self.scanner = scanner(rig.scanner, rig.rate)
-        self.T_base_lidar = rig.T_base_lidar()
+        self.T_base_lidar = rig.lidar.pose()
         self.T_base_camera = rig.T_base_camera(seed, tilt_deg)
         self.T_base_frame: Floats = np.eye(4) if rig.base_frame else self.T_base_lidar
         self.reference = np.asarray(se3.inverse(self.T_base_camera) @ self.T_base_frame)
@@ -45,25 +45,13 @@ class Installation:
         # The ride is that of a scanner above the origin of the vehicle's frame.
         self._T_ride_base = se3.from_parts(np.eye(3), [0.0, 0.0, -LIDAR_HEIGHT])
 
-    def base_pose(self, ride: Floats) -> Floats:
-        """T_world_base (4, 4) from the pose of the ride (4, 4)."""
-        return np.asarray(ride @ self._T_ride_base)
+    def pose(self, ride: Floats, T_base: Floats) -> Floats:
+        """The pose (4, 4) of a frame that lies at T_base (4, 4) on the vehicle, from that of the ride (4, 4)."""
+        return np.asarray(ride @ self._T_ride_base @ T_base)
 
-    def frame_pose(self, ride: Floats) -> Floats:
-        """T_world_frame (4, 4) of the frame that clouds are given in."""
-        return np.asarray(self.base_pose(ride) @ self.T_base_frame)
-
-    def lidar_pose(self, ride: Floats) -> Floats:
-        """T_world_lidar (4, 4)."""
-        return np.asarray(self.base_pose(ride) @ self.T_base_lidar)
-
-    def frame_twist(self, ride: Floats) -> Floats:
-        """The twist (6,) of the ride in the frame that clouds are given in."""
-        return in_frame(ride, self._T_ride_base @ self.T_base_frame)
-
-    def lidar_twist(self, ride: Floats) -> Floats:
-        """The twist (6,) of the ride in the scanner's own frame."""
-        return in_frame(ride, self._T_ride_base @ self.T_base_lidar)
+    def twist(self, ride: Floats, T_base: Floats) -> Floats:
+        """The twist (6,) of the ride in such a frame."""
+        return in_frame(ride, self._T_ride_base @ T_base)
 
     @property
     def image_delay(self) -> float:
@@ -107,14 +95,9 @@ class Installation:
         keep = np.flatnonzero(np.abs(base[:, 1]) <= self.rig.crop)
         if self.rig.base_frame:
             xyz = base
-        bare = {
-            Fields.ALL: {},
-            Fields.NO_TIME: {"time": None},
-            Fields.INTENSITY: {"time": None, "ring": None},
-            Fields.BARE: {"time": None, "ring": None, "intensity": None},
-        }[fields]
+        left_out = ("time", "ring", "intensity")[: list(Fields).index(fields)]
         whole = replace(cloud, xyz=xyz.astype(np.float32), intensity=intensity)
-        return replace(whole, **bare).select(keep), keep  # type: ignore[arg-type]
+        return replace(whole, **dict.fromkeys(left_out)).select(keep), keep  # type: ignore[arg-type]
 
     def _intensity(self, cloud: PointCloud, rng: np.random.Generator) -> NDArray[np.float32]:
         assert cloud.intensity is not None

@@ -1,14 +1,11 @@
-"""Objects of the synthetic street: what stands along it, vehicles and people.
-
-Each function adds one object to a Builder at the Builder's current frame.
-"""
+"""Objects of the synthetic street: what stands along it, vehicles and people; each is added at a Builder's current frame."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from calib_ros.frame import SemanticClass as Label
-from calib_ros_synthetic.solids import Builder, Kind, Numbers, Surface, pick_colour
+from calib_ros_synthetic.solids import Builder, Numbers, Surface, pick_colour
 
 Rng = np.random.Generator
 WALL_PAINTS = [
@@ -25,20 +22,25 @@ def pole(b: Builder, rng: Rng) -> None:
     """A street lamp with an arm over the road (to the left: y > 0) or a plain post."""
     r, height = rng.uniform(0.06, 0.11), rng.uniform(5.0, 8.0)
     grey = np.full(3, rng.uniform(0.12, 0.4))
-    b.add(Kind.CYLINDER, Surface.METAL, Label.POLE, (0, 0, height / 2), (r, r, height / 2), grey)
-    b.add(Kind.CYLINDER, Surface.METAL, Label.POLE, (0, 0, 0.5), (1.5 * r, 1.5 * r, 0.5), grey)
+    b.cylinder(Label.POLE, (0, 0, height / 2), (r, r, height / 2), grey, Surface.METAL)
+    b.cylinder(Label.POLE, (0, 0, 0.5), (1.5 * r, 1.5 * r, 0.5), grey, Surface.METAL)
     if rng.random() < 0.75:
-        b.add(Kind.BOX, Surface.METAL, Label.POLE, (0, 0.8, height - 0.1), (0.04, 0.8, 0.04), grey)
-        b.add(Kind.BOX, Surface.METAL, Label.POLE, (0, 1.5, height - 0.17), (0.14, 0.35, 0.06), grey)
+        b.box(Label.POLE, (0, 0.8, height - 0.1), (0.04, 0.8, 0.04), grey, Surface.METAL)
+        b.box(Label.POLE, (0, 1.5, height - 0.17), (0.14, 0.35, 0.06), grey, Surface.METAL)
 
 
 def sign(b: Builder, rng: Rng) -> None:
     """A traffic sign that faces the traffic, retro-reflective as real ones."""
     height, size = rng.uniform(2.0, 2.6), rng.uniform(0.3, 0.42)
-    b.add(Kind.CYLINDER, Surface.METAL, Label.POLE, (0, 0, height / 2 + 0.2), (0.035, 0.035, height / 2 + 0.2), (0.4, 0.4, 0.4))
+    b.cylinder(Label.POLE, (0, 0, height / 2 + 0.2), (0.035, 0.035, height / 2 + 0.2), (0.4, 0.4, 0.4), Surface.METAL)
     colour = [(0.08, 0.05, 0.7), (0.6, 0.25, 0.05), (0.1, 0.6, 0.8), (0.8, 0.8, 0.8)][rng.integers(4)]
     wide = size * (1.0 if rng.random() < 0.7 else 1.7)
-    b.add(Kind.BOX, Surface.SIGN, Label.SIGN, (-0.06, 0, height), (0.015, wide, size), colour, style=rng.random(4))
+    b.box(Label.SIGN, (-0.06, 0, height), (0.015, wide, size), colour, Surface.SIGN, style=rng.random(4))
+
+
+def clump(b: Builder, rng: Rng, centre: Numbers, half: Numbers, green: Numbers) -> None:
+    """Some leaves."""
+    b.ellipsoid(Label.VEGETATION, centre, half, green, Surface.LEAF, style=rng.random(4))
 
 
 def tree(b: Builder, rng: Rng) -> None:
@@ -46,14 +48,12 @@ def tree(b: Builder, rng: Rng) -> None:
     r, trunk, spread = rng.uniform(0.10, 0.26), rng.uniform(2.0, 3.2), rng.uniform(1.3, 2.4)
     green = np.array([0.07, 0.22, 0.13]) * rng.uniform(0.7, 1.5) + [0, 0, rng.uniform(0, 0.10)]
     bark = np.array([0.12, 0.16, 0.20]) * rng.uniform(0.7, 1.3)
-    b.add(Kind.CYLINDER, Surface.BARK, Label.VEGETATION, (0, 0, trunk / 2 + 0.4), (r, r, trunk / 2 + 0.4), bark)
-    b.add(Kind.ELLIPSOID, Surface.LEAF, Label.VEGETATION, (0, 0, trunk + spread), (0.8 * spread, 0.8 * spread, spread),
-          green, style=rng.random(4))  # fmt: skip
+    b.cylinder(Label.VEGETATION, (0, 0, trunk / 2 + 0.4), (r, r, trunk / 2 + 0.4), bark, Surface.BARK)
+    clump(b, rng, (0, 0, trunk + spread), (0.8 * spread, 0.8 * spread, spread), green)
     for k in range(5):
         a, size = k * 2 * np.pi / 5 + rng.uniform(-0.4, 0.4), spread * rng.uniform(0.5, 0.75)
         centre = (0.6 * spread * np.cos(a), 0.6 * spread * np.sin(a), trunk + spread * rng.uniform(0.45, 1.3))
-        b.add(Kind.ELLIPSOID, Surface.LEAF, Label.VEGETATION, centre, (size, size, 0.8 * size),
-              green * rng.uniform(0.8, 1.2), style=rng.random(4))  # fmt: skip
+        clump(b, rng, centre, (size, size, 0.8 * size), green * rng.uniform(0.8, 1.2))
 
 
 def bush(b: Builder, rng: Rng) -> None:
@@ -61,59 +61,57 @@ def bush(b: Builder, rng: Rng) -> None:
     green = np.array([0.08, 0.24, 0.14]) * rng.uniform(0.6, 1.3)
     for _ in range(2):
         size = rng.uniform(0.4, 0.9)
-        b.add(Kind.ELLIPSOID, Surface.LEAF, Label.VEGETATION, (rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.3), 0.6 * size),
-              (size, size, 0.9 * size), green, style=rng.random(4))  # fmt: skip
+        clump(b, rng, (rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.3), 0.6 * size), (size, size, 0.9 * size), green)
 
 
 def border(b: Builder, rng: Rng, length: float) -> None:
     """Hedge, wall or fence along the pavement, centred on the frame's origin."""
     kind = rng.integers(3)
     if kind == 0:
-        b.add(Kind.BOX, Surface.LEAF, Label.VEGETATION, (0, 0, 0.6), (length / 2, 0.35, rng.uniform(0.5, 0.9)),
-              (0.06, 0.2, 0.1), style=rng.random(4))  # fmt: skip
+        b.box(Label.VEGETATION, (0, 0, 0.6), (length / 2, 0.35, rng.uniform(0.5, 0.9)), (0.06, 0.2, 0.1), Surface.LEAF,
+              style=rng.random(4))  # fmt: skip
     elif kind == 1:
-        b.add(Kind.BOX, Surface.PLAIN, Label.BUILDING, (0, 0, 0.45), (length / 2, 0.12, rng.uniform(0.35, 0.6)),
-              pick_colour(rng, WALL_PAINTS))  # fmt: skip
+        b.box(Label.BUILDING, (0, 0, 0.45), (length / 2, 0.12, rng.uniform(0.35, 0.6)), pick_colour(rng, WALL_PAINTS))
     else:
-        b.add(Kind.BOX, Surface.FENCE, Label.OTHER, (0, 0, 0.7), (length / 2, 0.03, rng.uniform(0.5, 0.8)),
-              (0.2, 0.3, 0.4), style=rng.random(4))  # fmt: skip
+        b.box(Label.OTHER, (0, 0, 0.7), (length / 2, 0.03, rng.uniform(0.5, 0.8)), (0.2, 0.3, 0.4), Surface.FENCE,
+              style=rng.random(4))  # fmt: skip
 
 
 def bin_or_box(b: Builder, rng: Rng) -> None:
     """A waste bin or a cabinet of the telephone company."""
     half = (rng.uniform(0.2, 0.5), rng.uniform(0.18, 0.3), rng.uniform(0.45, 0.7))
-    b.add(Kind.FRUSTUM, Surface.PLAIN, Label.OTHER, (0, 0, half[2]), half, rng.uniform(0.05, 0.45, 3), taper=(0.06, 0.06))
+    b.frustum(Label.OTHER, (0, 0, half[2]), half, rng.uniform(0.05, 0.45, 3), taper=(0.06, 0.06))
 
 
 def billboard(b: Builder, rng: Rng) -> None:
     """A poster on two legs: the print has edges that no LiDAR sees."""
     for x in (-0.7, 0.7):
-        b.add(Kind.CYLINDER, Surface.METAL, Label.POLE, (x, 0, 0.5), (0.05, 0.05, 0.5), (0.2, 0.2, 0.2))
-    b.add(Kind.BOX, Surface.POSTER, Label.OTHER, (0, 0, 1.7), (1.1, 0.08, 0.9), rng.uniform(0.05, 0.5, 3), style=rng.random(4))
+        b.cylinder(Label.POLE, (x, 0, 0.5), (0.05, 0.05, 0.5), (0.2, 0.2, 0.2), Surface.METAL)
+    b.box(Label.OTHER, (0, 0, 1.7), (1.1, 0.08, 0.9), rng.uniform(0.05, 0.5, 3), Surface.POSTER, style=rng.random(4))
 
 
 def house(b: Builder, rng: Rng, length: float, depth: float, height: float) -> None:
     """A building whose front faces -y, centred on the frame's origin: walls, roof, steps, pipes and sometimes a bay."""
     B, wall, style = Label.BUILDING, pick_colour(rng, WALL_PAINTS), rng.random(4)
-    b.add(Kind.BOX, Surface.FACADE, B, (0, 0, height / 2), (length / 2, depth / 2, height / 2), wall, style=style)
+    b.box(B, (0, 0, height / 2), (length / 2, depth / 2, height / 2), wall, Surface.FACADE, style=style)
     if rng.random() < 0.75:
         tiles = np.array([0.12, 0.16, 0.34]) * rng.uniform(0.5, 1.3)
         rise = rng.uniform(1.2, 2.4)
-        b.add(Kind.FRUSTUM, Surface.ROOF, B, (0, 0, height + rise), (length / 2 + 0.2, depth / 2 + 0.4, rise), tiles,
-              taper=(0.05, 0.96), style=style)  # fmt: skip
-        b.add(Kind.BOX, Surface.PLAIN, B, (rng.uniform(-0.3, 0.3) * length, 0, height + 2 * rise), (0.35, 0.35, 0.8), tiles)
+        b.frustum(B, (0, 0, height + rise), (length / 2 + 0.2, depth / 2 + 0.4, rise), tiles, Surface.ROOF, taper=(0.05, 0.96),
+                  style=style)  # fmt: skip
+        b.box(B, (rng.uniform(-0.3, 0.3) * length, 0, height + 2 * rise), (0.35, 0.35, 0.8), tiles)
     else:
-        b.add(Kind.BOX, Surface.PLAIN, B, (0, 0, height + 0.15), (length / 2 + 0.15, depth / 2 + 0.15, 0.15), wall * 0.7)
+        b.box(B, (0, 0, height + 0.15), (length / 2 + 0.15, depth / 2 + 0.15, 0.15), wall * 0.7)
     x = rng.choice([-1, 1]) * (length / 2 - 0.25)
-    b.add(Kind.CYLINDER, Surface.METAL, B, (x, -depth / 2 - 0.08, height / 2), (0.06, 0.06, height / 2), (0.3, 0.3, 0.3))
+    b.cylinder(B, (x, -depth / 2 - 0.08, height / 2), (0.06, 0.06, height / 2), (0.3, 0.3, 0.3), Surface.METAL)
     if rng.random() < 0.45:
         size, x = rng.uniform(0.8, 1.4), rng.uniform(-0.25, 0.25) * length
         top = min(height, rng.uniform(3.0, 6.0))
-        b.add(Kind.BOX, Surface.FACADE, B, (x, -depth / 2, top / 2), (size, rng.uniform(0.4, 0.9), top / 2), wall * 0.95,
+        b.box(B, (x, -depth / 2, top / 2), (size, rng.uniform(0.4, 0.9), top / 2), wall * 0.95, Surface.FACADE,
               style=rng.random(4))  # fmt: skip
     if rng.random() < 0.6:
         x = rng.uniform(-0.35, 0.35) * length
-        b.add(Kind.BOX, Surface.PLAIN, B, (x, -depth / 2 - 0.4, 0.17), (0.7, 0.4, 0.17), (0.4, 0.42, 0.44))
+        b.box(B, (x, -depth / 2 - 0.4, 0.17), (0.7, 0.4, 0.17), (0.4, 0.42, 0.44))
 
 
 def car(b: Builder, rng: Rng) -> None:
@@ -124,33 +122,34 @@ def car(b: Builder, rng: Rng) -> None:
     height = rng.uniform(1.95, 2.5) if van else rng.uniform(1.4, 1.62)
     waist = 0.55 * height if van else rng.uniform(0.80, 0.92)  # height of the bonnet
     V = Label.VEHICLE
-    b.add(Kind.FRUSTUM, Surface.BODY, V, (0, 0, (waist + 0.2) / 2), (length / 2, width / 2, (waist - 0.2) / 2),
-          paint, taper=(0.04, 0.05), style=style)  # fmt: skip
+    b.frustum(V, (0, 0, (waist + 0.2) / 2), (length / 2, width / 2, (waist - 0.2) / 2), paint, Surface.BODY, taper=(0.04, 0.05),
+              style=style)  # fmt: skip
     back, front = (0.02, 0.24) if van else (rng.uniform(0.02, 0.16), rng.uniform(0.24, 0.30))
     cabin = length * (1 - back - front)
-    b.add(Kind.FRUSTUM, Surface.CABIN, V, (length * (back - front) / 2, 0, (waist + height) / 2 - 0.01),
-          (cabin / 2, width / 2 * 0.96, (height - waist) / 2 + 0.01), paint,
-          taper=(0.10 if van else rng.uniform(0.24, 0.40), 0.10 if van else 0.22), style=style)  # fmt: skip
+    lean = (0.10, 0.10) if van else (rng.uniform(0.24, 0.40), 0.22)
+    half = (cabin / 2, width / 2 * 0.96, (height - waist) / 2 + 0.01)
+    middle = (length * (back - front) / 2, 0, (waist + height) / 2 - 0.01)
+    b.frustum(V, middle, half, paint, Surface.CABIN, taper=lean, style=style)
     r = rng.uniform(0.29, 0.35)
     for x in (-0.5 * length + 0.17 * length, 0.5 * length - 0.18 * length):
         for y in (-1, 1):
-            b.add(Kind.WHEEL, Surface.TYRE, V, (x, y * (width / 2 - 0.09), r), (r, 0.11, r), (0.03, 0.03, 0.03))
+            b.wheel(V, (x, y * (width / 2 - 0.09), r), (r, 0.11, r), (0.03, 0.03, 0.03), Surface.TYRE)
     for y in (-1, 1):
         x = length * (0.5 - front) - 0.25
-        b.add(Kind.ELLIPSOID, Surface.PLAIN, V, (x, y * (width / 2 + 0.07), waist + 0.07), (0.07, 0.10, 0.07), paint)
+        b.ellipsoid(V, (x, y * (width / 2 + 0.07), waist + 0.07), (0.07, 0.10, 0.07), paint)
 
 
 def truck(b: Builder, rng: Rng) -> None:
     """A delivery truck with a box body."""
     V, length, style = Label.VEHICLE, rng.uniform(4.2, 5.8), rng.random(4)
     paint = pick_colour(rng, CAR_PAINTS)
-    b.add(Kind.BOX, Surface.POSTER, V, (-1.0, 0, 1.95), (length / 2, 1.15, 1.15), rng.uniform(0.05, 0.6, 3), style=style)
-    b.add(Kind.BOX, Surface.PLAIN, V, (-0.2, 0, 0.62), (length / 2 + 0.6, 0.9, 0.17), (0.08, 0.08, 0.08))
-    b.add(Kind.FRUSTUM, Surface.CABIN, V, (length / 2, 0, 1.9), (0.9, 1.03, 0.6), paint, taper=(0.2, 0.1), style=style)
-    b.add(Kind.BOX, Surface.BODY, V, (length / 2, 0, 0.85), (0.95, 1.05, 0.5), paint, style=style)
+    b.box(V, (-1.0, 0, 1.95), (length / 2, 1.15, 1.15), rng.uniform(0.05, 0.6, 3), Surface.POSTER, style=style)
+    b.box(V, (-0.2, 0, 0.62), (length / 2 + 0.6, 0.9, 0.17), (0.08, 0.08, 0.08))
+    b.frustum(V, (length / 2, 0, 1.9), (0.9, 1.03, 0.6), paint, Surface.CABIN, taper=(0.2, 0.1), style=style)
+    b.box(V, (length / 2, 0, 0.85), (0.95, 1.05, 0.5), paint, Surface.BODY, style=style)
     for x in (-1.0 - length / 4, length / 2):
         for y in (-1, 1):
-            b.add(Kind.WHEEL, Surface.TYRE, V, (x, 0.95 * y, 0.45), (0.45, 0.14, 0.45), (0.03, 0.03, 0.03))
+            b.wheel(V, (x, 0.95 * y, 0.45), (0.45, 0.14, 0.45), (0.03, 0.03, 0.03), Surface.TYRE)
 
 
 def person(b: Builder, rng: Rng, label: Label = Label.PERSON, lean: float = 0.0, seat: float = 0.0) -> None:
@@ -159,7 +158,7 @@ def person(b: Builder, rng: Rng, label: Label = Label.PERSON, lean: float = 0.0,
     k, stride, style = rng.uniform(0.9, 1.08), rng.uniform(0.05, 0.22), rng.random(4)
 
     def limb(surface: Surface, x: float, y: float, z: float, half: tuple[float, float, float], colour: Numbers) -> None:
-        b.add(Kind.ELLIPSOID, surface, label, (x, y, seat + z * k), half, colour, style=style)
+        b.ellipsoid(label, (x, y, seat + z * k), half, colour, surface, style=style)
 
     for side in (-1, 1):
         limb(Surface.CLOTH, side * stride, side * 0.09, 0.42, (0.11, 0.09, 0.47 * k), trousers)
@@ -172,7 +171,7 @@ def cyclist(b: Builder, rng: Rng) -> None:
     """A rider on a bicycle."""
     C, paint = Label.CYCLIST, rng.uniform(0.05, 0.6, 3)
     for x in (-0.52, 0.52):
-        b.add(Kind.WHEEL, Surface.TYRE, C, (x, 0, 0.34), (0.34, 0.02, 0.34), (0.04, 0.04, 0.04))
-    b.add(Kind.BOX, Surface.PLAIN, C, (0, 0, 0.62), (0.42, 0.025, 0.04), paint)
-    b.add(Kind.BOX, Surface.PLAIN, C, (0.46, 0, 0.98), (0.03, 0.27, 0.02), (0.05, 0.05, 0.05))
+        b.wheel(C, (x, 0, 0.34), (0.34, 0.02, 0.34), (0.04, 0.04, 0.04), Surface.TYRE)
+    b.box(C, (0, 0, 0.62), (0.42, 0.025, 0.04), paint)
+    b.box(C, (0.46, 0, 0.98), (0.03, 0.27, 0.02), (0.05, 0.05, 0.05))
     person(b, rng, C, lean=0.22, seat=0.32)

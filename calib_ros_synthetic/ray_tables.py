@@ -6,12 +6,19 @@ whose HDL-64E is that of one unit; Hesai's user manuals of the Pandar40P and Pan
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from calib_ros_synthetic.solids import Floats
 
 # Elevations and azimuths in degrees, delays in microseconds after the firing of a column begins, by the maker's laser number.
 Table = tuple[Floats, Floats, Floats]
+
+
+def above_each_other(elevation: Floats) -> Callable[[], Table]:
+    """Lasers at elevations (n,) deg that fire together."""
+    return lambda: (elevation, np.zeros_like(elevation), np.zeros_like(elevation))
 
 
 def vlp16() -> Table:

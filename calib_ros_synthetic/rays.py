@@ -6,7 +6,7 @@ on the window of the grid that its bounding box covers, so that no step tests al
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import Any
@@ -21,15 +21,20 @@ from calib_ros_synthetic.solids import Kind, Solids, Surface, leaf_gap
 from calib_ros_synthetic.street import Street
 
 Float32 = NDArray[np.float32]
+Vectors = tuple[Float32, Float32, Float32]
 Ints = NDArray[np.int32]
 # What a ray meets that is no solid of the street; solids have their index from 0.
 SKY, ROAD, PAVEMENT, CURB, OWN = (-1, -2, -3, -4, -5)
+ZERO = np.zeros((1, 1), np.float32)
+ORIGIN = (ZERO, ZERO, ZERO)  # of rays that start where solids are relative to
 NEAREST = np.float32(0.05)  # ray parameter below which nothing is seen: the sensor's own housing
 TINY = 1e-20  # keeps a ray along an axis from dividing zero by zero
 LEAF_STEP, LEAF_STEPS = 0.2, 5  # m between the places where a ray looks for leaves, and their greatest number
 # Enum members are slow to look up and to compare with numpy's numbers.
 BOX, FRUSTUM, ELLIPSOID, CYLINDER, LEAF = (int(k) for k in (Kind.BOX, Kind.FRUSTUM, Kind.ELLIPSOID, Kind.CYLINDER, Surface.LEAF))
 Floats = NDArray[np.float64]
+# Sub-pixel rays, in pixels from the centre. Symmetric about it, so that averaging moves no edge.
+SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
 BLOCK_PIXELS = 1 << 20  # looked through the lens at a time: in double precision 12 Mpx would need gigabytes
 NEAR = 0.1  # m; solids are cut at this depth before they are projected
 SMALLEST = 0.3  # of a pixel or firing step: smaller solids are left out
@@ -42,8 +47,8 @@ class Rays:
     Distances along a ray are in units of its direction's length.
     """
 
-    origin: tuple[Float32, Float32, Float32]
-    direction: tuple[Float32, Float32, Float32]
+    origin: Vectors
+    direction: Vectors
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -51,7 +56,7 @@ class Rays:
         rows, columns = np.broadcast_shapes(*(a.shape for a in (*self.origin, *self.direction)))
         return rows, columns
 
-    def window(self, rows: slice, columns: slice) -> Rays:
+    def window(self, rows: slice, columns: slice | NDArray[np.intp]) -> Rays:
         """The rays of some rows and columns."""
 
         def cut(a: Float32) -> Float32:
@@ -59,15 +64,7 @@ class Rays:
 
         return Rays(tuple(map(cut, self.origin)), tuple(map(cut, self.direction)))  # type: ignore[arg-type]
 
-    def pick(self, columns: NDArray[np.intp]) -> Rays:
-        """The rays of some columns."""
-
-        def cut(a: Float32) -> Float32:
-            return a[:, columns] if a.shape[1] > 1 else a
-
-        return Rays(tuple(map(cut, self.origin)), tuple(map(cut, self.direction)))  # type: ignore[arg-type]
-
-    def at(self, t: Float32) -> tuple[Float32, Float32, Float32]:
+    def at(self, t: Float32) -> Vectors:
         """The points at distances t (rows, columns): x, y, z."""
         return tuple(o + t * d for o, d in zip(self.origin, self.direction, strict=True))  # type: ignore[return-value]
 
@@ -78,18 +75,39 @@ class Jobs:
     a lower bound of the distance to each solid; the nearest should come first, for what they hide is skipped."""
 
     window: Ints
-    nearest: NDArray[np.float64]
+    nearest: Floats
+
+    @classmethod
+    def whole(cls, count: int, shape: tuple[int, int]) -> Jobs:
+        """All of so many solids on all rays of a grid."""
+        window = np.zeros((count, 5), np.int32)
+        window[:, 0], window[:, 2], window[:, 4] = np.arange(count), *shape
+        return cls(window, np.zeros(count))
 
 
-def cast(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints) -> None:
-    """Lowers t (rows, columns) to the first hit of the solids and writes their indices to ids, in place."""
+Pierce = Callable[[int, Rays, Float32, NDArray[np.bool_]], None]
+
+
+def unmet(shape: tuple[int, ...]) -> tuple[Float32, Ints]:
+    """Distances and ids of rays that have met nothing."""
+    return np.full(shape, np.inf, np.float32), np.full(shape, SKY, np.int32)
+
+
+def cast(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints, pierce: Pierce | None = None) -> None:
+    """Lowers t (rows, columns) to the first hit of the solids and writes their indices to ids, in place.
+
+    pierce: clears the hits that lie in holes of a solid; given its index, rays, their distances to it, and the hits.
+    """
     for (i, r0, r1, c0, c1), nearest in zip(jobs.window.tolist(), jobs.nearest.tolist(), strict=True):
         rows, columns = slice(r0, r1), slice(c0, c1)
         old = t[rows, columns]
         if old.max() <= nearest:
             continue
-        new = intersect(solids, i, rays.window(rows, columns), old)
+        window = rays.window(rows, columns)
+        new = intersect(solids, i, window, old)
         hit = new < old
+        if pierce is not None:
+            pierce(i, window, new, hit)
         np.copyto(old, new, where=hit)
         np.copyto(ids[rows, columns], i, where=hit)
 
@@ -254,18 +272,20 @@ def _undistort(model: str) -> Any:
     return lambda uv, K, D, R, P, criteria: cv2.undistortPoints(uv, K, D, R=R, P=P, criteria=criteria)
 
 
-def _swept(M: Float32, origin: Float32, x: Float32, y: Float32, z: Float32 | None) -> Rays:
-    """Rays of directions (x, y, z) with an attitude M (..., 3, 3) and an origin (..., 3) of their own; z = 1 if it is None."""
-    directions = tuple(M[..., k, 0] * x + M[..., k, 1] * y + M[..., k, 2] * (1 if z is None else z) for k in range(3))
-    return Rays(tuple(origin[..., k] for k in range(3)), directions)  # type: ignore[arg-type]
+def turned(M: Float32, directions: Vectors) -> Vectors:
+    """Directions, x, y and z parts, of a camera with attitudes M (..., 3, 3) in the world."""
+    x, y, z = directions
+    return tuple(M[..., k, 0] * x + M[..., k, 1] * y + M[..., k, 2] * z for k in range(3))
 
 
-def towards(R: Floats, x: Float32, y: Float32, z: Float32 | None = None) -> tuple[Float32, Float32, Float32]:
-    """Directions (x, y, z), z = 1 if it is None, of the camera turned by R (3, 3) into the world: x, y and z parts."""
-    M = R.astype(np.float32)
-    if z is not None:
-        return tuple(M[k, 0] * x + M[k, 1] * y + M[k, 2] * z for k in range(3))
-    return (M[0, 0] * x + M[0, 1] * y + M[0, 2], M[1, 0] * x + M[1, 1] * y + M[1, 2], M[2, 0] * x + M[2, 1] * y + M[2, 2])
+def changes(key: NDArray[Any]) -> NDArray[np.bool_]:
+    """Pixels (H, W) with another key beside, above or below them."""
+    out = np.zeros(key.shape, bool)
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        differs = key[a] != key[b]
+        out[a] |= differs
+        out[b] |= differs
+    return out
 
 
 def nearest_first(window: Ints, nearest: Floats) -> Jobs:
@@ -299,15 +319,15 @@ def row_motion(T_world_camera: Floats, twist: Floats, readout: float, rows: int)
 class CameraView:
     """All pixels of a camera. Coordinates of solids and rays are world axes with the origin at the lens.
 
-    z: depth of the directions where it is not 1, see wide.py.
+    x, y, z: directions (H, W); z is 1 but in wide.py.
     """
-
-    z: Float32 | None = None
 
     def __init__(self, camera: Camera) -> None:
         self.x, self.y, self.seen = pixel_directions(camera)
         # Change of the direction per pixel down (0) and to the right (1), for rays between the pixels' centres.
-        self.dx, self.dy, self.dz = np.gradient(self.x), np.gradient(self.y), np.gradient(np.ones((2, 2), np.float32))
+        self.dx, self.dy = np.gradient(self.x), np.gradient(self.y)
+        self.z: Float32 = np.broadcast_to(np.float32(1), self.x.shape)
+        self.dz: Any = (np.broadcast_to(np.float32(0), self.x.shape),) * 2
         self.K = camera.K
         self._columns = self._limits(self.x, 0)
         self._rows = self._limits(self.y, 1)
@@ -321,26 +341,24 @@ class CameraView:
 
     def rays(self, R_world_camera: Floats, motion: RowMotion | None = None) -> Rays:
         """The rays with their depth as distance: directions have z = 1 in the camera. motion: instead of one attitude."""
-        if motion is not None:
-            return _swept(motion.R[:, None], motion.origin[:, None], self.x, self.y, self.z)
-        zero = np.zeros((1, 1), np.float32)
-        return Rays((zero, zero, zero), towards(R_world_camera, self.x, self.y, self.z))
+        return self._rays(R_world_camera, motion, np.s_[:, None], (self.x, self.y, self.z))
+
+    def _rays(self, R: Floats, motion: RowMotion | None, rows: Any, directions: Vectors) -> Rays:
+        if motion is None:
+            return Rays(ORIGIN, turned(R.astype(np.float32), directions))
+        x, y, z = (motion.origin[rows][..., k] for k in range(3))
+        return Rays((x, y, z), turned(motion.R[rows], directions))
 
     def between(self, pixels: NDArray[np.intp], samples: Floats, R_world_camera: Floats, motion: RowMotion | None = None) -> Rays:
         """Rays (s, n) through flat pixels (n,) at s offsets (down, right) in pixels from their centres, samples (s, 2)."""
         at = np.divmod(pixels, self.x.shape[1])
         x, y, z = (
-            None if a is None else np.stack([a[at] + u * step[1][at] + v * step[0][at] for u, v in samples]).astype(np.float32)
+            np.stack([a[at] + u * step[1][at] + v * step[0][at] for u, v in samples]).astype(np.float32)
             for a, step in ((self.x, self.dx), (self.y, self.dy), (self.z, self.dz))
         )
-        assert x is not None
-        assert y is not None
-        if motion is not None:
-            return _swept(motion.R[at[0]][None], motion.origin[at[0]][None], x, y, z)
-        zero = np.zeros((1, 1), np.float32)
-        return Rays((zero, zero, zero), towards(R_world_camera, x, y, z))
+        return self._rays(R_world_camera, motion, at[0][None], (x, y, z))
 
-    def pixels(self, points: tuple[Float32, Float32, Float32]) -> Float32:
+    def pixels(self, points: Vectors) -> Float32:
         """Where points (x, y, z parts of any shape) in the camera's frame are in the picture, for blur: the lens taken as a
         pinhole -> (..., 2) px."""
         x, y, z = points

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum, auto
+from enum import Enum
 from functools import cached_property
 
 import numpy as np
@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros_synthetic import ray_tables as tables
-from calib_ros_synthetic.lidar import directions
 from calib_ros_synthetic.rays import Jobs
 from calib_ros_synthetic.solids import Float32, Floats, Solids
 from calib_ros_synthetic.windows import grid_windows, row_windows
 
-RATE = 10.0  # Hz; what the data sheets call usual
+RATE, PERIOD = 10.0, 0.1  # Hz and s of a turn; what the data sheets call usual
 MICROSECOND = 1e-6
 TEN_PERCENT = 0.1  # reflectivity that reach is stated for
 
@@ -29,16 +28,13 @@ TEN_PERCENT = 0.1  # reflectivity that reach is stated for
 class Rings(Enum):
     """How a driver numbers the rings."""
 
-    FROM_TOP = auto()
-    FROM_BOTTOM = auto()
-    NONE = auto()
+    FROM_TOP, FROM_BOTTOM, NONE = range(3)
 
 
 class Order(Enum):
-    """How a driver stores the points of a scan."""
+    """How a driver stores the points of a scan: as they were measured, or ring by ring, each in the order of time."""
 
-    FIRING = auto()  # as they were measured
-    ROWS = auto()  # ring by ring, each in the order of time
+    FIRING, ROWS = range(2)
 
 
 @dataclass(frozen=True)
@@ -58,6 +54,11 @@ class ScannerModel:
     reach: float
     rings: Rings
     order: Order
+
+    @property
+    def weakest(self) -> float:
+        """Reflectivity / m^2 of the weakest return that is noticed."""
+        return TEN_PERCENT / self.reach**2
 
 
 MODELS = {
@@ -84,21 +85,6 @@ class SpinningScanner:
     model: ScannerModel
     rate: float = RATE
     number: int = 0
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the range, m."""
-        return self.model.noise
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Shortest and longest range, m."""
-        return self.model.near, self.model.far
-
-    @property
-    def weakest(self) -> float:
-        """Reflectivity / m^2 of the weakest return that is noticed."""
-        return TEN_PERCENT / self.model.reach**2
 
     @property
     def firings(self) -> int:
@@ -149,7 +135,8 @@ class SpinningScanner:
 
     def describe(self) -> str:
         """For people."""
-        return f"{self.model.name}, {len(self._table[0])} rings, {self.firings} firings per turn of {1 / self.rate:g} s"
+        name = f"{self.model.name}, " if self.model.name else ""
+        return f"{name}{len(self._table[0])} rings, {self.firings} firings per turn of {1 / self.rate:g} s"
 
 
 # Of the Mid-360's head about the vertical and of its mirror, per second; no common period within a drive. Livox does not publish
@@ -163,22 +150,22 @@ LASERS, STEP_AZIMUTH, STEP_ELEVATION = 4, np.deg2rad(0.9), np.deg2rad(0.5)  # fi
 class RosetteScanner(SpinningScanner):
     """A scanner without rings, all around, whose pattern never repeats. number: of the scan."""
 
-    @property
-    def firings(self) -> int:
-        """Points per scan."""
-        return round(self.model.firings * RATE / self.rate)
+    def pattern(self, times: Floats) -> tuple[Floats, Floats]:
+        """Azimuth and elevation (n,) rad of the points at times (n,) s since the scanner was switched on."""
+        laser = np.arange(self.firings) % LASERS - (LASERS - 1) / 2
+        middle, reach = FIELD.mean(), np.ptp(FIELD) / 2 - STEP_ELEVATION * (LASERS - 1) / 2
+        elevation = middle + laser * STEP_ELEVATION + reach * np.sin(2 * np.pi * MIRROR * times)
+        return np.mod(2 * np.pi * HEAD * times + laser * STEP_AZIMUTH, 2 * np.pi) - np.pi, elevation
 
     def beams(self) -> tuple[Float32, Floats]:
         """(3, 1, points) unit vectors in the LiDAR frame by azimuth, and the time of each (1, points), s."""
         n, period = self.firings, 1 / self.rate
         time = ((np.arange(n) + 0.5) / n - 0.5) * period
-        since = time + (self.number + 0.5) * period
-        laser = np.arange(n) % LASERS - (LASERS - 1) / 2
-        middle, reach = FIELD.mean(), np.ptp(FIELD) / 2 - STEP_ELEVATION * (LASERS - 1) / 2
-        elevation = middle + laser * STEP_ELEVATION + reach * np.sin(2 * np.pi * MIRROR * since)
-        azimuth = np.mod(2 * np.pi * HEAD * since + laser * STEP_AZIMUTH, 2 * np.pi) - np.pi
+        azimuth, elevation = self.pattern(time + (self.number + 0.5) * period)
         order = np.argsort(azimuth, kind="stable")
-        return directions(azimuth[order], elevation[order]), time[None, order]
+        a, e = azimuth[order], elevation[order]
+        c = np.cos(e)
+        return np.stack([c * np.cos(a), c * np.sin(a), np.sin(e)])[:, None].astype(np.float32), time[None, order]
 
     def order(self, time: Floats) -> NDArray[np.intp]:
         """The columns in the order in which they were measured."""
@@ -196,6 +183,82 @@ class RosetteScanner(SpinningScanner):
     def describe(self) -> str:
         """For people."""
         return f"{self.model.name}, no rings, {self.firings} points per scan of {1 / self.rate:g} s, all around"
+
+
+# The plain drive's, by rings from the top, after the OS1-128, HDL-64E, HDL-32E and VLP-16; 0: without any, by two prisms.
+PLAIN: dict[int, ScannerModel] = {
+    rings: ScannerModel("", table, firings, 0.02, 0.9, 100.0, 91.28709291752769, Rings.FROM_TOP, Order.ROWS)
+    for rings, table, firings in (
+        (128, tables.above_each_other(np.linspace(22.5, -22.5, 128)), 1024),
+        (64, tables.above_each_other(np.r_[np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.8, 32)]), 2083),
+        (32, tables.above_each_other(np.linspace(10.0, -30.0, 32)), 2170),
+        (16, tables.above_each_other(np.linspace(15.0, -15.0, 16)), 1800),
+        (0, None, 24_000),
+    )
+}
+PRISMS = 121.567, -77.731  # turns per second; no common period within a drive
+PRISM_FIELD = float(np.deg2rad(80.0))  # diameter of their field of view, rad
+
+
+def _by_footprint(window: NDArray[np.int32], solids: Solids, shift: float) -> Jobs:
+    """Of two surfaces at the same distance, that of the solid whose footprint is nearer is met first."""
+    c, s, (x, y, _) = np.cos(solids.yaw), np.sin(solids.yaw), solids.centre.T
+    beside = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x])) - solids.half[:, :2].T, 0)
+    near = np.maximum(np.hypot(*beside) - shift, 0.1)[window[:, 0]]
+    order = np.lexsort((window[:, 0], near))
+    return Jobs(window[order], near[order])
+
+
+@dataclass(frozen=True, eq=False)
+class PlainScanner(SpinningScanner):
+    """Lasers above each other that fire together, in a head that is nearly upright; stored as in KITTI's files.
+
+    A column's azimuth is -2 pi time / PERIOD.
+    """
+
+    def beams(self) -> tuple[Float32, Floats]:
+        """(3, rings, firings) unit vectors in the LiDAR frame, columns by azimuth, and the time of each column (firings,) s."""
+        e, a = self._table[0][:, None], self._head[None]
+        vectors = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e) + 0 * a])
+        return vectors.astype(np.float32), -self._head * (PERIOD / (2 * np.pi))
+
+    def order(self, time: Floats) -> NDArray[np.intp]:
+        """The columns with azimuth from 0 to 2 pi."""
+        return np.roll(np.arange(len(time)), -int(np.searchsorted(self._head, 0.0)))
+
+    def jobs(self, solids: Solids, beams: Float32, pose: Floats, shift: float, turn: float) -> Jobs:
+        """Windows for `cast`, of solids that are not too thin."""
+        level = se3.rotation_from_euler(float(np.arctan2(pose[1, 0], pose[0, 0])), 0.0, 0.0)
+        tilt = float(np.arccos(np.clip(pose[2, 2], -1, 1)))
+        # A tilt of the head also turns its azimuth a little where beams are steep.
+        corners = solids.corners() @ level
+        window = grid_windows(corners, self._table[0], self.firings, shift, turn + 1.5 * tilt, 0.0, no_thin=True).window
+        return _by_footprint(window, solids, shift)
+
+
+@dataclass(frozen=True, eq=False)
+class PrismScanner(RosetteScanner):
+    """The plain scanner without rings: two prisms draw a rosette ahead."""
+
+    def pattern(self, times: Floats) -> tuple[Floats, Floats]:
+        """As of any rosette."""
+        first, second = (2 * np.pi * turns * times for turns in PRISMS)
+        reach = PRISM_FIELD / 4  # each prism bends the beam by this angle
+        return reach * (np.cos(first) + np.cos(second)), reach * (np.sin(first) + np.sin(second))
+
+    def jobs(self, solids: Solids, beams: Float32, pose: Floats, shift: float, turn: float) -> Jobs:
+        """As of any rosette, in the order of the plain scanners."""
+        return _by_footprint(RosetteScanner.jobs(self, solids, beams, pose, shift, turn).window, solids, shift)
+
+    def describe(self) -> str:
+        """For people."""
+        n, field = self.firings, np.rad2deg(PRISM_FIELD)
+        return f"no rings, {n} points per scan of {PERIOD:g} s in a rosette {field:g} deg wide"
+
+
+def plain_scanner(rings: int) -> SpinningScanner:
+    """The plain drive's scanner with a number of rings in PLAIN."""
+    return (PlainScanner if rings else PrismScanner)(PLAIN[rings])
 
 
 def scanner(name: str, rate: float = RATE) -> SpinningScanner:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from functools import lru_cache
+from functools import lru_cache, partialmethod
 from math import cos, sin
 
 import cv2
@@ -27,33 +27,19 @@ MAX_ROW = 1024  # OpenCV refuses to remap very long rows
 
 
 class Kind(IntEnum):
-    """Shapes inside the unit cube, scaled by the half sizes of a solid."""
+    """Shapes inside the unit cube, scaled by the half sizes of a solid.
 
-    BOX = 0
-    FRUSTUM = 1  # a box whose sides lean inwards by `taper` (share of the half size lost at the top)
-    ELLIPSOID = 2
-    CYLINDER = 3  # axis up
-    WHEEL = 4  # axis to the left
+    FRUSTUM: a box whose sides lean inwards by `taper` (share of the half size lost at the top). The axis of a CYLINDER points up,
+    that of a WHEEL to the left.
+    """
+
+    BOX, FRUSTUM, ELLIPSOID, CYLINDER, WHEEL = range(5)
 
 
 class Surface(IntEnum):
-    """What covers a solid; decides its materials, see surfaces.py."""
+    """What covers a solid; decides its materials, see surfaces.py. CEILING throws no shadow: the lamps hang below it."""
 
-    PLAIN = 0
-    FACADE = 1
-    ROOF = 2
-    BODY = 3
-    CABIN = 4
-    TYRE = 5
-    BARK = 6
-    LEAF = 7
-    CLOTH = 8
-    SKIN = 9
-    SIGN = 10
-    FENCE = 11
-    POSTER = 12
-    METAL = 13
-    CEILING = 14  # throws no shadow: the lamps hang below it
+    PLAIN, FACADE, ROOF, BODY, CABIN, TYRE, BARK, LEAF, CLOTH, SKIN, SIGN, FENCE, POSTER, METAL, CEILING = range(15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +94,11 @@ class Builder:
     def add(
         self,
         kind: Kind,
-        surface: Surface,
         label: Label,
         centre: Numbers,
         half: Numbers,
         colour: Numbers,
+        surface: Surface = Surface.PLAIN,
         *,
         taper: Numbers = (0.0, 0.0),
         style: Numbers = (0.0, 0.0, 0.0, 0.0),
@@ -123,6 +109,9 @@ class Builder:
         c, s, (x, y, z) = cos(self._yaw), sin(self._yaw), centre
         where = (self._origin[0] + c * x - s * y, self._origin[1] + s * x + c * y, self._origin[2] + z)
         self._rows.append((kind, surface, label, where, tuple(half), self._yaw, tuple(taper), tuple(colour), tuple(style)))
+
+    box, frustum, ellipsoid = partialmethod(add, Kind.BOX), partialmethod(add, Kind.FRUSTUM), partialmethod(add, Kind.ELLIPSOID)
+    cylinder, wheel = partialmethod(add, Kind.CYLINDER), partialmethod(add, Kind.WHEEL)
 
     def solids(self) -> Solids:
         """Everything added so far."""

@@ -6,7 +6,6 @@ Blocks do not depend on each other, so that the street has no end.
 from __future__ import annotations
 
 from collections import OrderedDict
-from enum import Enum, auto
 from typing import ClassVar
 
 import numpy as np
@@ -28,28 +27,17 @@ VIEW_BEHIND, VIEW_AHEAD = 110.0, 150.0  # m of street that the sensors may see
 CACHED_BLOCKS = 32
 
 
-class Ground(Enum):
-    """What the ground is painted as, see grounds.py."""
-
-    STREET = auto()
-    COUNTRY = auto()
-    PATH = auto()
-    PARKING = auto()
-    HALL = auto()
-    HIGHWAY = auto()
-
-
 class Street:
     """What stands where. `road`: half width of the road; `pavement`: width of each pavement; metres.
 
-    Other scenes (scenes.py) are streets with other furniture. kerb: m that all beyond the road lies above it. bend: factor on the
-    bends of the centre line. view: m of it behind and ahead that sensors may see. cruise: usual speed, m/s. indoors: lamps at the
-    ceiling instead of sun and sky.
+    Other scenes are streets with other furniture. ground: a name in grounds.PAINTERS. kerb: m that all beyond the road lies above
+    it. bend: factor on the bends of the centre line. view: m of it behind and ahead that sensors may see. cruise: usual speed,
+    m/s. indoors: lamps at the ceiling instead of sun and sky.
 
     empty: stations (from, to) in metres between which nothing stands; the rest of the street is the same as without it.
     """
 
-    ground: ClassVar[Ground] = Ground.STREET
+    ground: ClassVar[str] = "street"
     kerb: ClassVar[float] = KERB
     bend: ClassVar[float] = 1.0
     view: ClassVar[tuple[float, float]] = (VIEW_BEHIND, VIEW_AHEAD)
@@ -72,6 +60,10 @@ class Street:
         c = np.cos(elevation)
         self.sun: NDArray[np.float64] = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
         self._blocks: OrderedDict[int, Solids] = OrderedDict()
+        self._lay_out(np.random.default_rng([seed, 8]))
+
+    def _lay_out(self, rng: Rng) -> None:
+        """What other scenes make otherwise."""
 
     def around(self, s: float) -> Solids:
         """All solids in `view` of station s, by whole blocks."""
@@ -100,10 +92,13 @@ class Street:
             self._furniture(b, rng, start, side)
         self._crowd(b, rng, start)
 
-    def _at(self, b: Builder, s: float, d: float, turn: float = 0.0, z: float = KERB) -> None:
+    def _at(self, b: Builder, s: float, d: float, turn: float = 0.0, z: float | None = None) -> Builder:
+        """The Builder, with its frame at a station and an offset; z: m, beside the road's level the kerb's."""
         x, y, heading = self.path.place(s, d)
         # What is left out is made all the same: the numbers it draws belong to what comes after it.
-        b.at(x, y, heading + turn, z, hidden=self.empty is not None and self.empty[0] <= s <= self.empty[1])
+        hidden = self.empty is not None and self.empty[0] <= s <= self.empty[1]
+        b.at(x, y, heading + turn, self.kerb if z is None else z, hidden=hidden)
+        return b
 
     def _houses(self, b: Builder, rng: np.random.Generator, start: float, side: int) -> None:
         front = self.road + self.pavement
@@ -119,14 +114,12 @@ class Street:
                 self._at(b, middle, side * (front + setback + depth / 2), turn)
                 objects.house(b, rng, length - rng.choice([0.0, 0.4, 2.5]), depth, height)
             else:  # a garden; a row of houses behind closes the view
-                self._at(b, middle, side * (front + rng.uniform(22, 40)), turn)
-                objects.house(b, rng, length + 6, depth, height + 1)
+                objects.house(self._at(b, middle, side * (front + rng.uniform(22, 40)), turn), rng, length + 6, depth, height + 1)
                 for _ in range(rng.integers(1, 4)):
                     self._at(b, s + rng.uniform(0, length), side * (front + rng.uniform(2.5, 14)))
                     (objects.tree if rng.random() < 0.5 else objects.bush)(b, rng)
             if setback > 1.2 and rng.random() < 0.7:
-                self._at(b, middle, side * (front + 0.3))
-                objects.border(b, rng, length - rng.uniform(1, 4))
+                objects.border(self._at(b, middle, side * (front + 0.3)), rng, length - rng.uniform(1, 4))
             s += length + rng.choice([0.0, 0.0, 1.2, 3.5])
 
     def _parked(self, b: Builder, rng: np.random.Generator, start: float, side: int) -> None:
@@ -147,15 +140,13 @@ class Street:
             choice = rng.random()
             self._at(b, s, side * (self.road + rng.uniform(0.35, 0.6)), inward)
             if choice < self._trees * 0.6:
-                self._at(b, s, side * (self.road + rng.uniform(0.7, 0.9)))
-                objects.tree(b, rng)
+                objects.tree(self._at(b, s, side * (self.road + rng.uniform(0.7, 0.9))), rng)
             elif choice < self._trees * 0.6 + 0.25:
                 objects.pole(b, rng)
             elif choice < self._trees * 0.6 + 0.40:
                 objects.sign(b, rng)
             elif choice < self._trees * 0.6 + 0.55:
-                self._at(b, s, side * (self.road + self.pavement - 0.3), rng.uniform(-0.1, 0.1))
-                objects.bin_or_box(b, rng)
+                objects.bin_or_box(self._at(b, s, side * (self.road + self.pavement - 0.3), rng.uniform(-0.1, 0.1)), rng)
             elif choice < self._trees * 0.6 + 0.62:
                 self._at(b, s, side * (self.road + self.pavement - 0.1), rng.uniform(-0.4, 0.4) + np.pi / 2)
                 objects.billboard(b, rng)
@@ -172,8 +163,7 @@ class Street:
             self._at(b, start + rng.uniform(0, BLOCK), rng.uniform(1.0, self.road - 2.6), rng.uniform(0, 2 * np.pi), z=0.0)
             objects.person(b, rng)
         if rng.random() < 0.5:
-            self._at(b, start + rng.uniform(0, BLOCK), self.road - 2.5, np.pi, z=0.0)
-            objects.cyclist(b, rng)
+            objects.cyclist(self._at(b, start + rng.uniform(0, BLOCK), self.road - 2.5, np.pi, z=0.0), rng)
 
 
 class Path:

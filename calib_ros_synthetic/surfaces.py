@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros_synthetic.grounds import ground_parts
+from calib_ros_synthetic import grounds
 from calib_ros_synthetic.materials import ALBEDO, CONTRAST, GLOSS, GRAIN, OWN_COLOUR, Part
-from calib_ros_synthetic.rays import CURB, ROAD
+from calib_ros_synthetic.rays import CURB, ROAD, Ints
 from calib_ros_synthetic.solids import Float32, Floats, Kind, Solids, Surface, cell, noise2
 from calib_ros_synthetic.street import Street
 
@@ -54,7 +54,7 @@ class Spots:
     v: Float32
 
 
-def spots(street: Street | None, solids: Solids, ids: NDArray[np.int32], xyz: Float32, origin: Floats) -> Spots:
+def spots(street: Street | None, solids: Solids, ids: Ints, xyz: Float32, origin: Floats) -> Spots:
     """Materials of hits: ids (n,) as `cast` writes them, xyz (3, n) relative to origin (3,) in the world."""
     n = len(ids)
     out = Spots(np.zeros(n, np.uint8), np.zeros((3, n), np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32))
@@ -63,7 +63,7 @@ def spots(street: Street | None, solids: Solids, ids: NDArray[np.int32], xyz: Fl
     if street is not None and len(ground):
         s, d = street.path.frenet(xyz[0, ground], xyz[1, ground], origin)
         out.u[ground], out.v[ground] = s, d
-        out.part[ground] = ground_parts(street, ids[ground], s, d)
+        out.part[ground] = grounds.PAINTERS[street.ground](street, ids[ground], s, d)
         curb = ground[ids[ground] == CURB]
         heading = street.path.station(out.u[curb])[2]
         towards_road = -np.sign(out.v[curb])
@@ -74,16 +74,18 @@ def spots(street: Street | None, solids: Solids, ids: NDArray[np.int32], xyz: Fl
     return out
 
 
-def _bodies(solids: Solids, ids: NDArray[np.int32], xyz: Float32, out: Spots, where: NDArray[np.intp]) -> None:
-    def of(values: NDArray[np.float64]) -> Float32:
-        return np.asarray(values.astype(np.float32).take(ids))
+def _of(values: Floats, ids: Ints) -> Float32:
+    return np.asarray(values.astype(np.float32).take(ids))
 
-    c, s = of(np.cos(solids.yaw)), of(np.sin(solids.yaw))
-    x, y, z = (xyz[k] - of(solids.centre[:, k]) for k in range(3))
-    half = [of(solids.half[:, k]) for k in range(3)]
-    q = np.stack([(c * x + s * y) / half[0], (c * y - s * x) / half[1], z / half[2]])  # -1..1 in the solid's own axes
+
+def faces(solids: Solids, ids: Ints, q: Float32) -> tuple[Bytes, list[Float32], Float32, Float32]:
+    """Axis of the face (n,), normal (three (n,), of any length), u and v (n,) m of places q (3, n), -1..1, on solids ids (n,).
+
+    Axes and normals are the solids' own.
+    """
+    half = [_of(solids.half[:, k], ids) for k in range(3)]
     # The sides of a frustum lean; a box is a frustum that does not.
-    slope = [of(solids.taper[:, k] / 2) for k in (0, 1)]
+    slope = [_of(solids.taper[:, k] / 2, ids) for k in (0, 1)]
     side = [np.abs(q[k]) + slope[k] * (q[2] + 1) for k in (0, 1)]
     top = np.abs(q[2])
     across = (side[0] >= side[1]) & (side[0] >= top)
@@ -104,12 +106,21 @@ def _bodies(solids: Solids, ids: NDArray[np.int32], xyz: Float32, out: Spots, wh
     for k in range(3):
         normal[k][curved] = bent[k]
         normal[k] /= half[k]
+    u = np.where(across, q[1] * half[1], q[0] * half[0])
+    v = np.where(face == 2, q[1] * half[1], (q[2] + 1) * half[2])
+    return face, normal, u, v
+
+
+def _bodies(solids: Solids, ids: Ints, xyz: Float32, out: Spots, where: NDArray[np.intp]) -> None:
+    c, s = _of(np.cos(solids.yaw), ids), _of(np.sin(solids.yaw), ids)
+    x, y, z = (xyz[k] - _of(solids.centre[:, k], ids) for k in range(3))
+    half = [_of(solids.half[:, k], ids) for k in range(3)]
+    q = np.stack([(c * x + s * y) / half[0], (c * y - s * x) / half[1], z / half[2]])
+    face, normal, u, v = faces(solids, ids, q)
     scale = 1 / np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     out.normal[0, where] = (c * normal[0] - s * normal[1]) * scale
     out.normal[1, where] = (s * normal[0] + c * normal[1]) * scale
     out.normal[2, where] = normal[2] * scale
-    u = np.where(across, q[1] * half[1], q[0] * half[0])
-    v = np.where(face == 2, q[1] * half[1], (q[2] + 1) * half[2])
     out.u[where], out.v[where] = u, v
     surface = solids.surface[ids]
     part = np.zeros(len(ids), np.uint8)
@@ -196,25 +207,14 @@ def _fence(a: Place) -> Bytes:
     return np.where((a.u % 0.16 < 0.03) & (a.q[2] < 0.8), Part.RUBBER, Part.SLAT).astype(np.uint8)
 
 
-PLAIN_PARTS = {
-    int(Surface.PLAIN): Part.PLAIN,
-    int(Surface.ROOF): Part.TILES,
-    int(Surface.BARK): Part.BARK,
-    int(Surface.LEAF): Part.LEAF,
-    int(Surface.CLOTH): Part.CLOTH,
-    int(Surface.METAL): Part.METAL,
-    int(Surface.CEILING): Part.PLAIN,
-}
+PLAIN_PARTS: dict[int, Part] = {
+    Surface.PLAIN: Part.PLAIN, Surface.ROOF: Part.TILES, Surface.BARK: Part.BARK, Surface.LEAF: Part.LEAF,
+    Surface.CLOTH: Part.CLOTH, Surface.METAL: Part.METAL, Surface.CEILING: Part.PLAIN,
+}  # fmt: skip
 PAINTERS: dict[int, Callable[[Place], Bytes]] = {
-    int(Surface.FACADE): _facade,
-    int(Surface.BODY): _body,
-    int(Surface.CABIN): _cabin,
-    int(Surface.TYRE): _wheel,
-    int(Surface.SKIN): _skin,
-    int(Surface.SIGN): _sign,
-    int(Surface.FENCE): _fence,
-    int(Surface.POSTER): _poster,
-}
+    Surface.FACADE: _facade, Surface.BODY: _body, Surface.CABIN: _cabin, Surface.TYRE: _wheel,
+    Surface.SKIN: _skin, Surface.SIGN: _sign, Surface.FENCE: _fence, Surface.POSTER: _poster,
+}  # fmt: skip
 
 
 def display(linear: Float32) -> Float32:
@@ -222,7 +222,7 @@ def display(linear: Float32) -> Float32:
     return np.asarray(np.sqrt(np.clip(linear, 0, 1)) * np.float32(255))
 
 
-def sky(direction: Float32, seed: int, lighting: Lighting = DAY) -> Float32:
+def sky(direction: Float32, seed: int, lighting: Lighting) -> Float32:
     """Light (3, n) from the directions (3, n) of any length: gradient, clouds, and woods at the horizon."""
     x, y, z = direction / np.sqrt((direction * direction).sum(axis=0))
     up = np.clip(z, 0, 1)
@@ -242,15 +242,7 @@ def sky(direction: Float32, seed: int, lighting: Lighting = DAY) -> Float32:
 
 
 def light(
-    solids: Solids,
-    ids: NDArray[np.int32],
-    xyz: Float32,
-    here: Spots,
-    lit: Float32,
-    sun: Floats,
-    seed: int,
-    lighting: Lighting = DAY,
-    forward: Floats | None = None,
+    solids: Solids, ids: Ints, xyz: Float32, here: Spots, lit: Float32, sun: Floats, lighting: Lighting, forward: Floats | None
 ) -> Float32:
     """Light (3, n) that reaches the lens from hits at xyz (3, n) relative to the lens. lit: (n,) share of the sun seen.
 

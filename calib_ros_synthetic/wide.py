@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib_ros.camera import Camera
-from calib_ros_synthetic.rays import SMALLEST, CameraView, Jobs, RowMotion, nearest_first
+from calib_ros_synthetic.rays import SMALLEST, CameraView, Jobs, RowMotion, Vectors, nearest_first
 from calib_ros_synthetic.solids import Float32, Floats, Solids
 
 STEPS = 8  # parts of each edge of a solid's box whose ends are projected
@@ -32,7 +32,7 @@ class WideView(CameraView):
         self.seen = angle <= self._field
         scale = np.sin(angle) / np.maximum(radius, 1e-12)
         self.x, self.y = (mx * scale).astype(np.float32), (my * scale).astype(np.float32)
-        self.z: Float32 = np.cos(angle).astype(np.float32)
+        self.z = np.cos(angle).astype(np.float32)
         self.dx, self.dy, self.dz = np.gradient(self.x), np.gradient(self.y), np.gradient(self.z)
 
     def _radius(self, angle: Floats) -> Floats:
@@ -48,7 +48,7 @@ class WideView(CameraView):
         scale = self._radius(angle) / np.maximum(flat, 1e-12)
         return self.K[0, 0] * x * scale + self.K[0, 2], self.K[1, 1] * y * scale + self.K[1, 2], angle
 
-    def pixels(self, points: tuple[Float32, Float32, Float32]) -> Float32:
+    def pixels(self, points: Vectors) -> Float32:
         """Where points (x, y, z parts of any shape) in the camera's frame are in the picture -> (..., 2) px."""
         u, v, _ = self._image(*(a.astype(float) for a in points))
         return np.stack([u, v], axis=-1).astype(np.float32)

@@ -1,7 +1,6 @@
 """Which rays of a scanner can meet a solid: windows of its grid of rings x firings, or of its one row of rays.
 
-`grid_windows` and `row_windows` bound a solid by the corners of its box in the scanner's own frame, whatever its attitude;
-`lidar_jobs` bounds it in world axes, for one that is nearly upright. Windows are never too small; slack only costs time.
+A solid is bounded by the corners of its box in the scanner's frame. Windows are never too small; slack only costs time.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros_synthetic.rays import SMALLEST, Jobs, nearest_first
-from calib_ros_synthetic.solids import Floats, Solids
+from calib_ros_synthetic.solids import Floats
 
 CLOSE = 0.5  # m from the vertical axis; nearer solids are tried all around
 _ANGLES = np.arange(32) * (2 * np.pi / 32)
@@ -22,13 +21,14 @@ SIDES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # directions in which the 
 @dataclass(frozen=True, eq=False)
 class Bounds:
     """n solids seen from a scanner: azimuth of their middle, its lowest and highest value relative to that, lowest and highest
-    elevation (rad), each (n,), and a lower bound of their distance (n,), m."""
+    elevation, the width in azimuth at time 0 (rad), each (n,), and a lower bound of their distance (n,), m."""
 
     middle: Floats
     left: Floats
     right: Floats
     low: Floats
     high: Floats
+    width: Floats
     near: Floats
 
 
@@ -53,15 +53,18 @@ def bounds(corners: Floats, shift: float, turn: float) -> Bounds:
     steep = np.tan(np.minimum(np.maximum(np.abs(high), np.abs(low)), 1.4))
     side = np.arcsin(np.minimum(shift / near, 1)) + turn * (1 + steep)
     around = clear < CLOSE
-    left = np.where(around, -np.pi, spread.min(axis=1) - side)
-    right = np.where(around, np.pi, spread.max(axis=1) + side)
-    return Bounds(middle, left, right, low, high, near)
+    first, last = spread.min(axis=1), spread.max(axis=1)
+    left, right = np.where(around, -np.pi, first - side), np.where(around, np.pi, last + side)
+    return Bounds(middle, left, right, low, high, np.where(around, 2 * np.pi, last - first), near)
 
 
-def grid_windows(corners: Floats, elevation: Floats, firings: int, shift: float, turn: float, stagger: float) -> Jobs:
+def grid_windows(
+    corners: Floats, elevation: Floats, firings: int, shift: float, turn: float, stagger: float, *, no_thin: bool = False
+) -> Jobs:
     """Windows for `cast` in a grid of rings (elevations falling) x firings, whose azimuth rises evenly from -pi to pi.
 
-    corners: (n, 8, 3) in the scanner's frame. stagger: rad that a laser's azimuth may be from that of its column.
+    corners: (n, 8, 3) in the scanner's frame. stagger: rad that a laser's azimuth may be from that of its column. no_thin: what
+    is too thin is left out however far the scanner moves.
     """
     b = bounds(corners, shift, turn)
     step = 2 * np.pi / firings
@@ -70,7 +73,7 @@ def grid_windows(corners: Floats, elevation: Floats, firings: int, shift: float,
     start = b.middle + np.pi
     c0 = np.floor((start + b.left - stagger) / step).astype(int)
     c1 = np.minimum(np.ceil((start + b.right + stagger) / step).astype(int) + 1, c0 + firings)
-    keep = np.flatnonzero((r1 > r0) & (b.right - b.left > SMALLEST * step))
+    keep = np.flatnonzero((r1 > r0) & ((b.width if no_thin else b.right - b.left) > SMALLEST * step))
     windows = [np.zeros((0, 5), np.int64)]
     for k in (-firings, 0, firings):  # a window that leaves the grid on one side comes in again on the other
         first, past = np.maximum(c0[keep] + k, 0), np.minimum(c1[keep] + k, firings)
@@ -95,45 +98,3 @@ def row_windows(corners: Floats, azimuth: Floats, shift: float, turn: float) -> 
 def _jobs(window: NDArray[np.int64], b: Bounds) -> Jobs:
     window32 = window.astype(np.int32)
     return nearest_first(window32, b.near[window32[:, 0]])
-
-
-def lidar_jobs(solids: Solids, elevation: Floats, firings: int, yaw: float, margin: tuple[float, float, float]) -> Jobs:
-    """Windows for `cast` in a grid of rings (from the top) x firings, whose azimuth rises from -pi to pi.
-
-    Solids are in world axes with the origin at the scanner. elevation: (rings,) rad. yaw: of the scanner in rad.
-    margin: how far the scanner's origin (m), its azimuth (rad) and its elevation (rad) may be from that in the scan.
-    """
-    shift, turn, tilt = margin
-    corners = solids.corners()
-    azimuth = np.arctan2(corners[..., 1], corners[..., 0])
-    centre = np.arctan2(solids.centre[:, 1], solids.centre[:, 0])
-    spread = np.mod(azimuth - centre[:, None] + np.pi, 2 * np.pi) - np.pi
-    # The scanner in the frame of the solid tells the distance to its footprint.
-    c, s = np.cos(solids.yaw), np.sin(solids.yaw)
-    x, y = solids.centre[:, 0], solids.centre[:, 1]
-    beside = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x])) - solids.half[:, :2].T, 0)
-    near = np.maximum(np.hypot(*beside) - shift, 0.1)
-    far = np.hypot(corners[..., 0], corners[..., 1]).max(axis=1) + shift
-    low, high = solids.centre[:, 2] - solids.half[:, 2], solids.centre[:, 2] + solids.half[:, 2]
-    top = np.arctan2(high, np.where(high > 0, near, far)) + tilt
-    bottom = np.arctan2(low, np.where(low < 0, near, far)) - tilt
-    side = np.arcsin(np.minimum(shift / near, 1)) + turn
-    around = near < 0.5
-    left = np.where(around, np.pi, spread.max(axis=1) + side)
-    right = np.where(around, -np.pi, spread.min(axis=1) - side)
-    step = 2 * np.pi / firings
-    r0 = np.searchsorted(-elevation, -top)
-    r1 = np.searchsorted(-elevation, -bottom, side="right")
-    middle = np.mod(centre - yaw + np.pi, 2 * np.pi)
-    c0 = np.floor((middle + right) / step).astype(int)
-    c1 = np.minimum(np.ceil((middle + left) / step).astype(int) + 1, c0 + firings)
-    keep = np.flatnonzero((r1 > r0) & (left - right - 2 * side > SMALLEST * step))
-    jobs = []
-    for i in keep.tolist():
-        # A window that leaves the grid on one side comes in again on the other.
-        for k in (-firings, 0, firings):
-            a, b = max(c0[i] + k, 0), min(c1[i] + k, firings)
-            if b > a:
-                jobs.append((i, r0[i], r1[i], a, b))
-    window = np.array(jobs, np.int32).reshape(-1, 5)
-    return nearest_first(window, near[window[:, 0]])

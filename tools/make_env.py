@@ -158,11 +158,7 @@ STEPS = [
     ("create .venv", create_venv, ["tools/make_env.py"]),
     ("install requirements", install_requirements, ["requirements.txt", "constraints.txt"]),
     ("build messages", build_messages, MESSAGE_PACKAGES),
-    (
-        "install calib_ros",
-        install_package,
-        ["setup.py", "setup.cfg", "calib_ros/__init__.py", KERNEL],
-    ),
+    ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/__init__.py", KERNEL]),
 ]
 
 

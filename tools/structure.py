@@ -11,10 +11,13 @@ from __future__ import annotations
 import argparse
 import ast
 import re
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).resolve().parents[1]
 CORE = "calib_ros"
@@ -106,48 +109,24 @@ class Structure:
 
 
 def circles(arrows: Mapping[tuple[str, str], str]) -> list[list[str]]:
-    """Sets of names that import each other, directly or through others (Tarjan's strongly connected components)."""
-    below: dict[str, list[str]] = defaultdict(list)
-    for a, b in arrows:
-        below[a].append(b)
-    number: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[list[str]] = []
-
-    def visit(name: str) -> None:
-        number[name] = low[name] = len(number)
-        stack.append(name)
-        for other in below.get(name, ()):
-            if other not in number:
-                visit(other)
-                low[name] = min(low[name], low[other])
-            elif other in stack:
-                low[name] = min(low[name], number[other])
-        if low[name] == number[name]:
-            k = stack.index(name)
-            if len(stack) - k > 1:
-                found.append(sorted(stack[k:]))
-            del stack[k:]
-
-    for name in sorted({name for arrow in arrows for name in arrow}):
-        if name not in number:
-            visit(name)
-    return found
+    """Sets of names that import each other, directly or through others."""
+    names = sorted({name for arrow in arrows for name in arrow})
+    ends = np.array([[names.index(name) for name in arrow] for arrow in arrows], int).reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(arrows)), ends), (len(names), len(names)))
+    count, part = connected_components(graph, connection="strong")
+    found = [[name for name, own in zip(names, part, strict=True) if own == k] for k in range(count)]
+    return [circle for circle in found if len(circle) > 1]
 
 
 def floors(arrows: Mapping[tuple[str, str], str]) -> dict[str, int]:
     """Room -> floor from 0, the ground. ValueError where rooms form a circle."""
     if circles(arrows):
         raise ValueError("rooms that import each other lie on no floor")
-    below: dict[str, list[str]] = defaultdict(list)
-    for a, b in arrows:
-        below[a].append(b)
     out: dict[str, int] = {}
 
     def floor(room: str) -> int:
         if room not in out:
-            out[room] = 1 + max((floor(other) for other in below.get(room, ())), default=-1)
+            out[room] = 1 + max((floor(b) for a, b in arrows if a == room), default=-1)
         return out[room]
 
     for room in {room for arrow in arrows for room in arrow}:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
 import cv2
 import numpy as np
@@ -49,12 +48,8 @@ class Pictures(Sequence[Pair]):
     def __len__(self) -> int:
         return len(self._samples)
 
-    @overload
-    def __getitem__(self, number: int) -> Pair: ...
-    @overload
-    def __getitem__(self, number: slice) -> Pictures: ...
-    def __getitem__(self, number: int | slice) -> Pair | Pictures:
-        return Pictures(self._samples[number]) if isinstance(number, slice) else self._samples[number].read()
+    def __getitem__(self, number: int) -> Pair:  # type: ignore[override]
+        return self._samples[number].read()
 
 
 def samples(root: Path, held_out: bool) -> list[Sample]:

@@ -13,7 +13,6 @@ from torch.nn import functional
 from training.data import NAMES
 
 STRIDE = 16  # of the coarsest level: heights and widths must be multiples of it
-OUTPUT_STRIDE = 2  # of the scores: fine enough for poles, and a quarter of the pixels
 CHANNELS = (16, 32, 56, 104)  # at strides 2, 4, 8, 16
 DECODED = (24, 40, 64)  # at strides 2, 4, 8
 DILATIONS = (1, 2, 4, 8, 2, 4)  # of the coarsest level; they reach 43 cells, 688 px
@@ -49,9 +48,7 @@ class Inverted(nn.Module):
         super().__init__()
         wide = inputs * widen
         self.layers = nn.Sequential(
-            ConvNorm(inputs, wide),
-            ConvNorm(wide, wide, 3, stride, dilation, groups=wide),
-            ConvNorm(wide, outputs, linear=True),
+            ConvNorm(inputs, wide), ConvNorm(wide, wide, 3, stride, dilation, groups=wide), ConvNorm(wide, outputs, linear=True)
         )
         self.adds = stride == 1 and inputs == outputs
 

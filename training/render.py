@@ -21,7 +21,6 @@ from training.world.picture import picture_of
 DIGITS = 6  # of a picture's name
 PICTURES = 3600  # what the free weights were trained on
 QUALITY = (60, 96)  # of JPEG, each picture its own
-SMALLEST = 0.1  # factor on the size: smaller pictures show nothing
 
 
 def write(folder: Path, seed: int, number: int, scale: float = 1.0) -> bool:
@@ -40,7 +39,7 @@ def write(folder: Path, seed: int, number: int, scale: float = 1.0) -> bool:
 
 
 def render(folder: Path, seed: int, numbers: Iterable[int], processes: int, scale: float = 1.0) -> None:
-    """Renders the pictures with these numbers. ValueError if the folder holds those of another seed or size."""
+    """Renders the pictures with these numbers; scale: factor on their sizes. ValueError if the folder holds others."""
     for name in ("images", "labels"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     note, mine = folder / "seed.txt", f"seed {seed} scale {scale:g}\n"
@@ -65,16 +64,13 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=PICTURES)
     parser.add_argument("--seed", type=int, default=1, help="0 or more")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--scale", type=float, default=1.0, help="factor on the size of the pictures")
     args = parser.parse_args()
     if args.pictures < 1 or args.processes < 1 or args.seed < 0:
         parser.error("--pictures and --processes must be 1 or more, --seed 0 or more")
-    if not SMALLEST <= args.scale <= 4:
-        parser.error(f"--scale must be {SMALLEST} to 4")
     if args.out.exists() and not args.out.is_dir():
         parser.error(f"--out {args.out} is a file; name a folder")
     try:
-        render(args.out, args.seed, range(args.pictures), args.processes, args.scale)
+        render(args.out, args.seed, range(args.pictures), args.processes)
     except (ValueError, OSError) as error:
         parser.error(str(error))
 

@@ -88,6 +88,8 @@ class Run:
         )
         steps = settings.epochs * (len(pictures) // settings.batch)
         self._schedule = torch.optim.lr_scheduler.OneCycleLR(self._optimizer, settings.rate, steps, pct_start=0.15)
+        self._parts: dict[str, Any] = {"network": self.network, "average": self.average.module}
+        self._parts |= {"optimizer": self._optimizer, "schedule": self._schedule}
         self.epoch = 0
         if self._file.exists():
             self._load()
@@ -120,15 +122,8 @@ class Run:
 
     def save(self) -> None:
         """Writes last.pt; a stop in between leaves the one before."""
-        state = {
-            "settings": asdict(self.settings),
-            "epoch": self.epoch,
-            "network": self.network.state_dict(),
-            "average": self.average.module.state_dict(),
-            "averaged": self.average.n_averaged,
-            "optimizer": self._optimizer.state_dict(),
-            "schedule": self._schedule.state_dict(),
-        }
+        state = {"settings": asdict(self.settings), "epoch": self.epoch, "averaged": self.average.n_averaged}
+        state |= {name: part.state_dict() for name, part in self._parts.items()}
         self._file.parent.mkdir(parents=True, exist_ok=True)
         new = self._file.with_suffix(".new")
         torch.save(state, new)
@@ -139,11 +134,9 @@ class Run:
         if state["settings"] != asdict(self.settings):
             raise ValueError(f"{self._file} is of a run with {state['settings']}; use these, or another --out")
         self.epoch = state["epoch"]
-        self.network.load_state_dict(state["network"])
-        self.average.module.load_state_dict(state["average"])
         self.average.n_averaged.copy_(state["averaged"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._schedule.load_state_dict(state["schedule"])
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
 
     def _loss(self, images: Tensor, labels: Tensor) -> Tensor:
         images = images.contiguous(memory_format=torch.channels_last)

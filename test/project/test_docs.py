@@ -101,16 +101,6 @@ def test_parameters_in_the_text_exist() -> None:
     assert not unknown, "\n".join(unknown)
 
 
-def test_every_parameter_is_on_the_page_and_in_the_table_of_parameters() -> None:
-    names = [*SETTINGS, *(f"{stage}.{name}" for stage, values in Config().to_dict().items() for name in values)]
-    page = (ROOT / "docs/parameters.md").read_text(encoding="utf-8")
-    with (ROOT / "docs/figures/parameters.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["parameter"] for row in rows] == names
-    assert all(row["default"] and row["meaning"] for row in rows)
-    assert [name for name in names if f"`{name}`" not in page] == []
-
-
 def test_tables_of_figures_are_linked_and_whole() -> None:
     """A line of column names, then rows of as many cells; a page says where each comes from."""
     linked = {(page.parent / link).resolve() for page in PAGES for _, link in links(page) if link.endswith(".csv")}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import pkgutil
 import re
 import subprocess
 import sys
+from collections import defaultdict
 
 import pytest
 from paths import ROOT, module_at
@@ -48,6 +50,17 @@ def test_rclpy_and_messages_are_imported_where_ros_lives(imports) -> None:
 
 def test_the_product_imports_neither_the_evaluation_nor_benchmarks(imports) -> None:
     assert [(path, module) for path, _, module in imports if module.split(".")[0] in structure.LABORATORY] == []
+
+
+def test_class_names_are_unique() -> None:
+    """One name means one thing: no two public classes at the top of the packages' modules share theirs."""
+    found = defaultdict(list)
+    for path in (path for package in (*structure.PACKAGES, "calib_ros_evaluation") for path in structure.package_files(package)):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found[node.name].append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert len(found) > 300
+    assert {name: places for name, places in found.items() if len(places) > 1} == {}
 
 
 def test_names_in_strings_are_those_of_the_code() -> None:

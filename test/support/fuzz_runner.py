@@ -12,7 +12,6 @@ import resource
 import shutil
 import sys
 import tempfile
-import time
 import traceback
 import warnings
 from collections import Counter
@@ -54,8 +53,7 @@ class Run:
     def __init__(self) -> None:
         self.outcomes: Counter[str] = Counter()
         self.failures: list[str] = []
-        self.slowest, self.most = (0.0, ""), (0.0, "")
-        self.base = 0.0
+        self.most, self.base = (0.0, ""), 0.0
 
     def start(self) -> None:
         """From here on memory is limited and measured."""
@@ -67,8 +65,7 @@ class Run:
         """What `work` returns; None if it refused the input, or failed."""
         faulthandler.dump_traceback_later(HANG_S, exit=True)
         forget_peak()
-        before, begin = memory("VmRSS"), time.perf_counter()
-        value = None
+        before, value = memory("VmRSS"), None
         try:
             value = work()
             outcome = "taken"
@@ -79,8 +76,7 @@ class Run:
         except BaseException:
             outcome = "failed"
             self.fail(f"{label}: {traceback.format_exc()[-3000:]}")
-        seconds, grown = time.perf_counter() - begin, memory("VmHWM") - before
-        self.slowest, self.most = max(self.slowest, (seconds, label)), max(self.most, (grown, label))
+        self.most = max(self.most, (memory("VmHWM") - before, label))
         self.outcomes[f"{kind} {outcome}"] += 1
         faulthandler.cancel_dump_traceback_later()
         return value
@@ -90,7 +86,7 @@ class Run:
             self.failures.append(text)
 
     def report(self) -> dict[str, Any]:
-        found = {name: getattr(self, name) for name in ("outcomes", "failures", "slowest", "most")}
+        found = {name: getattr(self, name) for name in ("outcomes", "failures", "most")}
         return {**found, "grown": memory("VmRSS") - self.base}
 
 
@@ -179,9 +175,7 @@ def pipeline(run: Run, seed: int, count: int) -> None:
     few = {"starts": 64, "rounds": 1}
     whole = Pipeline(Config.from_dict({"search": few, "online": {"similarity_threshold": 1.0}}), inputs, events.append)
     whole.set_camera(CAMERA)
-    SegmentationModels(SemanticsConfig())(
-        good_frame(seed)
-    )  # the first import of its libraries takes seconds where others run, too
+    SegmentationModels(SemanticsConfig())(good_frame(seed))  # the first import of its libraries takes seconds
     run.start()
     for k in range(count):
         fuzzer = fuzzers[k % len(fuzzers)]
@@ -313,9 +307,8 @@ def kitti(folder: Path, layout: str) -> None:
     T, P = nominal(0.0)[:3], f"P2: {text(np.c_[K, [1.0, 0, 0]])}\n"
     files: dict[str, str] = {}
     if layout == "raw":
-        files["calib_cam_to_cam.txt"] = (
-            f"calib_time: 09-Jan-2012 13:57:47\nR_rect_00: {text(np.eye(3))}\n{P.replace('2', '_rect_02', 1)}"
-        )
+        rectified = f"R_rect_00: {text(np.eye(3))}\n{P.replace('2', '_rect_02', 1)}"
+        files["calib_cam_to_cam.txt"] = f"calib_time: 09-Jan-2012 13:57:47\n{rectified}"
         files["calib_velo_to_cam.txt"] = f"R: {text(T[:, :3])}\nT: 0.1 0.2 0.3\ndelta_f: 0 0\n"
         files["calib_imu_to_velo.txt"] = f"R: {text(np.eye(3))}\nT: -0.8 0.3 -0.8\n"
         for name in ("image_02/timestamps.txt", *(f"velodyne_points/timestamps{s}.txt" for s in ("", "_start", "_end"))):

@@ -218,34 +218,32 @@ class MessageFuzzer:
         D = self.rng.normal(0, self.one((0.0, 0.02, 0.3)), DISTORTIONS[model])
         message = self.make.camera_info(WIDTH, HEIGHT, K, D, P, model=model)
         for _ in range(int(self.one((0, 1, 1, 2, 3)))):
-            getattr(self, "_info_" + self.one(("size", "matrix", "matrix", "distortion", "distortion", "model", "part")))(message)
+            self._change(message, self.one(("size", "matrix", "matrix", "distortion", "distortion", "model", "part")))
         return message
 
-    def _info_size(self, message: Any) -> None:
-        name = self.one(("width", "height"))
-        setattr(message, name, self.number(getattr(message, name)))
-
-    def _info_matrix(self, message: Any) -> None:
-        name = self.one("kkp")
-        values = np.array(getattr(message, name), float)
-        values[self.some(values)] = self.one(FLOATS)
-        if self.chance(0.2):
+    def _change(self, message: Any, what: str) -> None:
+        """Another size, matrix, distortion, model or part of the picture for a CameraInfo."""
+        if what == "model":
+            message.distortion_model = self.one((*DISTORTIONS, "fisheye", "none", "thin_prism", *TEXTS))
+        elif what == "matrix":
+            name = self.one("kkp")
             values = np.array(getattr(message, name), float)
-            values[self.some(values)] *= self.one((0.0, -1.0, 1e-3, 1e3))
-        setattr(message, name, values)
-
-    def _info_distortion(self, message: Any) -> None:
-        D = self.rng.normal(0, self.one((0.1, 10.0, 1e6)), int(self.one((0, 1, 3, 4, 5, 8, 12, 14, 15, 1000))))
-        if len(D) and self.chance(0.5):
-            D[self.some(D)] = self.one(FLOATS)
-        message.d = D if self.make.family == "rosbags" else D.tolist()
-
-    def _info_model(self, message: Any) -> None:
-        message.distortion_model = self.one((*DISTORTIONS, "fisheye", "none", "thin_prism", *TEXTS))
-
-    def _info_part(self, message: Any) -> None:
-        name = self.one(("binning_x", "binning_y", "x_offset", "y_offset", "width", "height"))
-        setattr(message if name.startswith("binning") else message.roi, name, self.number(2))
+            values[self.some(values)] = self.one(FLOATS)
+            if self.chance(0.2):
+                values = np.array(getattr(message, name), float)
+                values[self.some(values)] *= self.one((0.0, -1.0, 1e-3, 1e3))
+            setattr(message, name, values)
+        elif what == "distortion":
+            D = self.rng.normal(0, self.one((0.1, 10.0, 1e6)), int(self.one((0, 1, 3, 4, 5, 8, 12, 14, 15, 1000))))
+            if len(D) and self.chance(0.5):
+                D[self.some(D)] = self.one(FLOATS)
+            message.d = D if self.make.family == "rosbags" else D.tolist()
+        elif what == "size":
+            name = self.one(("width", "height"))
+            setattr(message, name, self.number(getattr(message, name)))
+        else:
+            name = self.one(("binning_x", "binning_y", "x_offset", "y_offset", "width", "height"))
+            setattr(message if name.startswith("binning") else message.roi, name, self.number(2))
 
 
 def png_header(width: int, height: int, colour: int, data: bytes = b"") -> bytes:

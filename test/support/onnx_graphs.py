@@ -33,16 +33,41 @@ def save(path: Path, nodes, inputs, outputs, constants=None, metadata=None) -> P
     return path
 
 
+class Graph:
+    """Nodes, one after the other."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[str, np.ndarray] = {}
+
+    def const(self, value: object, dtype: object = np.float32) -> str:
+        name = f"c{len(self.constants)}"
+        self.constants[name] = np.asarray(value, dtype)
+        return name
+
+    def ints(self, *values: int) -> str:
+        return self.const(values, np.int64)
+
+    def op(self, kind: str, *inputs: str, out: str = "", **attributes: object) -> str:
+        name = out or f"n{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
+        return name
+
+    def scores(self, x: str, at: np.ndarray, channel: int, mean: Sequence[float], std: Sequence[float], out: str = "") -> str:
+        """Scores of classes whose centres, before the normalisation of a channel, are at (K,)."""
+        w = np.zeros((len(at), len(mean), 1, 1), np.float32)
+        w[:, channel, 0, 0] = 2 * at * std[channel]
+        return self.op("Conv", x, self.const(w), self.const(2 * at * mean[channel] - at**2), out=out)
+
+    def save(self, path: Path, inputs: Sequence[tuple], outputs: Sequence[tuple], metadata: dict | None = None) -> Path:
+        """As a file; inputs and outputs: name, shape, and type if it is not float."""
+        given = [[value(*tensor) for tensor in tensors] for tensors in (inputs, outputs)]
+        return save(path, self.nodes, *given, self.constants, metadata)
+
+
 def centres(classes: int, low: float = 0.0, high: float = 1.0) -> np.ndarray:
     """Values (K,) in the middle of K bands from low to high."""
     return low + (np.arange(classes) + 0.5) / classes * (high - low)
-
-
-def weights(at: np.ndarray, channel: int, mean: Sequence[float], std: Sequence[float]) -> dict[str, np.ndarray]:
-    """Kernels (K, C, 1, 1) and biases (K,) of the scores of one channel before its normalisation."""
-    w = np.zeros((len(at), len(mean), 1, 1), np.float32)
-    w[:, channel, 0, 0] = 2 * at * std[channel]
-    return {"w": w, "b": (2 * at * mean[channel] - at**2).astype(np.float32)}
 
 
 def shape_of(text: str) -> list[int | str] | None:
@@ -87,82 +112,58 @@ def segmentation(
     outputs = tensors(outputs) if isinstance(outputs, str) else outputs
     first = next((name for name, _ in outputs if not name.startswith(MADE_FROM_SCORES)), "scores")
     given, scores = names or ("input", first)
-    constants = weights(centres(classes) if at is None else at, channel, mean, std)
-    nodes, last = [], given
+    g, x = Graph(), given
     if kind != Type.FLOAT:
-        nodes, last = [*nodes, helper.make_node("Cast", [last], ["float"], to=Type.FLOAT)], "float"
+        x = g.op("Cast", x, to=Type.FLOAT)
     if form.startswith("HWC") or form.startswith("CHW"):
-        constants["zero"] = np.array([0])
-        nodes, last = [*nodes, helper.make_node("Unsqueeze", [last, "zero"], ["batch"])], "batch"
+        x = g.op("Unsqueeze", x, g.ints(0))
     if form.split()[0].endswith("HWC"):
-        nodes, last = [*nodes, helper.make_node("Transpose", [last], ["first"], perm=[0, 3, 1, 2])], "first"
+        x = g.op("Transpose", x, perm=[0, 3, 1, 2])
     if stride > 1:
-        pool = helper.make_node("AveragePool", [last], ["pooled"], kernel_shape=[stride] * 2, strides=[stride] * 2)
-        nodes, last = [*nodes, pool], "pooled"
+        x = g.op("AveragePool", x, kernel_shape=[stride] * 2, strides=[stride] * 2)
     if enlarged > 1:
-        constants["factors"] = np.array([1, 1, enlarged, enlarged], np.float32)
-        nodes, last = [*nodes, helper.make_node("Resize", [last, "", "factors"], ["large"], mode="nearest")], "large"
-    end = "raw" if "to" in form else scores
-    nodes.append(helper.make_node("Conv", [last, "w", "b"], [end]))
+        x = g.op("Resize", x, "", g.const([1, 1, enlarged, enlarged]), mode="nearest")
+    raw = g.scores(x, centres(classes) if at is None else at, channel, mean, std, out="" if "to" in form else scores)
     if form.endswith("to NHWC"):
-        nodes.append(helper.make_node("Transpose", ["raw"], [scores], perm=[0, 2, 3, 1]))
+        g.op("Transpose", raw, perm=[0, 2, 3, 1], out=scores)
     if form.endswith("to CHW"):
-        constants["zero"] = np.array([0])
-        nodes.append(helper.make_node("Squeeze", ["raw", "zero"], [scores]))
+        g.op("Squeeze", raw, g.ints(0), out=scores)
     made = []
     for name, shape in outputs:
         out = Type.FLOAT
         if name.startswith("argmax"):
             keep = int(shape is None or len(shape) == 4)
             out = Type.FLOAT if "float" in name else Type.INT32 if "int32" in name else Type.INT64
-            nodes.append(helper.make_node("ArgMax", [scores], [f"{name}_64"], axis=1, keepdims=keep))
-            nodes.append(helper.make_node("Cast", [f"{name}_64"], [name], to=out))
+            g.op("Cast", g.op("ArgMax", scores, axis=1, keepdims=keep), to=out, out=name)
         elif name.startswith("aux"):
-            nodes.append(helper.make_node("Neg", [scores], [name]))
+            g.op("Neg", scores, out=name)
         elif name.startswith("edge"):
-            nodes.append(helper.make_node("ReduceMax", [scores], [name], axes=[1], keepdims=1))
+            g.op("ReduceMax", scores, axes=[1], keepdims=1, out=name)
         elif name.startswith("mean"):
-            nodes.append(helper.make_node("GlobalAveragePool", [scores], [name]))
-        made.append(value(name, shape, out))
-    return save(path, nodes, [value(given, inputs, kind)], made, constants, metadata)
+            g.op("GlobalAveragePool", scores, out=name)
+        made.append((name, shape, out))
+    return g.save(path, [(given, inputs, kind)], made, metadata)
 
 
 def endless(path: Path, turns: int = 10**7, above: float = 0.0, size: tuple = (64, 64)) -> Path:
     """A network for classes of pixels that takes minutes where its highest value is above a level (a loop), else no time."""
-    body = helper.make_graph(
-        [
-            helper.make_node("Identity", ["go"], ["go_on"]),
-            helper.make_node("Tanh", ["x"], ["y"]),
-        ],
-        "body",
-        [value("i", [], Type.INT64), value("go", [], Type.BOOL), value("x", None)],
-        [value("go_on", [], Type.BOOL), value("y", None)],
-    )
-    nodes = [
-        helper.make_node("ReduceMax", ["input"], ["high"], keepdims=0),
-        helper.make_node("Greater", ["high", "none"], ["go_at_all"]),
-        helper.make_node("Loop", ["turns", "go_at_all", "input"], ["after"], body=body),
-        helper.make_node("Conv", ["after", "w", "b"], ["output"]),
-    ]
-    constants = {"turns": np.array(turns), "none": np.array(above, np.float32), **weights(centres(19), 0, *IMAGENET)}
-    return save(path, nodes, [value("input", [1, 3, *size])], [value("output", [1, 19, *size])], constants)
+    turn = [helper.make_node("Identity", ["go"], ["go_on"]), helper.make_node("Tanh", ["x"], ["y"])]
+    given = [value("i", [], Type.INT64), value("go", [], Type.BOOL), value("x", None)]
+    body = helper.make_graph(turn, "body", given, [value("go_on", [], Type.BOOL), value("y", None)])
+    g = Graph()
+    go = g.op("Greater", g.op("ReduceMax", "input", keepdims=0), g.const(above))
+    g.scores(g.op("Loop", g.const(turns, np.int64), go, "input", body=body), centres(19), 0, *IMAGENET, out="output")
+    return g.save(path, [("input", [1, 3, *size])], [("output", [1, 19, *size])])
 
 
 def failing(path: Path) -> Path:
     """A network for classes of pixels that fails for what is brighter than the mean: it reshapes that to twice the size."""
-    nodes = [
-        helper.make_node("ReduceMax", ["input"], ["high"], keepdims=1, axes=[1, 2, 3]),
-        helper.make_node("Reshape", ["high", "one"], ["flat"]),
-        helper.make_node("Greater", ["flat", "none"], ["bright"]),
-        helper.make_node("Cast", ["bright"], ["more"], to=Type.INT64),
-        helper.make_node("Add", ["more", "one"], ["factor"]),
-        helper.make_node("Mul", ["factor", "size"], ["shape"]),
-        helper.make_node("Reshape", ["input", "shape"], ["again"]),
-        helper.make_node("Conv", ["again", "w", "b"], ["output"]),
-    ]
-    constants = {"one": np.array([1]), "none": np.zeros(1, np.float32), "size": np.array([1, 3, 64, 64])}
-    constants |= weights(centres(19), 0, *IMAGENET)
-    return save(path, nodes, [value("input", [1, 3, 64, 64])], [value("output", [1, 19, 64, 64])], constants)
+    g = Graph()
+    high = g.op("Reshape", g.op("ReduceMax", "input", keepdims=1, axes=[1, 2, 3]), g.ints(1))
+    factor = g.op("Add", g.op("Cast", g.op("Greater", high, g.const([0])), to=Type.INT64), g.ints(1))
+    again = g.op("Reshape", "input", g.op("Mul", factor, g.ints(1, 3, 64, 64)))
+    g.scores(again, centres(19), 0, *IMAGENET, out="output")
+    return g.save(path, [("input", [1, 3, 64, 64])], [("output", [1, 19, 64, 64])])
 
 
 def range_network(
@@ -183,39 +184,24 @@ def range_network(
     last: channels last, as of SqueezeSeg. mask: shape of a second input, by which the scores are multiplied. outputs: "output"
     (scores), "softmax", "argmax", or names beginning with "aux".
     """
-    count, (height, width) = len(mean), size
-    nodes, constants, now = [], weights(at, channel, mean, std), names[0]
-    if last:
-        nodes, now = [helper.make_node("Transpose", [now], ["first"], perm=[0, 3, 1, 2])], "first"
-    nodes.append(helper.make_node("Conv", [now, "w", "b"], ["plain"]))
-    given = [value(names[0], [1, height, width, count] if last else [1, count, height, width])]
-    if mask is None:
-        nodes.append(helper.make_node("Identity", ["plain"], ["scores"]))
-    else:
+    g, count, (height, width) = Graph(), len(mean), size
+    x = g.op("Transpose", names[0], perm=[0, 3, 1, 2]) if last else names[0]
+    scores = g.scores(x, at, channel, mean, std)
+    given: list[tuple] = [(names[0], [1, height, width, count] if last else [1, count, height, width])]
+    if mask is not None:
         # Scores fall far below those of class 0 where the mask is 0: then no point may keep its class.
-        constants["shape"], constants["far"] = np.array([1, 1, height, width]), np.array(1e6, np.float32)
-        constants["one"], constants["first_only"] = (
-            np.array(1, np.float32),
-            np.eye(1, len(at), dtype=np.float32).reshape(1, -1, 1, 1),
-        )
-        nodes += [
-            helper.make_node("Reshape", ["lidar_mask", "shape"], ["m"]),
-            helper.make_node("Sub", ["one", "m"], ["empty"]),
-            helper.make_node("Mul", ["empty", "far"], ["loss"]),
-            helper.make_node("Mul", ["loss", "first_only"], ["raised"]),
-            helper.make_node("Add", ["plain", "raised"], ["scores"]),
-        ]
-        given.append(value("lidar_mask", mask))
-    made = []
+        empty = g.op("Sub", g.const(1), g.op("Reshape", "lidar_mask", g.ints(1, 1, height, width)))
+        first_only = g.const(1e6 * np.eye(1, len(at)).reshape(1, -1, 1, 1))
+        scores = g.op("Add", scores, g.op("Mul", empty, first_only))
+        given.append(("lidar_mask", mask))
+    made: list[tuple] = []
     for name in outputs:
-        shape, kind = [1, len(at), height, width], Type.FLOAT
         out = names[1] if name in ("output", "softmax", "argmax") else name
-        if name == "softmax":
-            nodes.append(helper.make_node("Softmax", ["scores"], [out], axis=1))
-        elif name == "argmax":
-            nodes.append(helper.make_node("ArgMax", ["scores"], [out], axis=1, keepdims=0))
-            shape, kind = [1, height, width], Type.INT64
-        else:
-            nodes.append(helper.make_node("Neg" if name.startswith("aux") else "Identity", ["scores"], [out]))
-        made.append(value(out, shape, kind))
-    return save(path, nodes, given, made, constants)
+        if name == "argmax":
+            g.op("ArgMax", scores, axis=1, keepdims=0, out=out)
+            made.append((out, [1, height, width], Type.INT64))
+            continue
+        how = {"axis": 1} if name == "softmax" else {}
+        g.op("Softmax" if name == "softmax" else "Neg" if name.startswith("aux") else "Identity", scores, out=out, **how)
+        made.append((out, [1, len(at), height, width]))
+    return g.save(path, given, made)

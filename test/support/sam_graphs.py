@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto
+from onnx_graphs import Graph
 
 FLOAT, HALF, INT64, UINT8 = TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.INT64, TensorProto.UINT8
 MEAN, STD = np.array([123.675, 116.28, 103.53]), np.array([58.395, 57.12, 57.375])
@@ -20,34 +20,11 @@ LEVELS = (0.06, 0.06, 0.06, 0.06)
 PREDICTED = (0.97, 0.95, 0.93, 0.9)
 
 
-class Graph:
-    """Nodes, one after the other."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def const(self, value: object, dtype: object = np.float32) -> str:
-        name = f"c{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
-        return name
-
-    def ints(self, *values: int) -> str:
-        return self.const(values, np.int64)
-
-    def op(self, kind: str, *inputs: str, out: str = "", **attributes: object) -> str:
-        name = out or f"n{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
-        return name
+class SamGraph(Graph):
+    """A graph that segments by colour."""
 
     def save(self, path: Path, inputs: Sequence[tuple], outputs: Sequence[tuple], metadata: dict | None = None) -> str:
-        values = [[helper.make_tensor_value_info(*tensor) for tensor in tensors] for tensors in (inputs, outputs)]
-        graph = helper.make_graph(self.nodes, "g", *values, self.constants)
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-        helper.set_model_props(model, metadata or {})
-        onnx.checker.check_model(model)
-        onnx.save(model, str(path))
-        return str(path)
+        return str(super().save(path, inputs, outputs, metadata))
 
     def slice(self, x: str, start: Sequence[int], end: Sequence[int], axes: Sequence[int], step: Sequence[int] = ()) -> str:
         return self.op("Slice", x, self.ints(*start), self.ints(*end), self.ints(*axes), self.ints(*(step or [1] * len(axes))))
@@ -106,22 +83,22 @@ class Graph:
 
 def encoder(path: Path, name: str = "input_image", out: str = "image_embeddings", side: int = 1024, kind: int = FLOAT) -> str:
     """1x3xSxS normalised and padded -> 1x256x(S/16)x(S/16): official SAM, samexporter without preprocessing, EdgeSAM, NanoSAM."""
-    g = Graph()
+    g = SamGraph()
     x = g.op("Cast", name, to=FLOAT)
     embedding = g.packed(g.denormalised(g.sampled(x)), side // 16, "e")
     g.op("Cast", embedding, to=kind, out=out)
-    return g.save(path, [(name, kind, [1, 3, side, side])], [(out, kind, [1, 256, side // 16, side // 16])])
+    return g.save(path, [(name, [1, 3, side, side], kind)], [(out, [1, 256, side // 16, side // 16], kind)])
 
 
 def raw_encoder(path: Path, shape: Sequence[object] = ("image_height", "image_width", 3)) -> str:
     """samexporter with preprocessing inside: HxWx3 0..255; the graph pads to 1024x1024."""
-    g = Graph()
+    g = SamGraph()
     x = g.op("Div", g.op("Transpose", "input_image", perm=[2, 0, 1]), g.const(255))
     x = g.op("Unsqueeze", x, g.ints(0))
     lacking = g.op("Sub", g.ints(1024, 1024), g.slice(g.op("Shape", x), (2,), (4,), (0,)))
     padded = g.op("Pad", x, g.op("Concat", g.ints(0, 0, 0, 0, 0, 0), lacking, axis=0))
     g.packed(g.sampled(padded), 64, "image_embeddings")
-    return g.save(path, [("input_image", FLOAT, shape)], [("image_embeddings", FLOAT, [1, 256, 64, 64])])
+    return g.save(path, [("input_image", shape)], [("image_embeddings", [1, 256, 64, 64])])
 
 
 def official_decoder(
@@ -134,7 +111,7 @@ def official_decoder(
     kind: int = FLOAT,
 ) -> str:
     """The export of SAM's authors. sized: with orig_im_size. names: other names for its tensors. kind: type of its tensors."""
-    g, low, cells = Graph(), side // 4, side // 16
+    g, low, cells = SamGraph(), side // 4, side // 16
     names = names or {}
     inputs = {
         "image_embeddings": [1, 256, cells, cells],
@@ -159,36 +136,32 @@ def official_decoder(
         g.op("Cast", made[n], to=kind, out=names.get(n, n))
     return g.save(
         path,
-        [(names.get(n, n), kind, shape) for n, shape in inputs.items()],
-        [(names.get(n, n), kind, shapes[n]) for n in outputs],
+        [(names.get(n, n), shape, kind) for n, shape in inputs.items()],
+        [(names.get(n, n), shapes[n], kind) for n in outputs],
     )
 
 
 def edge_sam_decoder(path: Path) -> str:
     """EdgeSAM: embedding and points only; scores and masks of the low resolution."""
-    g = Graph()
+    g = SamGraph()
     logits, iou = g.answer(g.unpacked("image_embeddings"), g.first_point("point_coords"), LEVELS)
     g.op("Identity", g.worth(iou, "point_labels", True), out="scores")
     g.op("Identity", logits, out="masks")
     inputs = [("image_embeddings", [1, 256, 64, 64]), ("point_coords", [1, "n", 2]), ("point_labels", [1, "n"])]
-    return g.save(
-        path,
-        [(name, FLOAT, shape) for name, shape in inputs],
-        [("scores", FLOAT, [1, 4]), ("masks", FLOAT, [1, 4, 256, 256])],
-    )
+    return g.save(path, inputs, [("scores", [1, 4]), ("masks", [1, 4, 256, 256])])
 
 
 def sam2_pair(folder: Path, honest: bool = True, prompts: object = "num_labels") -> tuple[str, str]:
     """SAM2 by samexporter. honest: whether the decoder takes several prompts at once, as it says. prompts: how many."""
-    g = Graph()
+    g = SamGraph()
     x = g.denormalised("image")
     g.packed(g.sampled(x), 64, "image_embed")
     g.op("Concat", g.sampled(x), g.const(np.zeros((1, 29, 256, 256))), axis=1, out="high_res_feats_0")
     g.op("Concat", g.sampled(x, 8), g.const(np.zeros((1, 61, 128, 128))), axis=1, out="high_res_feats_1")
     fine, middle, coarse = [1, 32, 256, 256], [1, 64, 128, 128], [1, 256, 64, 64]
-    features = [("high_res_feats_0", FLOAT, fine), ("high_res_feats_1", FLOAT, middle), ("image_embed", FLOAT, coarse)]
-    first = g.save(folder / "sam2.encoder.onnx", [("image", FLOAT, [1, 3, 1024, 1024])], features)
-    g = Graph()
+    features = [("high_res_feats_0", fine), ("high_res_feats_1", middle), ("image_embed", coarse)]
+    first = g.save(folder / "sam2.encoder.onnx", [("image", [1, 3, 1024, 1024])], features)
+    g = SamGraph()
     red = g.slice("high_res_feats_0", (0,), (1,), (1,))
     colours = g.op("Concat", red, g.slice(g.unpacked("image_embed"), (1,), (3,), (1,)), axis=1)
     point = g.first_point("point_coords")
@@ -198,26 +171,26 @@ def sam2_pair(folder: Path, honest: bool = True, prompts: object = "num_labels")
     g.op("Identity", logits, out="masks")
     g.op("Identity", g.worth(iou, "point_labels", True, "has_mask_input"), out="iou_predictions")
     inputs = [
-        ("point_coords", FLOAT, [prompts, "num_points", 2]),
-        ("point_labels", FLOAT, [prompts, "num_points"]),
-        ("mask_input", FLOAT, [prompts, 1, 256, 256]),
-        ("has_mask_input", FLOAT, [prompts]),
+        ("point_coords", [prompts, "num_points", 2]),
+        ("point_labels", [prompts, "num_points"]),
+        ("mask_input", [prompts, 1, 256, 256]),
+        ("has_mask_input", [prompts]),
     ]
-    outputs = [("masks", FLOAT, [prompts, 3, 256, 256]), ("iou_predictions", FLOAT, [prompts, 3])]
+    outputs = [("masks", [prompts, 3, 256, 256]), ("iou_predictions", [prompts, 3])]
     second = g.save(folder / "sam2.decoder.onnx", [features[2], *features[:2], *inputs], outputs)
     return first, second
 
 
 def efficient_sam_pair(folder: Path) -> tuple[str, str]:
     """EfficientSAM: pictures RGB 0..1 of any size, points in their pixels, masks of their size."""
-    g = Graph()
+    g = SamGraph()
     g.packed(g.sampled(g.resized("batched_images", g.ints(1024, 1024))), 64, "image_embeddings")
     first = g.save(
         folder / "efficient.encoder.onnx",
-        [("batched_images", FLOAT, ["batch", 3, "height", "width"])],
-        [("image_embeddings", FLOAT, ["batch", 256, 64, 64])],
+        [("batched_images", ["batch", 3, "height", "width"])],
+        [("image_embeddings", ["batch", 256, 64, 64])],
     )
-    g = Graph()
+    g = SamGraph()
     width_height = g.op("Cast", g.op("Gather", "orig_im_size", g.ints(1, 0)), to=FLOAT)
     coords = g.op("Squeeze", g.op("Squeeze", g.slice("batched_point_coords", (0,), (1,), (2,)), g.ints(2)), g.ints(0))
     point = g.op("Mul", coords, g.op("Div", g.const(1024), width_height))
@@ -228,12 +201,12 @@ def efficient_sam_pair(folder: Path) -> tuple[str, str]:
     second = g.save(
         folder / "efficient.decoder.onnx",
         [
-            ("image_embeddings", FLOAT, ["batch", 256, 64, 64]),
-            ("batched_point_coords", FLOAT, [1, "queries", "points", 2]),
-            ("batched_point_labels", FLOAT, [1, "queries", "points"]),
-            ("orig_im_size", INT64, [2]),
+            ("image_embeddings", ["batch", 256, 64, 64]),
+            ("batched_point_coords", [1, "queries", "points", 2]),
+            ("batched_point_labels", [1, "queries", "points"]),
+            ("orig_im_size", [2], INT64),
         ],
-        [("output_masks", FLOAT, [1, "queries", 3, "h", "w"]), ("iou_predictions", FLOAT, [1, "queries", 3])],
+        [("output_masks", [1, "queries", 3, "h", "w"]), ("iou_predictions", [1, "queries", 3])],
     )
     return first, second
 
@@ -241,12 +214,12 @@ def efficient_sam_pair(folder: Path) -> tuple[str, str]:
 def transformers_pair(folder: Path) -> tuple[str, str]:
     """SAM by Hugging Face's exporter: a second embedding, prompts in a dimension more, points that the graph fills up itself."""
     embedding, points = ["b", 256, 64, 64], ["b", "prompts", "points", 2]
-    g = Graph()
+    g = SamGraph()
     g.packed(g.denormalised(g.sampled("pixel_values")), 64, "image_embeddings")
     g.op("Identity", g.const(np.ones((1, 256, 64, 64))), out="image_positional_embeddings")
-    features = [("image_embeddings", FLOAT, embedding), ("image_positional_embeddings", FLOAT, embedding)]
-    first = g.save(folder / "vision.onnx", [("pixel_values", FLOAT, ["b", 3, 1024, 1024])], features)
-    g = Graph()
+    features = [("image_embeddings", embedding), ("image_positional_embeddings", embedding)]
+    first = g.save(folder / "vision.onnx", [("pixel_values", ["b", 3, 1024, 1024])], features)
+    g = SamGraph()
     coords = g.op("Squeeze", g.op("Squeeze", g.slice("input_points", (0,), (1,), (2,)), g.ints(2)), g.ints(0))
     colours = g.unpacked(g.op("Mul", "image_embeddings", "image_positional_embeddings"))
     logits, iou = g.answer(colours, coords, LEVELS[:3])
@@ -255,8 +228,8 @@ def transformers_pair(folder: Path) -> tuple[str, str]:
     g.op("Unsqueeze", logits, g.ints(0), out="pred_masks")
     second = g.save(
         folder / "prompt.onnx",
-        [("input_points", FLOAT, points), ("input_labels", INT64, points[:3]), *features],
-        [("iou_scores", FLOAT, ["b", "prompts", 3]), ("pred_masks", FLOAT, ["b", "prompts", 3, 256, 256])],
+        [("input_points", points), ("input_labels", points[:3], INT64), *features],
+        [("iou_scores", ["b", "prompts", 3]), ("pred_masks", ["b", "prompts", 3, 256, 256])],
     )
     return first, second
 
@@ -272,7 +245,7 @@ def fast_sam(
 ) -> str:
     """YOLOv8-seg. detections: (n, 5 + p) centre, size, confidence, coefficients; prototype k is how like colour k of the
     palette (p, 3), 0..1, a pixel is. extra: with a table without detections and two maps of features before the prototypes."""
-    g, cells = Graph(), side // 4
+    g, cells = SamGraph(), side // 4
     colours = g.sampled("images")
     like = [
         g.op("ReduceMax", g.op("Abs", g.op("Sub", colours, g.const(c.reshape(1, 3, 1, 1)))), axes=[1], keepdims=1)
@@ -283,19 +256,19 @@ def fast_sam(
     g.op("Clip", likeness, g.const(-6), g.const(6), out="output1")
     table = detections if transposed else detections.T
     g.op("Identity", g.const(table[None]), out="output0")
-    outputs = [("output0", FLOAT, [1, *table.shape]), ("output1", FLOAT, [1, len(palette), cells, cells])]
+    outputs = [("output0", [1, *table.shape]), ("output1", [1, len(palette), cells, cells])]
     if extra:
         g.op("Identity", g.const(np.zeros((1, *table.shape))), out="empty")
         g.op("AveragePool", "images", out="few", kernel_shape=[8, 8], strides=[8, 8])
         g.op("Concat", *["few"] * 35, axis=1, out="many")
-        maps = [(name, FLOAT, [1, n, side // 8, side // 8]) for name, n in (("few", 3), ("many", 105))]
-        outputs = [("empty", FLOAT, [1, *table.shape]), *maps[:1], *outputs, *maps[1:]]
-    return g.save(path, [("images", FLOAT, [1, 3, side, side])], outputs, metadata)
+        maps = [(name, [1, n, side // 8, side // 8]) for name, n in (("few", 3), ("many", 105))]
+        outputs = [("empty", [1, *table.shape]), *maps[:1], *outputs, *maps[1:]]
+    return g.save(path, [("images", [1, 3, side, side])], outputs, metadata)
 
 
 def other(path: Path) -> str:
     """A graph that is neither half of a pair: a classifier."""
-    g = Graph()
+    g = SamGraph()
     pooled = g.op("ReduceMean", "data", axes=[2, 3], keepdims=0)
     g.op("Softmax", pooled, out="probabilities")
-    return g.save(path, [("data", FLOAT, [1, 3, 32, 32])], [("probabilities", FLOAT, [1, 3])])
+    return g.save(path, [("data", [1, 3, 32, 32])], [("probabilities", [1, 3])])

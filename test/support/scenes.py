@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import pickle
 import tempfile
@@ -74,6 +75,19 @@ class RenderedDrive(SyntheticDrive):
 
 def is_near(reference: np.ndarray, T: np.ndarray, deg: float, m: float) -> bool:
     return se3.rotation_error_deg(reference, T) < deg and se3.translation_error_m(reference, T) < m
+
+
+def on_pixels_of_their_class(drive: SyntheticDrive, index: int, T: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Classes (n,) of a frame's points in the picture, and whether a pixel within `reach` px has the same one."""
+    labels = drive.labels(index)
+    uv, inside = drive.camera.project(se3.transform(T, drive[index].cloud.xyz))
+    u, v = np.rint(uv[inside]).astype(int).T
+    own = labels.points[inside]
+    same = np.zeros(len(own), bool)
+    for dv, du in itertools.product(range(-reach, reach + 1), repeat=2):
+        row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
+        same |= labels.image[row, column] == own
+    return own, same
 
 
 class Scene:

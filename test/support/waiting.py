@@ -15,10 +15,7 @@ def pause() -> None:
 
 
 def until(
-    condition: Callable[[], Any],
-    what: object = "",
-    turn: Callable[[], object] = pause,
-    state: Callable[[], object] = lambda: "",
+    condition: Callable[[], Any], what: object = "", turn: Callable[[], object] = pause, state: Callable[[], object] = lambda: ""
 ) -> Any:
     """Wait until the condition holds and return its value. turn: what is done meanwhile. state: told where it never does."""
     end = time.monotonic() + LIMIT_S

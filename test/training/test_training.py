@@ -16,10 +16,7 @@ sys.path.insert(0, str(ROOT))  # training/ is no part of the installed package
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.frame import Frame
-from calib_ros_semantics.models.labels import (
-    CAMVID,
-    lookup,
-)
+from calib_ros_semantics.models.labels import CAMVID, lookup
 from calib_ros_semantics.models.onnx_model import Deadline
 from training import augment, data
 
@@ -174,19 +171,6 @@ def test_training_resumes(torch: Any, tmp_path: Path, monkeypatch: pytest.Monkey
         run_of(tmp_path / "parts", epochs=3)
 
 
-def test_an_exported_file_names_its_licence(torch: Any, tmp_path: Path) -> None:
-    for module in ("onnxscript", "onnxruntime"):
-        pytest.importorskip(module, reason=NO_TORCH)
-    onnx = pytest.importorskip("onnx", reason=NO_TORCH)
-    from training.export import export
-    from training.network import Network
-
-    export(Network().fuse(), tmp_path / "free.onnx", (64, 96))
-    metadata = {entry.key: entry.value for entry in onnx.load(str(tmp_path / "free.onnx")).metadata_props}
-    assert "Apache-2.0" in metadata["license"]
-    assert metadata["names"] == str(list(data.NAMES)).replace("'", '"')
-
-
 def test_training_lowers_the_loss(torch: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from training import train
 
@@ -212,8 +196,12 @@ def exported(torch: Any, file: Path, size: tuple[int, int] | None) -> Any:
     return ImageNetwork(file, SemanticsConfig())
 
 
-def test_an_exported_file_of_one_size(torch: Any, tmp_path: Path) -> None:
+def test_an_exported_file_of_one_size_names_classes_and_licence(torch: Any, tmp_path: Path) -> None:
     opened = exported(torch, tmp_path / "streets.onnx", (64, 96))
+    onnx = pytest.importorskip("onnx", reason=NO_TORCH)
+    metadata = {entry.key: entry.value for entry in onnx.load(str(tmp_path / "streets.onnx")).metadata_props}
+    assert "Apache-2.0" in metadata["license"]
+    assert metadata["names"] == str(list(data.NAMES)).replace("'", '"')
     assert "96x64 RGB" in opened.describe()
     assert "-> scores: scores of 11 classes" in opened.describe()
 

@@ -39,15 +39,11 @@ class Layout:
     crossings: tuple[tuple[float, float], ...]
     lots: tuple[tuple[float, float, float, float], ...]
 
-    def line(self, s: float) -> tuple[float, float]:
-        """The centre line's y and heading at a station."""
-        x = min(max(s, -STRAIGHT), STRAIGHT)
-        slope = self.slope + self.bend * x
-        return self.y + self.slope * x + self.bend * x * x / 2 + slope * (s - x), float(np.arctan(slope))
-
     def place(self, s: float, d: float) -> tuple[float, float, float]:
         """x, y and heading at a station and an offset."""
-        y, heading = self.line(s)
+        x = min(max(s, -STRAIGHT), STRAIGHT)
+        slope = self.slope + self.bend * x
+        y, heading = self.y + self.slope * x + self.bend * x * x / 2 + slope * (s - x), float(np.arctan(slope))
         return s - d * float(np.sin(heading)), y + d * float(np.cos(heading)), heading
 
     def offset(self, x: Float32, y: Float32) -> Float32:
@@ -113,11 +109,8 @@ class GroundPainter:
         self._side = self._road if rng.random() < 0.6 else stage.add(looks.asphalt(rng))
         self._bay = self._road if rng.random() < 0.5 else stage.add(looks.asphalt(rng))
         self._lot = self._road if rng.random() < 0.4 else stage.add(looks.asphalt(rng))
-        self._walk, self._beyond, self._verge = (
-            stage.add(looks.paving(rng)),
-            stage.add(looks.turf(rng)),
-            stage.add(looks.turf(rng)),
-        )
+        self._walk = stage.add(looks.paving(rng))
+        self._beyond, self._verge = stage.add(looks.turf(rng)), stage.add(looks.turf(rng))
         if rng.random() < 0.35:
             self._beyond = stage.add(looks.paving(rng))
         self._kerb = stage.add(looks.plain(rng, looks.hsv(rng.uniform(0.05, 0.6), 0.06, rng.uniform(0.15, 0.6)), 0, 0.1))
@@ -134,17 +127,14 @@ class GroundPainter:
         self._patches, self._cracks = worn_out[0], worn_out[1]
         self._puddles = rng.uniform(0.3, 1.2) if rng.random() < 0.2 else NONE
         self._litter = rng.uniform(1.8, 3.2) if rng.random() < 0.2 else NONE
-        self._zebras = [
-            (s + side * (half + rng.uniform(1, 4)), rng.uniform(1.2, 2.2)) for s, half in layout.crossings for side in (-1, 1)
-        ]
+        ends = [(s, half, side) for s, half in layout.crossings for side in (-1, 1)]
+        self._zebras = [(s + side * (half + rng.uniform(1, 4)), rng.uniform(1.2, 2.2)) for s, half, side in ends]
         if rng.random() < 0.3:
             self._zebras.append((float(rng.uniform(4, 40)), float(rng.uniform(1.2, 2.2))))
         self._zebra = rng.random() < 0.6
 
-    def paint(
-        self, x: Float32, y: Float32, kerb: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int32], NDArray[np.uint8], Float32, Float32]:
-        """Finishes and labels (n,) of points (n,) m, kerb where they are on a kerb's side, and u, v of the texture."""
+    def paint(self, x: Float32, y: Float32, kerb: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.uint8], Float32]:
+        """Finishes and labels (n,) of points (n,) m, kerb where they are on a kerb's side, and their offsets (n,)."""
         a = self._layout
         d, n = a.offset(x, y), len(x)
         far, road = np.abs(d), a.is_road(x, y)
@@ -152,8 +142,10 @@ class GroundPainter:
         edge = a.road + a.verge
         finish[far < edge + a.walk] = self._walk
         finish[far < edge] = self._verge if a.verge else self._walk
-        rim = ~road & (self._near_road(x, y, 0.14)) & (a.kerb > 0)
-        finish[rim | kerb] = self._kerb
+        beside = np.zeros(n, bool)
+        for dx, dy in ((0.14, 0), (-0.14, 0), (0, 0.14), (0, -0.14)):
+            beside |= a.is_road(x + np.float32(dx), y + np.float32(dy))
+        finish[(~road & beside & (a.kerb > 0)) | kerb] = self._kerb
         own = far < a.road
         finish[road] = self._side
         for s0, s1, d0, d1 in a.lots:
@@ -167,13 +159,7 @@ class GroundPainter:
         self._spoil(finish, road, x, y, d)
         self._lines(finish, own, x, d)
         label[road & ~kerb] = ROAD
-        return finish, label, x, d
-
-    def _near_road(self, x: Float32, y: Float32, width: float) -> NDArray[np.bool_]:
-        out = np.zeros(len(x), bool)
-        for dx, dy in ((width, 0), (-width, 0), (0, width), (0, -width)):
-            out |= self._layout.is_road(x + np.float32(dx), y + np.float32(dy))
-        return out
+        return finish, label, d
 
     def _spoil(self, finish: NDArray[np.int32], road: NDArray[np.bool_], x: Float32, y: Float32, d: Float32) -> None:
         """Patches, cracks, manholes, wet places, fallen leaves."""
@@ -221,8 +207,8 @@ class GroundPainter:
         finish[mark] = self._mark
 
 
-def layout_of(rng: Rng, kind: str, y: float) -> Layout:
-    """A random layout for a kind of place, with the road's centre line at y beside the camera."""
+def layout_of(rng: Rng, kind: str) -> Layout:
+    """A random layout for a kind of place, with the camera on the road's centre line."""
     wide = {"highway": (5.5, 9.0), "lot": (2.6, 4.0), "park": (1.5, 3.5)}.get(kind, (2.8, 7.0))
     road = float(rng.uniform(*wide))
     bay = 2.1 if kind in ("town", "suburb", "blocks") and road > 4.5 and rng.random() < 0.7 else 0.0
@@ -233,7 +219,7 @@ def layout_of(rng: Rng, kind: str, y: float) -> Layout:
             if rng.random() < 0.7:
                 crossings.append((s, float(rng.uniform(2.2, 6.0))))
             s += float(rng.uniform(25, 90))
-    walk = float(rng.uniform(1.2, 4.5)) if kind not in ("highway",) else 0.0
+    walk = float(rng.uniform(1.2, 4.5)) if kind != "highway" else 0.0
     verge = float(rng.uniform(0.6, 3.0)) if rng.random() < (0.3 if kind != "highway" else 1.0) else 0.0
     lots: list[tuple[float, float, float, float]] = []
     for side in (-1, 1):
@@ -243,4 +229,4 @@ def layout_of(rng: Rng, kind: str, y: float) -> Layout:
             lots.append((first, first + float(rng.uniform(20, 70)), *span))
     kerb = 0.0 if rng.random() < 0.2 or kind in ("highway", "park") else float(rng.uniform(0.04, 0.17))
     bend = float(rng.normal(0, 0.0025))
-    return Layout(y, float(rng.normal(0, 0.03)), bend, road, walk, verge, bay, kerb, tuple(crossings), tuple(lots))
+    return Layout(0.0, float(rng.normal(0, 0.03)), bend, road, walk, verge, bay, kerb, tuple(crossings), tuple(lots))

@@ -87,7 +87,7 @@ def light_of(rng: Rng) -> Light:
 
 def sky(light: Light, direction: Float32) -> tuple[Float32, NDArray[np.uint8]]:
     """Light (3, n) and labels (n,) from directions (3, n) of any length: gradient, clouds, the sun, far woods and houses."""
-    x, y, z = direction / np.sqrt((direction * direction).sum(axis=0))
+    x, y, z = unit = direction / np.sqrt((direction * direction).sum(axis=0))
     up = np.clip(z, 0, 1)
     out = light.horizon[:, None] + (light.zenith - light.horizon)[:, None] * np.sqrt(up)
     height = 1 / (up + np.float32(0.1))
@@ -95,9 +95,7 @@ def sky(light: Light, direction: Float32) -> tuple[Float32, NDArray[np.uint8]]:
     cover = np.clip((0.45 * noise + light.cover) * light.sharp, 0, 1) * np.minimum(1, 6 * up)
     shade = 1 + np.float32(0.12) * noise2(x * height, y * height + np.float32(light.seed), light.scale * 2)
     out += (light.cloud[:, None] * shade - out) * cover
-    towards = np.clip(
-        (direction / np.sqrt((direction * direction).sum(axis=0)) * light.sun.astype(np.float32)[:, None]).sum(axis=0), 0, 1
-    )
+    towards = np.clip((unit * light.sun.astype(np.float32)[:, None]).sum(axis=0), 0, 1)
     out += (light.glow * towards**12 + 8 * light.glow * towards**900) * light.direct[:, None] * (1 - 0.8 * cover)
     label = np.full(len(x), SKY, np.uint8)
     low = np.flatnonzero(z < 0.2)
@@ -118,47 +116,37 @@ def sky(light: Light, direction: Float32) -> tuple[Float32, NDArray[np.uint8]]:
     return np.asarray(np.maximum(out, 0), np.float32), label
 
 
-@dataclass(frozen=True, eq=False)
-class Surfaces:
-    """n places as light meets them. albedo, normal, ray: (3, n), the ray a unit vector from the lens. distance, lit, near: (n,).
+def shine(
+    light: Light, albedo: Float32, normal: Float32, ray: Float32, distance: Float32, lit: Float32, near: Float32, gloss: Float32,
+    emit: Float32, leaf: NDArray[np.bool_], forward: Float32,
+) -> Float32:  # fmt: skip
+    """Light (3, n) that reaches the lens from n places.
 
-    lit: share of the sun that is seen. near: share of the ambient light that is not hidden by what stands near. leaf: (n,).
+    albedo, normal, ray: (3, n), the ray a unit vector from the lens. distance, gloss, emit: (n,). lit: (n,) share of the sun that
+    is seen. near: (n,) share of the ambient light that is not hidden by what stands near. leaf: (n,). forward: (3,) where the
+    own headlights shine.
     """
-
-    albedo: Float32
-    normal: Float32
-    ray: Float32
-    distance: Float32
-    lit: Float32
-    near: Float32
-    gloss: Float32
-    emit: Float32
-    leaf: NDArray[np.bool_]
-
-
-def shine(light: Light, at: Surfaces, forward: Float32) -> Float32:
-    """Light (3, n) that reaches the lens. forward: (3,) where the own headlights shine."""
     sun = light.sun.astype(np.float32)
-    direct = np.maximum((at.normal * sun[:, None]).sum(axis=0), 0) * at.lit
-    direct = np.where(at.leaf, 0.35 * at.lit + 0.5 * direct, direct)  # leaves point everywhere and let light through
-    ambient = (np.float32(0.65) + np.float32(0.35) * at.normal[2]) * at.near
-    out = at.albedo * (light.direct[:, None] * direct + light.ambient[:, None] * ambient * 1.6)
+    direct = np.maximum((normal * sun[:, None]).sum(axis=0), 0) * lit
+    direct = np.where(leaf, 0.35 * lit + 0.5 * direct, direct)  # leaves point everywhere and let light through
+    ambient = (np.float32(0.65) + np.float32(0.35) * normal[2]) * near
+    out = albedo * (light.direct[:, None] * direct + light.ambient[:, None] * ambient * 1.6)
     # What the sun lights on the ground lights the walls from below.
-    out += at.albedo * light.direct[:, None] * (0.10 * (1 - at.normal[2]) * max(float(sun[2]), 0))
+    out += albedo * light.direct[:, None] * (0.10 * (1 - normal[2]) * max(float(sun[2]), 0))
     if light.headlights:
-        ahead = np.clip((at.ray * forward[:, None]).sum(axis=0), -1, 1)
-        beam = np.exp(-np.square(np.arccos(ahead) / 0.45)) * np.abs((at.ray * at.normal).sum(axis=0))
-        out += at.albedo * light.headlights * beam / (25 + at.distance**2)
-    shiny = np.flatnonzero(at.gloss > 0)
+        ahead = np.clip((ray * forward[:, None]).sum(axis=0), -1, 1)
+        beam = np.exp(-np.square(np.arccos(ahead) / 0.45)) * np.abs((ray * normal).sum(axis=0))
+        out += albedo * light.headlights * beam / (25 + distance**2)
+    shiny = np.flatnonzero(gloss > 0)
     if len(shiny):
-        ray, n = at.ray[:, shiny], at.normal[:, shiny]
-        cosine = (ray * n).sum(axis=0)
-        mirror = ray - 2 * cosine * n
-        fresnel = at.gloss[shiny] + np.float32(0.6) * (1 - np.abs(cosine)) ** 5
+        r, n = ray[:, shiny], normal[:, shiny]
+        cosine = (r * n).sum(axis=0)
+        mirror = r - 2 * cosine * n
+        fresnel = gloss[shiny] + np.float32(0.6) * (1 - np.abs(cosine)) ** 5
         up = np.clip(3 * mirror[2] + 0.3 + 0.35 * noise2(mirror[0] * 3, mirror[2] * 3 + mirror[1], 8), 0.06, 1)
         out[:, shiny] += fresnel * up * (0.5 * light.horizon + 0.5 * light.zenith)[:, None]
-        glint = np.maximum((mirror * sun[:, None]).sum(axis=0), 0) ** 80 * at.lit[shiny]
+        glint = np.maximum((mirror * sun[:, None]).sum(axis=0), 0) ** 80 * lit[shiny]
         out[:, shiny] += np.minimum(fresnel * 5, 1) * glint * light.direct[:, None]
-    out += at.emit * at.albedo
-    clear = np.exp(-at.distance / np.float32(light.haze))
+    out += emit * albedo
+    clear = np.exp(-distance / np.float32(light.haze))
     return np.asarray(out * clear + light.horizon[:, None] * np.float32(0.75) * (1 - clear), np.float32)

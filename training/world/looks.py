@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -48,22 +48,6 @@ class Finish:
     emit: float = 0.0
 
 
-class Finishes:
-    """The finishes of one world, by number."""
-
-    def __init__(self) -> None:
-        self._rows: list[Finish] = []
-
-    def add(self, finish: Finish) -> int:
-        """Its number."""
-        self._rows.append(finish)
-        return len(self._rows) - 1
-
-    def table(self) -> dict[str, Float32]:
-        """Each field of all finishes: (k,), (k, 2) or (k, 3) float32."""
-        return {f.name: np.array([getattr(row, f.name) for row in self._rows], np.float32) for f in fields(Finish)}
-
-
 def hsv(hue: float, saturation: float, value: float) -> Colour:
     """BGR of a hue (0 red, 1/3 green, 2/3 blue; repeats), all 0..1."""
     r, g, b = colorsys.hsv_to_rgb(hue % 1.0, min(max(saturation, 0.0), 1.0), min(max(value, 0.01), 0.95))
@@ -106,11 +90,8 @@ def wall(rng: Rng) -> Finish:
         if rng.random() < 0.8:  # bricks are mostly red, brown or yellow
             colour = hsv(rng.uniform(0.01, 0.12), rng.uniform(0.25, 0.7), rng.uniform(0.12, 0.5))
             joint = hsv(0.1, rng.uniform(0, 0.2), rng.uniform(0.15, 0.6))
-        size = (
-            (rng.uniform(0.2, 0.3), rng.uniform(0.065, 0.1))
-            if rng.random() < 0.7
-            else (rng.uniform(0.3, 0.9), rng.uniform(0.2, 0.5))
-        )
+        low, high = ((0.2, 0.065), (0.3, 0.1)) if rng.random() < 0.7 else ((0.3, 0.2), (0.9, 0.5))
+        size = (rng.uniform(low[0], high[0]), rng.uniform(low[1], high[1]))
         return Finish(colour, joint, Pattern.BRICK, size, 0.012 + 0.03 * size[1], rng.uniform(0.03, 0.25), **common)
     if kind < 0.82:
         size = (rng.uniform(0.6, 3.0), rng.uniform(0.5, 2.0))
@@ -137,22 +118,15 @@ def paint(rng: Rng) -> Finish:
     """Of vehicles: mostly white, grey, silver and black."""
     kind = rng.random()
     if kind < 0.62:
-        colour = hsv(
-            rng.uniform(0.5, 0.7),
-            rng.uniform(0, 0.12),
-            rng.choice([0.02, 0.05, 0.1, 0.25, 0.4, 0.55, 0.8]) * rng.uniform(0.8, 1.2),
-        )
+        hue, grey = rng.uniform(0.5, 0.7), rng.uniform(0, 0.12)
+        colour = hsv(hue, grey, rng.choice([0.02, 0.05, 0.1, 0.25, 0.4, 0.55, 0.8]) * rng.uniform(0.8, 1.2))
     elif kind < 0.92:
-        colour = hsv(
-            rng.choice([0.0, 0.02, 0.58, 0.62, 0.66, 0.35, 0.12]) + rng.normal(0, 0.02),
-            rng.uniform(0.5, 1),
-            rng.uniform(0.05, 0.6),
-        )
+        hue = rng.choice([0.0, 0.02, 0.58, 0.62, 0.66, 0.35, 0.12]) + rng.normal(0, 0.02)
+        colour = hsv(hue, rng.uniform(0.5, 1), rng.uniform(0.05, 0.6))
     else:
         colour = any_colour(rng)
-    return Finish(
-        colour, scaled(colour, 0.5), fine=rng.uniform(0, 0.03), broad=rng.uniform(0, 0.05), gloss=rng.uniform(0.04, 0.22)
-    )
+    fine, broad = rng.uniform(0, 0.03), rng.uniform(0, 0.05)
+    return Finish(colour, scaled(colour, 0.5), fine=fine, broad=broad, gloss=rng.uniform(0.04, 0.22))
 
 
 def asphalt(rng: Rng) -> Finish:
@@ -187,9 +161,8 @@ def turf(rng: Rng) -> Finish:
     else:
         colour = hsv(rng.uniform(0.05, 0.14), rng.uniform(0.1, 0.6), rng.uniform(0.08, 0.45))
     other = hsv(rng.uniform(0.07, 0.3), rng.uniform(0.2, 0.7), rng.uniform(0.08, 0.35))
-    return Finish(
-        colour, other, Pattern.BLOTCH, (rng.uniform(0.3, 3), 1), 0.02, 0.0, rng.uniform(0.15, 0.4), rng.uniform(25, 70), 0.15
-    )
+    size, fine = (rng.uniform(0.3, 3), 1), rng.uniform(0.15, 0.4)
+    return Finish(colour, other, Pattern.BLOTCH, size, fine=fine, grain=rng.uniform(25, 70), broad=0.15)
 
 
 def foliage(rng: Rng) -> Finish:
@@ -204,9 +177,8 @@ def foliage(rng: Rng) -> Finish:
     else:
         colour = any_colour(rng)
     other = scaled(colour, rng.uniform(0.3, 0.8)) if rng.random() < 0.85 else any_colour(rng)  # flowers
-    return Finish(
-        colour, other, Pattern.BLOTCH, (rng.uniform(0.15, 1.0), 1), 0.02, 0.0, rng.uniform(0.3, 0.7), rng.uniform(10, 30), 0.2
-    )
+    size, fine = (rng.uniform(0.15, 1.0), 1), rng.uniform(0.3, 0.7)
+    return Finish(colour, other, Pattern.BLOTCH, size, fine=fine, grain=rng.uniform(10, 30), broad=0.2)
 
 
 def plain(rng: Rng, colour: Colour | None = None, gloss: float = 0.0, fine: float = 0.05) -> Finish:

@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros_synthetic.solids import Solids, cell, noise2
-from training.world.buildings import FACADE
 from training.world.looks import Float32, Pattern
 from training.world.stage import Cover, Stage
-from training.world.vehicles import BODY
 
 Ints = NDArray[np.int32]
 
@@ -34,32 +32,36 @@ class Places:
 class Painter:
     """Paints the solids of one stage."""
 
-    def __init__(self, stage: Stage, solids: Solids) -> None:
+    def __init__(self, stage: Stage, solids: Solids, night: bool) -> None:
         self._named = stage.finish
-        self._facades = np.array(stage.facades or [[0.0] * len(FACADE)], np.float32).T
-        self._bodies = np.array(stage.bodies or [[0.0] * len(BODY)], np.float32).T
+        self._facades, self._bodies = stage.facades, stage.bodies
         self._own = np.rint(solids.style[:, 1]).astype(np.int32)
         self._variant = np.rint(solids.style[:, 2]).astype(np.int32)
         self._phase = solids.style[:, 3]
         self._half = solids.half.astype(np.float32)
         self._cover = solids.surface
-        self.night = False
+        self._night = night
 
     def finishes(self, at: Places) -> Ints:
         """Finishes (n,) of places."""
         out = self._own[at.ids]
         cover = self._cover[at.ids]
-        for code, paint in (
-            (Cover.FACADE, self._facade), (Cover.BODY, self._body), (Cover.CABIN, self._cabin), (Cover.COACH, self._coach),
-            (Cover.WHEEL, self._wheel), (Cover.SHAPE, self._plate), (Cover.HEAD, self._head), (Cover.LIGHTS, self._lights),
-        ):  # fmt: skip
+        painters = {
+            Cover.FACADE: self._facade, Cover.BODY: self._body, Cover.CABIN: self._cabin, Cover.COACH: self._coach,
+            Cover.WHEEL: self._wheel, Cover.SHAPE: self._plate, Cover.HEAD: self._head, Cover.LIGHTS: self._lights,
+        }  # fmt: skip
+        for code, paint in painters.items():
             some = np.flatnonzero(cover == code)
             if len(some):
                 out[some] = paint(at.pick(some), out[some])
         return out
 
+    def _styles(self, rows: list[dict[str, float]], at: Places) -> dict[str, Float32]:
+        """What the styles of places say, (n,) by name."""
+        return {name: np.array([row[name] for row in rows], np.float32)[self._variant[at.ids]] for name in rows[0]}
+
     def _facade(self, at: Places, wall: Ints) -> Ints:
-        s = dict(zip(FACADE, self._facades[:, self._variant[at.ids]], strict=True))
+        s = self._styles(self._facades, at)
         phase, half = self._phase[at.ids], self._half[at.ids]
         reach = np.where(at.face == 0, half[:, 1], half[:, 0])
         pitch = 2 * reach / np.maximum(np.floor(2 * reach / s["pitch"]), 1)  # whole windows between the corners
@@ -72,35 +74,18 @@ class Painter:
         wide = np.where(shop, pitch * 0.44, np.where(door, np.minimum(wide, 0.7), wide))
         sill = np.where(shop, 0.45, np.where(door, 0.08, s["sill"]))
         lintel = s["lintel"]
-        whole = at.v < 2 * half[:, 2] - 0.2
-        hole = (
-            (x < wide)
-            & (y > sill)
-            & (y < lintel)
-            & whole
-            & (at.face < 2)
-            & ~((cell(column, row, phase * 999) < s["blind"]) & ~shop)
-        )
+        within = (y > sill) & (y < lintel) & (at.v < 2 * half[:, 2] - 0.2) & (at.face < 2)
+        hole = (x < wide) & within & ~((cell(column, row, phase * 999) < s["blind"]) & ~shop)
         frame = np.where(shop, 0.06, s["frame"])
         pane = hole & (x < wide - frame) & (y > sill + frame) & (y < lintel - frame)
         across = np.abs((x / wide * (s["bars_x"] + 1) / 2 + np.where(s["bars_x"] % 2 > 0, 0.0, 0.5)) % 1.0 - 0.5) * wide * 2
         up = np.abs(((y - sill) / (lintel - sill) * (s["bars_y"] + 1) + 0.5) % 1.0 - 0.5) * (lintel - sill)
         pane &= ~((across > wide - 0.035) & (s["bars_x"] > 0)) & ~((up < 0.03) & (s["bars_y"] > 0))
         lower = cell(column * 3 + 1, row, phase * 999)  # how far a curtain or a blind is down
-        curtain = (
-            pane & (lower < s["curtain"]) & (y > sill + (lintel - sill) * np.abs(2 * lower / np.maximum(s["curtain"], 0.01) - 1))
-        )
-        lit = pane & (cell(column + 5, row * 3, phase * 999) < s["lit"]) & self.night
-        shutter = (
-            (s["shutter"] > 0)
-            & ~ground
-            & (x > wide)
-            & (x < wide + s["shutter"])
-            & (y > sill)
-            & (y < lintel)
-            & (at.face < 2)
-            & whole
-        )
+        down = (lintel - sill) * np.abs(2 * lower / np.maximum(s["curtain"], 0.01) - 1)
+        curtain = pane & (lower < s["curtain"]) & (y > sill + down)
+        lit = pane & (cell(column + 5, row * 3, phase * 999) < s["lit"]) & self._night
+        shutter = (s["shutter"] > 0) & ~ground & (x > wide) & (x < wide + s["shutter"]) & within
         band = (y < s["band"]) & (row > 0) & (at.face < 2)
         glass, trim, wood = (s[name].astype(np.int32) for name in ("glass", "trim", "door"))
         out = np.where(band, trim, wall)
@@ -108,10 +93,10 @@ class Painter:
         out = np.where(hole, np.where(door, wood, trim), out)
         out = np.where(pane & ~door, glass, out)
         out = np.where(curtain & ~door, self._named["curtain"], out)
-        return np.where(lit & ~door, self._named["lit"], out).astype(np.int32)
+        return np.where(lit & ~door, self._named["lit"], out)
 
     def _body(self, at: Places, paint: Ints) -> Ints:
-        s = dict(zip(BODY, self._bodies[:, self._variant[at.ids]], strict=True))
+        s = self._styles(self._bodies, at)
         (x, y, z), name, front = at.q, self._named, at.q[0] > 0
         ends, sides = at.face == 0, at.face == 1
         lamp = ends & (np.abs(y) > s["lamp in"]) & (z > s["lamp low"]) & (z < s["lamp high"]) & (np.abs(y) < 0.95)
@@ -125,15 +110,15 @@ class Painter:
         out = np.where((z < s["sill"]) | seam | arch | grille, name["dark"], paint)
         out = np.where(handle, name["chrome"], out)
         out = np.where(lamp, np.where(front, name["lamp"], name["tail"]), out)
-        return np.where(plate, name["plate"], out).astype(np.int32)
+        return np.where(plate, name["plate"], out)
 
     def _cabin(self, at: Places, paint: Ints) -> Ints:
-        s = dict(zip(BODY, self._bodies[:, self._variant[at.ids]], strict=True))
+        s = self._styles(self._bodies, at)
         x, y, z = at.q
         w = s["pillar"]
         pillar = (np.abs(np.abs(x) - 0.9 + 0.16 * (z + 1)) < w) | (np.abs(x - 0.05) < 0.7 * w)
         glass = np.where(at.face == 1, ~pillar & (np.abs(x) < 0.9), np.abs(y) < 0.86) & (z > -0.82) & (z < 0.78) & (at.face < 2)
-        return np.where(glass, self._named["car glass"], paint).astype(np.int32)
+        return np.where(glass, self._named["car glass"], paint)
 
     def _coach(self, at: Places, paint: Ints) -> Ints:
         z, width = at.q[2], 1.5 + 0.5 * self._phase[at.ids]
@@ -144,28 +129,28 @@ class Painter:
         door = (at.face == 1) & (np.abs(np.abs(at.q[0]) - 0.8) < 0.06) & (z < 0.6) & ~pillar
         lamp = (at.face == 0) & (np.abs(at.q[1]) > 0.7) & (np.abs(z + 0.75) < 0.1)
         out = np.where(glass | door, self._named["car glass"], paint)
-        return np.where(lamp, self._named["lamp"], out).astype(np.int32)
+        return np.where(lamp, self._named["lamp"], out)
 
     def _wheel(self, at: Places, tyre: Ints) -> Ints:
         r, spokes = np.hypot(at.q[0], at.q[2]), np.cos(self._variant[at.ids] * np.arctan2(at.q[0], at.q[2])) > -0.3
         rim = (np.abs(at.q[1]) > 0.98) & (r < 0.7) & (spokes | (r < 0.2) | (r > 0.62))
-        return np.where(rim, self._named["rim"], tyre).astype(np.int32)
+        return np.where(rim, self._named["rim"], tyre)
 
     def _plate(self, at: Places, face: Ints) -> Ints:
         back = (at.face == 0) & (at.q[0] > 0) & (self._phase[at.ids] < 0.6)
         border = _inside(at.q[1] * 1.22, at.q[2] * 1.22, self._variant[at.ids])
         rim = np.where(self._phase[at.ids] < 0.5, self._named["red"], self._named["white"])
-        return np.where(back, self._named["metal"], np.where(border, face, rim)).astype(np.int32)
+        return np.where(back, self._named["metal"], np.where(border, face, rim))
 
     def _head(self, at: Places, skin: Ints) -> Ints:
-        return np.where((at.q[2] > 0.3) | (at.q[0] < -0.25), self._named["hair"], skin).astype(np.int32)
+        return np.where((at.q[2] > 0.3) | (at.q[0] < -0.25), self._named["hair"], skin)
 
     def _lights(self, at: Places, case: Ints) -> Ints:
         which = np.floor((at.q[2] + 1) * 1.5)
         disc = (at.face == 0) & (at.q[0] < 0) & (np.hypot(at.q[1] * 0.16, ((at.q[2] + 1) * 1.5 - which - 0.5) * 0.3) < 0.11)
         on = which == self._variant[at.ids] % 3
         colour = np.where(which > 1, self._named["red light"], self._named["green light"])
-        return np.where(disc, np.where(on, colour, self._named["dark"]), case).astype(np.int32)
+        return np.where(disc, np.where(on, colour, self._named["dark"]), case)
 
 
 def _inside(y: Float32, z: Float32, shape: Ints) -> NDArray[np.bool_]:
@@ -215,7 +200,7 @@ def texture(table: dict[str, Float32], finish: Ints, u: Float32, v: Float32, shi
         some = np.flatnonzero(pattern == kind)
         mix[some], tone[some] = _pattern(int(kind), u[some], v[some], size[some], f["joint"][some], shift[some])
         tone[some] = 1 + f["spread"][some] * (tone[some] - 0.5) * 2
-        if kind in (Pattern.BLOTCH,):
+        if kind == Pattern.BLOTCH:
             continue
         cells = np.minimum(size[some, 0], size[some, 1]) / np.maximum(texel[some], 1e-4)
         fade = np.clip(cells / 2 - 0.5, 0, 1)
@@ -241,12 +226,10 @@ def _pattern(kind: int, u: Float32, v: Float32, size: Float32, joint: Float32, s
     if kind == Pattern.PRINT:
         noise = noise2(u / size[:, 0] + shift * 17, v / size[:, 1], 3)
         line = (np.floor(v / size[:, 1] / 3 + shift * 5) % 2) > 0
-        return np.where(line, cell(along * 3, row, shift * 999) < 0.45, noise > 0.7).astype(np.float32), cell(
-            column, row, shift * 999
-        )
+        share = np.where(line, cell(along * 3, row, shift * 999) < 0.45, noise > 0.7)
+        return share.astype(np.float32), cell(column, row, shift * 999)
     gap_u, gap_v = (along - column) * size[:, 0] < joint, (v - row * size[:, 1]) < joint
-    if kind == Pattern.ROWS:
-        return gap_v.astype(np.float32), cell(row, shift * 999)
-    if kind == Pattern.COLUMNS:
-        return gap_u.astype(np.float32), cell(column, shift * 999)
+    if kind in (Pattern.ROWS, Pattern.COLUMNS):
+        share, which = (gap_v, row) if kind == Pattern.ROWS else (gap_u, column)
+        return share.astype(np.float32), cell(which, shift * 999)
     return (gap_u | gap_v).astype(np.float32), cell(column, row, shift * 999)

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from calib_ros_synthetic.camera import SunView
 from calib_ros_synthetic.rays import SKY as NOTHING
-from calib_ros_synthetic.rays import Jobs, Rays, intersect
-from calib_ros_synthetic.solids import Kind, Solids, cell
+from calib_ros_synthetic.rays import Jobs, Rays, cast, unmet
+from calib_ros_synthetic.solids import Solids, cell
+from calib_ros_synthetic.surfaces import faces
 from training.world.cameras import RandomCamera, camera_of, exposed
 from training.world.grounds import GROUND, GroundPainter, Layout, cast_ground
-from training.world.light import Light, Surfaces, light_of, shine, sky
+from training.world.light import Light, light_of, shine, sky
 from training.world.looks import Float32
 from training.world.paint import Painter, Places, open_at, texture
 from training.world.places import Place
@@ -58,8 +59,8 @@ def render(world: World) -> Picture:
     """The picture of a world."""
     camera, rng = world.camera, world.stage.rng
     rays = camera.view.rays(camera.R)
-    t, ids = np.full(rays.shape, np.inf, np.float32), np.full(rays.shape, NOTHING, np.int32)
-    cast(rays, world.solids, camera.view.jobs(world.solids, camera.R), t, ids)
+    t, ids = unmet(rays.shape)
+    _cast(rays, world.solids, camera.view.jobs(world.solids, camera.R), t, ids)
     kerbs = cast_ground(rays, world.layout, camera.height, t, ids)
     light, labels = _shaded(world, rays, t.ravel(), ids.ravel(), kerbs.ravel())
     image = np.ascontiguousarray(light.reshape(3, *ids.shape).transpose(1, 2, 0))
@@ -70,23 +71,18 @@ def render(world: World) -> Picture:
     return levels, labels
 
 
-def cast(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints) -> None:
+def _cast(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints) -> None:
     """As the ray caster's own, with holes in porous solids."""
-    for (i, r0, r1, c0, c1), nearest in zip(jobs.window.tolist(), jobs.nearest.tolist(), strict=True):
-        old = t[r0:r1, c0:c1]
-        if old.max() <= nearest:
-            continue
-        window = rays.window(slice(r0, r1), slice(c0, c1))
-        new = intersect(solids, i, window, old)
-        hit = new < old
+
+    def pierce(i: int, window: Rays, new: Float32, hit: NDArray[np.bool_]) -> None:
         if int(solids.surface[i]) in POROUS:
             rows, columns = np.nonzero(hit)
             points = [np.broadcast_to(p, hit.shape)[rows, columns] for p in window.at(np.where(hit, new, 0))]
             q = _local(solids, np.full(len(rows), i), np.stack(points).astype(np.float32))
             gap = open_at(int(solids.surface[i]), round(float(solids.style[i, 2])), q, solids.half[i].astype(np.float32))
             hit[rows[gap], columns[gap]] = False
-        np.copyto(old, new, where=hit)
-        np.copyto(ids[r0:r1, c0:c1], i, where=hit)
+
+    cast(rays, solids, jobs, t, ids, pierce)
 
 
 def _local(solids: Solids, ids: NDArray[np.integer], xyz: Float32) -> Float32:
@@ -112,7 +108,8 @@ def _shaded(world: World, rays: Rays, t: Float32, ids: Ints, kerbs: NDArray[np.b
     u, v, leaf, label = np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, bool), np.zeros(n, np.uint8)
     normal[2] = 1
     g = np.flatnonzero(what == GROUND)
-    finish[g], label[g], u[g], v[g] = world.ground.paint(xyz[0, g], xyz[1, g], kerbs[some][g])
+    u[g] = xyz[0, g]
+    finish[g], label[g], v[g] = world.ground.paint(xyz[0, g], xyz[1, g], kerbs[some][g])
     near[g] = _beneath(solids, camera.height, xyz[0, g], xyz[1, g])
     b = np.flatnonzero(what >= 0)
     if len(b):
@@ -121,9 +118,7 @@ def _shaded(world: World, rays: Rays, t: Float32, ids: Ints, kerbs: NDArray[np.b
         face, bent, u[b], v[b] = _geometry(solids, hit, q)
         c, s = np.cos(solids.yaw[hit]), np.sin(solids.yaw[hit])
         normal[:, b] = np.stack([c * bent[0] - s * bent[1], s * bent[0] + c * bent[1], bent[2]])
-        painter = Painter(world.stage, solids)
-        painter.night = world.light.night
-        finish[b] = painter.finishes(Places(hit, q, face, u[b], v[b]))
+        finish[b] = Painter(world.stage, solids, world.light.night).finishes(Places(hit, q, face, u[b], v[b]))
         leaf[b] = solids.surface[hit] == Cover.LEAF
         inner = np.clip(np.sqrt((q * q).sum(axis=0)), 0, 1)  # leaves deep within a clump, and low, are dark
         tint[b] = solids.colour[hit, 0] * np.where(leaf[b], (0.25 + 0.75 * inner * inner) * (0.72 + 0.28 * q[2]), 1)
@@ -132,14 +127,16 @@ def _shaded(world: World, rays: Rays, t: Float32, ids: Ints, kerbs: NDArray[np.b
         near[b] = 0.6 + 0.4 * above
     mixed = leaf & (label == TREE)
     u[mixed] += 0.6 * xyz[2, mixed]
-    table = world.stage.finishes.table()
+    table = world.stage.table()
     texel = distance / np.float32(camera.focal)
     tint[leaf] *= _single_leaves(xyz[:, leaf], texel[leaf])
     albedo = texture(table, finish, u, v, shift, texel) * tint
     lit = _lit(world, xyz, what, normal)
-    at = Surfaces(albedo, normal, xyz / distance, distance, lit, near, table["gloss"][finish], table["emit"][finish], leaf)
-    forward = camera.R[:, 2].astype(np.float32)
-    out[:, some], labels[some] = shine(world.light, at, forward), label
+    out[:, some] = shine(
+        world.light, albedo, normal, xyz / distance, distance, lit, near, table["gloss"][finish], table["emit"][finish], leaf,
+        camera.R[:, 2].astype(np.float32),
+    )  # fmt: skip
+    labels[some] = label
     return out, labels
 
 
@@ -157,32 +154,13 @@ def _geometry(solids: Solids, ids: Ints, q: Float32) -> tuple[NDArray[np.uint8],
 
     Vehicles' normals are bent outwards as if their sheets were curved: flat ones mirror one colour only.
     """
-    half, kind = solids.half[ids].T.astype(np.float32), solids.kind[ids]
-    slope = (solids.taper[ids] / 2).T.astype(np.float32)
-    side = [np.abs(q[k]) + slope[k] * (q[2] + 1) for k in (0, 1)]
-    across = (side[0] >= side[1]) & (side[0] >= np.abs(q[2]))
-    along = ~across & (side[1] >= np.abs(q[2]))
-    face = np.where(across, 0, np.where(along, 1, 2)).astype(np.uint8)
-    top = ~across & ~along
-    normal = np.stack([
-        np.where(across, np.sign(q[0]), 0), np.where(along, np.sign(q[1]), 0),
-        np.where(across, slope[0], np.where(along, slope[1], np.where(top, np.sign(q[2]), 0))),
-    ])  # fmt: skip
-    curved = kind == Kind.ELLIPSOID
-    normal = np.where(curved, q, normal)
-    for shape, k in ((Kind.CYLINDER, 2), (Kind.WHEEL, 1)):
-        m = kind == shape
-        cap = m & (np.abs(q[k]) > 0.999)
-        for j in range(3):
-            normal[j] = np.where(cap, np.sign(q[k]) if j == k else 0, np.where(m, 0 if j == k else q[j], normal[j]))
-    normal = normal / half
+    face, parts, u, v = faces(solids, ids, q)
+    normal = np.stack(parts)
     normal /= np.sqrt((normal * normal).sum(axis=0)) + 1e-9
     bend = np.isin(solids.surface[ids], [Cover.BODY, Cover.CABIN]) * np.float32(0.3)
     normal += bend * q
     normal /= np.sqrt((normal * normal).sum(axis=0)) + 1e-9
-    u = np.where(across, q[1] * half[1], q[0] * half[0])
-    v = np.where(top, q[1] * half[1], (q[2] + 1) * half[2])
-    return face, normal.astype(np.float32), u, v
+    return face, normal, u, v
 
 
 def _beneath(solids: Solids, height: float, x: Float32, y: Float32) -> Float32:
@@ -190,9 +168,8 @@ def _beneath(solids: Solids, height: float, x: Float32, y: Float32) -> Float32:
     size, reach = int(2 * 50 / BENEATH), 50.0
     grid = np.zeros((size, size), np.float32)
     low = solids.centre[:, 2] - solids.half[:, 2] + height < 0.7
-    close = (
-        (np.abs(solids.centre[:, :2]) < reach).all(axis=1) & low & np.isin(solids.label, [CAR, PEDESTRIAN, CYCLIST, OTHER, TREE])
-    )
+    close = (np.abs(solids.centre[:, :2]) < reach).all(axis=1) & low
+    close &= np.isin(solids.label, [CAR, PEDESTRIAN, CYCLIST, OTHER, TREE])
     if close.any():
         foot = solids.corners()[close][:, [0, 1, 3, 2], :2]
         for corners in np.rint((foot + reach) / BENEATH).astype(np.int32):
@@ -209,13 +186,11 @@ def _lit(world: World, xyz: Float32, ids: Ints, normal: Float32) -> Float32:
     if float(light.direct.max()) < 0.1:
         return out
     ahead, wide, high = SHADOWED
-    forward = np.array([np.cos(camera.yaw), np.sin(camera.yaw)])
-    left = np.array([-forward[1], forward[0]])
     low = -4.0 if camera.focal > 150 else -15.0
-    box = [[*(a * forward + b * left), z] for a in (low, ahead) for b in (-wide, wide) for z in (-camera.height, high)]
-    view = SunView(light.sun, np.array(box), TEXEL)
-    depth, owner = np.full(view.shape, np.inf, np.float32), np.full(view.shape, NOTHING, np.int32)
-    cast(view.rays(), world.solids, view.jobs(world.solids), depth, owner)
+    forward = np.array([np.cos(camera.yaw), np.sin(camera.yaw)])
+    view = SunView(light.sun, forward, (low, ahead), wide, (-camera.height, high), TEXEL)
+    depth, owner = unmet(view.shape)
+    _cast(view.rays(), world.solids, view.jobs(world.solids), depth, owner)
     facing = np.flatnonzero((normal * light.sun.astype(np.float32)[:, None]).sum(axis=0) > 0)
     at = view.axes.astype(np.float32) @ xyz[:, facing]
     column, row = ((at[k] - np.float32(view.low[k])) / TEXEL for k in (0, 1))

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import cos, pi
 
 import numpy as np
 
-from calib_ros_synthetic.solids import Kind
 from training.world import buildings, furniture, looks, people, plants, vehicles
 from training.world.cameras import RandomCamera
-from training.world.grounds import Layout, layout_of
-from training.world.stage import OTHER, Cover, Stage
+from training.world.grounds import layout_of
+from training.world.stage import OTHER, Stage
 
 KINDS = ("town", "suburb", "blocks", "park", "works", "lot", "highway")
 SHARES = (0.27, 0.28, 0.12, 0.09, 0.08, 0.09, 0.07)
+KERBSIDE = (furniture.lamp, furniture.mast, furniture.sign, furniture.board, furniture.traffic_light, furniture.bollard)
 AHEAD, BEHIND = 105.0, 22.0  # m along the road that is furnished
 
 
@@ -25,24 +26,26 @@ class Place:
         self.stage, self.rng = stage, rng
         self.kind = KINDS[int(rng.choice(len(KINDS), p=SHARES))]
         lane = -rng.uniform(0.1, 0.6) * (1 if rng.random() < 0.6 else -1)
-        layout = layout_of(rng, self.kind, 0.0)
+        layout = layout_of(rng, self.kind)
         if rng.random() < 0.1:  # on the pavement
             offset = rng.choice([-1, 1]) * (layout.road + layout.verge + 0.6 * max(layout.walk, 1))
         else:
             offset = lane * layout.road
-        self.layout = Layout(**{**vars(layout), "y": -offset})
-        turned = abs(camera.yaw)
-        wide = 1.0 if turned < 0.5 else 0.0
-        self.first = -BEHIND if wide else -AHEAD * max(-cos(camera.yaw), 0.4)
-        self.last = AHEAD if wide else AHEAD * max(cos(camera.yaw), 0.4)
+        self.layout = replace(layout, y=-offset)
+        ahead = cos(camera.yaw)
+        self.first, self.last = -BEHIND, AHEAD
+        if abs(camera.yaw) >= 0.5:
+            self.first, self.last = -AHEAD * max(-ahead, 0.4), AHEAD * max(ahead, 0.4)
         self.winter = float(rng.choice([0.0, rng.uniform(0.2, 1.0)], p=[0.7, 0.3]))
         self._furnish()
         if rng.random() < 0.15:
             self._bonnet(camera)
 
-    def _at(self, s: float, d: float, turn: float = 0.0, raised: bool = True) -> None:
+    def _at(self, s: float, d: float, turn: float = 0.0, raised: bool = True) -> Stage:
+        """The stage, with its frame at a station and an offset."""
         x, y, heading = self.layout.place(s, d)
         self.stage.at(x, y, heading + turn, self.layout.kerb if raised else 0.0)
+        return self.stage
 
     def _spread(self, step: tuple[float, float]) -> list[float]:
         """Stations with random steps between them."""
@@ -63,22 +66,20 @@ class Place:
                 self._parked(side)
             if kind == "highway":
                 for s in self._spread((8.0, 8.0)) if rng.random() < 0.7 else []:
-                    self._at(s, side * (a.road + 0.7), 0 if side < 0 else pi)
-                    furniture.rail(self.stage, 8.0)
+                    furniture.rail(self._at(s, side * (a.road + 0.7), 0 if side < 0 else pi), 8.0)
         self._lots()
         self._traffic()
         self._people()
         if kind == "highway" and rng.random() < 0.4:
-            self._at(rng.uniform(20, 80), 0)
-            furniture.gantry(self.stage, a.road + 1.5)
+            furniture.gantry(self._at(rng.uniform(20, 80), 0), rng, a.road + 1.5)
         for s, half in a.crossings:
             if rng.random() < 0.8:  # what closes the view along a crossing road
                 for side in (-1, 1):
                     self._at(s, side * rng.uniform(45, 80), 0 if side > 0 else pi)
-                    buildings.house(self.stage, rng.uniform(8, 20), 9, int(rng.integers(1, 5)))
+                    buildings.house(self.stage, rng, rng.uniform(8, 20), 9, int(rng.integers(1, 5)))
                     self._at(s + rng.normal(0, half), side * (a.road + rng.uniform(4, 30)), pi / 2, False)
                     if rng.random() < 0.6:
-                        vehicles.any_vehicle(self.stage)
+                        vehicles.any_vehicle(self.stage, rng)
 
     def _houses(self, side: int) -> None:
         a, rng, kind = self.layout, self.rng, self.kind
@@ -97,19 +98,19 @@ class Place:
                 continue
             self._at(middle, side * (front + back + depth / 2), (0 if side > 0 else pi) + np.deg2rad(rng.normal(0, 1.5)))
             if kind in ("works", "lot") and rng.random() < 0.6:
-                buildings.hall(self.stage, length, depth * 1.5, rng.uniform(3.5, 10))
+                buildings.hall(self.stage, rng, length, depth * 1.5, rng.uniform(3.5, 10))
             else:
-                buildings.house(self.stage, length, depth, max(1, round(storeys + rng.uniform(-1, 1))))
+                buildings.house(self.stage, rng, length, depth, max(1, round(storeys + rng.uniform(-1, 1))))
             if back > 1.5 and rng.random() < edges:
                 self._at(middle, side * (front + 0.3))
                 if rng.random() < 0.4:
-                    plants.hedge(self.stage, length)
+                    plants.hedge(self.stage, rng, length)
                 else:
-                    buildings.border(self.stage, length)
+                    buildings.border(self.stage, rng, length)
             if back > 3:
                 for _ in range(int(rng.poisson(1.2))):
                     self._at(s + rng.uniform(0, length), side * (front + rng.uniform(1.2, back - 0.8)))
-                    plants.bush(self.stage) if rng.random() < 0.6 else plants.any_tree(self.stage, self.winter)
+                    plants.bush(self.stage, rng) if rng.random() < 0.6 else plants.any_tree(self.stage, rng, self.winter)
             s += length + (0.0 if row else rng.choice([0.3, rng.uniform(2, 9)]))
 
     def _greenery(self, side: int) -> None:
@@ -121,26 +122,24 @@ class Place:
             d = a.road + 0.6 + 0.5 * a.verge
             for s in self._spread((5, 16)):
                 if a.free(s, 2):
-                    self._at(s, side * d)
-                    plants.any_tree(self.stage, self.winter)
+                    plants.any_tree(self._at(s, side * d), rng, self.winter)
         if far:
             for _ in range(int(rng.poisson(22 * density))):
                 s, d = rng.uniform(self.first, self.last), front + 1.5 + far * rng.random() ** 1.5
                 if a.free(s, 2):
-                    self._at(s, side * d)
-                    plants.bush(self.stage) if rng.random() < 0.35 else plants.any_tree(self.stage, self.winter)
+                    stage = self._at(s, side * d)
+                    plants.bush(stage, rng) if rng.random() < 0.35 else plants.any_tree(stage, rng, self.winter)
             if rng.random() < 0.5:
                 for s in self._spread((7, 9)):
                     if a.free(s, 4):
                         self._at(s, side * (front + 0.8))
-                        plants.hedge(self.stage, 7.5) if rng.random() < 0.5 else buildings.border(self.stage, 7.5)
+                        plants.hedge(self.stage, rng, 7.5) if rng.random() < 0.5 else buildings.border(self.stage, rng, 7.5)
             return
         for _ in range(int(rng.poisson(7 * rng.random()))):  # behind the houses
-            self._at(rng.uniform(self.first, self.last), side * (front + rng.uniform(14, 40)))
-            plants.any_tree(self.stage, self.winter)
+            plants.any_tree(self._at(rng.uniform(self.first, self.last), side * (front + rng.uniform(14, 40))), rng, self.winter)
         for _ in range(int(rng.poisson(5 * rng.random()))):
             self._at(rng.uniform(self.first, self.last), side * (front + rng.uniform(26, 60)), 0 if side > 0 else pi)
-            buildings.house(self.stage, rng.uniform(8, 25), 9, int(rng.integers(1, 9)))
+            buildings.house(self.stage, rng, rng.uniform(8, 25), 9, int(rng.integers(1, 9)))
 
     def _kerbside(self, side: int) -> None:
         a, rng = self.layout, self.rng
@@ -152,22 +151,18 @@ class Place:
             what = int(rng.choice(8, p=shares / shares.sum()))
             self._at(s, side * (a.road + rng.uniform(0.3, 0.8)), inward)
             if what < 6:
-                (furniture.lamp, furniture.mast, furniture.sign, furniture.board, furniture.traffic_light, furniture.bollard)[
-                    what
-                ](self.stage)
+                KERBSIDE[what](self.stage, rng)
             elif what == 6:
                 self._at(s, side * (a.road + a.verge + 0.8 * a.walk), inward + rng.normal(0, 0.2))
-                buildings.kiosk(self.stage) if rng.random() < 0.2 else furniture.clutter(self.stage)
+                buildings.kiosk(self.stage, rng) if rng.random() < 0.2 else furniture.clutter(self.stage, rng)
             elif rng.random() < 0.6:
-                self._at(s, side * (a.road + 0.3), inward)
-                buildings.border(self.stage, rng.uniform(2, 8))
+                buildings.border(self._at(s, side * (a.road + 0.3), inward), rng, rng.uniform(2, 8))
             else:
-                self._at(s, side * (a.road + 0.9 * a.walk), inward + rng.uniform(-1, 1))
-                people.bicycle(self.stage)
+                people.bicycle(self._at(s, side * (a.road + 0.9 * a.walk), inward + rng.uniform(-1, 1)), rng)
         for s, half in a.crossings:
             if rng.random() < 0.5:
                 self._at(s - half - 1, side * (a.road + 0.6), inward)
-                furniture.traffic_light(self.stage) if rng.random() < 0.5 else furniture.sign(self.stage)
+                furniture.traffic_light(self.stage, rng) if rng.random() < 0.5 else furniture.sign(self.stage, rng)
 
     def _parked(self, side: int) -> None:
         a, rng = self.layout, self.rng
@@ -180,8 +175,7 @@ class Place:
             near = abs(s) < 3.5 and abs(self.layout.y + side * d) < 2.2  # the camera is no parked car
             if rng.random() < share and a.free(s, 3) and not near:
                 turn = pi / 2 if across else rng.choice([0.0, pi], p=[0.75, 0.25]) + (0 if side < 0 else pi)
-                self._at(s, side * d, turn + np.deg2rad(rng.normal(0, 2)), d > a.road)
-                vehicles.any_vehicle(self.stage, 0.03)
+                vehicles.any_vehicle(self._at(s, side * d, turn + np.deg2rad(rng.normal(0, 2)), d > a.road), rng, 0.03)
 
     def _lots(self) -> None:
         rng = self.rng
@@ -192,10 +186,10 @@ class Place:
                     if rng.random() < share and abs(row) > self.layout.road + 2.4 and self.first < s < self.last:
                         self._at(s, row, pi / 2 * rng.choice([-1, 1]) + rng.normal(0, 0.03), False)
                         if np.hypot(*self.layout.place(s, row)[:2]) > 3.5:
-                            vehicles.any_vehicle(self.stage, 0.01)
+                            vehicles.any_vehicle(self.stage, rng, 0.01)
                 if rng.random() < 0.4:
                     self._at(rng.uniform(s0, s1), row + 2.6)
-                    (furniture.lamp if rng.random() < 0.5 else furniture.board)(self.stage)
+                    (furniture.lamp if rng.random() < 0.5 else furniture.board)(self.stage, rng)
 
     def _traffic(self) -> None:
         a, rng = self.layout, self.rng
@@ -205,37 +199,30 @@ class Place:
         for _ in range(count):
             direction = rng.choice([-1, 1])
             s = rng.uniform(6, 30) if jam else rng.uniform(self.first, self.last)
-            d = (
-                -direction
-                * (a.road - a.bay)
-                * rng.uniform(0.35, 0.55)
-                * (rng.integers(1, lanes + 1) / lanes * 2 if lanes > 1 else 1)
-            )
+            middle = -direction * (a.road - a.bay) * rng.uniform(0.35, 0.55)
+            d = middle * (rng.integers(1, lanes + 1) / lanes * 2 if lanes > 1 else 1)
             x, y, _ = a.place(s, d)
             if np.hypot(x, y) > 5.5 and abs(d) < a.road - 0.8:
-                self._at(s, d, (0 if direction > 0 else pi) + rng.normal(0, 0.04), False)
-                vehicles.any_vehicle(self.stage, 0.18)
+                vehicles.any_vehicle(self._at(s, d, (0 if direction > 0 else pi) + rng.normal(0, 0.04), False), rng, 0.18)
 
     def _people(self) -> None:
         a, rng = self.layout, self.rng
         crowd = {"town": 6.0, "highway": 0.0, "park": 4.0}.get(self.kind, 2.5) * rng.uniform(0, 2)
         for _ in range(int(rng.poisson(crowd))):
-            side, s = (
-                rng.choice([-1, 1]),
-                (self.last - 2) * rng.random() ** 1.4 if rng.random() < 0.8 else rng.uniform(self.first, 0),
-            )
+            side = rng.choice([-1, 1])
+            s = (self.last - 2) * rng.random() ** 1.4 if rng.random() < 0.8 else rng.uniform(self.first, 0)
             d = side * (a.road + a.verge + rng.uniform(0.3, max(a.walk, 0.8)))
             if rng.random() < 0.12:
                 d = rng.uniform(-a.road, a.road)
             x, y, _ = a.place(s, d)
             if np.hypot(x, y) > 2.0:
                 self._at(s, d, rng.choice([0, pi, rng.uniform(0, 6)]) + rng.normal(0, 0.2), abs(d) > a.road)
-                people.group(self.stage) if rng.random() < 0.3 else people.person(self.stage)
+                people.group(self.stage, rng) if rng.random() < 0.3 else people.person(self.stage, rng)
         for _ in range(int(rng.poisson(0.2 if self.kind == "highway" else 1.3))):
             s, d = rng.uniform(3, 45), rng.choice([-1, 1]) * a.road * rng.uniform(0.3, 0.95)
             if np.hypot(*a.place(s, d)[:2]) > 2.5:
                 self._at(s, d, (0 if d < 0 else pi) + rng.normal(0, 0.3), False)
-                people.motorcyclist(self.stage) if rng.random() < 0.3 else people.cyclist(self.stage)
+                people.motorcyclist(self.stage, rng) if rng.random() < 0.3 else people.cyclist(self.stage, rng)
 
     def _bonnet(self, camera: RandomCamera) -> None:
         """The own vehicle below the view; it has no class."""
@@ -243,6 +230,4 @@ class Place:
         stage.at(0, 0, camera.yaw)
         drop = max(0.2, camera.height - rng.uniform(0.6, 1.0))
         finish = stage.add(looks.paint(rng))
-        stage.put(
-            Kind.ELLIPSOID, Cover.PLAIN, OTHER, (rng.uniform(1.1, 1.6), rng.normal(0, 0.2), drop - 0.15), (0.9, 0.95, 0.2), finish
-        )
+        stage.ellipsoid(OTHER, (rng.uniform(1.1, 1.6), rng.normal(0, 0.2), drop - 0.15), (0.9, 0.95, 0.2), finish)

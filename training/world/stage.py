@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields, replace
 from enum import IntEnum
+from functools import partialmethod
 from math import cos, sin
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros_synthetic.solids import Builder, Kind, Solids, Surface
 from training.data import NAMES, VOID
-from training.world.looks import Finish, Finishes, Rng, hsv, plain, scaled
+from training.world.looks import Finish, Float32, Rng, hsv, plain, scaled
 
-Float32 = NDArray[np.float32]
 SKY, BUILDING, POLE, ROAD, PAVEMENT, TREE, SIGN, FENCE, CAR, PEDESTRIAN, CYCLIST = range(len(NAMES))
 OTHER = VOID
 
@@ -45,15 +45,14 @@ class Stage:
     def __init__(self, rng: Rng) -> None:
         self.rng = rng
         self._builder = Builder()
-        self.finishes = Finishes()
-        self.facades: list[list[float]] = []
-        self.bodies: list[list[float]] = []
+        self._finishes: list[Finish] = []
+        self.facades: list[dict[str, float]] = []  # styles, by the names that the painter looks up
+        self.bodies: list[dict[str, float]] = []
         self.at(0.0, 0.0)
         grey = hsv(0.6, rng.uniform(0, 0.2), rng.uniform(0.05, 0.6))
+        glass = hsv(rng.uniform(0.4, 0.7), rng.uniform(0, 0.4), rng.uniform(0.01, 0.09))
         named = {
-            "glass": plain(
-                rng, hsv(rng.uniform(0.4, 0.7), rng.uniform(0, 0.4), rng.uniform(0.01, 0.09)), rng.uniform(0.1, 0.45), 0.3
-            ),
+            "glass": plain(rng, glass, rng.uniform(0.1, 0.45), 0.3),
             "car glass": plain(rng, hsv(0.5, 0.2, rng.uniform(0.008, 0.05)), rng.uniform(0.04, 0.22), 0.3),
             "curtain": plain(rng, hsv(0.1, 0.1, rng.uniform(0.2, 0.7)), 0.1),
             "dark": plain(rng, hsv(0.6, 0.1, rng.uniform(0.01, 0.05))),
@@ -71,7 +70,7 @@ class Stage:
             "red light": Finish(hsv(0.0, 0.9, 0.9), (0, 0, 0), emit=1.0),
             "green light": Finish(hsv(0.42, 0.9, 0.9), (0, 0, 0), emit=1.0),
         }
-        self.finish = {name: self.finishes.add(f) for name, f in named.items()}
+        self.finish = {name: self.add(f) for name, f in named.items()}
 
     def at(self, x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> None:
         """Sets the frame of the next solids: x forward, y left, metres, rad."""
@@ -86,33 +85,36 @@ class Stage:
     def put(
         self,
         kind: Kind,
-        cover: Cover,
         label: int,
         centre: Sequence[float],
         half: Sequence[float],
         finish: int,
         *,
+        cover: Cover = Cover.PLAIN,
         taper: tuple[float, float] = (0.0, 0.0),
         variant: float = 0.0,
         openness: float = 0.5,
         tint: float = 1.0,
     ) -> None:
         """One solid: centre and half sizes (3,) in the frame. label: CamVid's number. variant: of its painter, below 4096."""
-        self._builder.add(
-            kind, cover, label, tuple(centre), tuple(max(h, 0.004) for h in half), (tint, tint, tint),  # type: ignore[arg-type]
-            taper=taper, style=(openness, finish, variant, float(self.rng.random())),
-        )  # fmt: skip
+        half, style = tuple(max(h, 0.004) for h in half), (openness, finish, variant, float(self.rng.random()))
+        self._builder.add(kind, label, centre, half, (tint, tint, tint), cover, taper=taper, style=style)  # type: ignore[arg-type]
+
+    box, frustum, ellipsoid = partialmethod(put, Kind.BOX), partialmethod(put, Kind.FRUSTUM), partialmethod(put, Kind.ELLIPSOID)
+    cylinder, wheel = partialmethod(put, Kind.CYLINDER), partialmethod(put, Kind.WHEEL)
 
     def add(self, finish: Finish) -> int:
-        """A finish of this world's own."""
-        return self.finishes.add(finish)
+        """A finish of this world's own; its number."""
+        self._finishes.append(finish)
+        return len(self._finishes) - 1
 
     def darker(self, finish: Finish, factor: float) -> int:
         """The same finish, darker or lighter."""
-        return self.finishes.add(
-            Finish(scaled(finish.a, factor), scaled(finish.b, factor), finish.pattern, finish.size, finish.joint, finish.spread,
-                   finish.fine, finish.grain, finish.broad, finish.gloss)
-        )  # fmt: skip
+        return self.add(replace(finish, a=scaled(finish.a, factor), b=scaled(finish.b, factor)))
+
+    def table(self) -> dict[str, Float32]:
+        """Each field of all finishes by number: (k,), (k, 2) or (k, 3) float32."""
+        return {f.name: np.array([getattr(row, f.name) for row in self._finishes], np.float32) for f in fields(Finish)}
 
     def solids(self) -> Solids:
         """Everything put so far."""

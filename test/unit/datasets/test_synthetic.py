@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from scenes import RenderedDrive
+from scenes import RenderedDrive, on_pixels_of_their_class
 
 from calib_ros import se3
 from calib_ros.camera import Camera
@@ -16,31 +16,20 @@ from calib_ros.frame import SemanticClass as Label
 from calib_ros_synthetic import rays
 from calib_ros_synthetic.camera import Scene, render
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_synthetic.lidar import MODELS, PERIOD
 from calib_ros_synthetic.rays import Rays, intersect
-from calib_ros_synthetic.solids import Builder, Kind, Solids, Surface
+from calib_ros_synthetic.scanners import PERIOD, plain_scanner
+from calib_ros_synthetic.solids import Builder, Kind, Solids
 from calib_ros_synthetic.street import Street
 
 SMALL = {"rings": 16, "width": 160, "height": 96}
 SHARP = {"rings": 32, "width": 620, "height": 188, "speed": 0, "noise": 0}
 
 
-def matched(drive: SyntheticDrive, index: int, T: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """Class of each point in view (n,), and whether it falls on a pixel of that class, or within `reach` pixels of one."""
-    labels = drive.labels(index)
-    uv, inside = drive.camera.project(se3.transform(T, drive[index].cloud.xyz))
-    u, v = np.rint(uv[inside]).astype(int).T
-    own = labels.points[inside]
-    same = np.zeros(len(own), bool)
-    for dv, du in itertools.product(range(-reach, reach + 1), repeat=2):
-        row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
-        same |= labels.image[row, column] == own
-    return own, same
-
-
 def agreement(drive: SyntheticDrive, frames: range, T: np.ndarray, reach: int = 0) -> dict[int, float]:
     """Class -> share of its points that fall on a pixel of the same class, or within `reach` pixels of one."""
-    own, same = (np.concatenate(parts) for parts in zip(*(matched(drive, i, T, reach) for i in frames), strict=True))
+    own, same = (
+        np.concatenate(parts) for parts in zip(*(on_pixels_of_their_class(drive, i, T, reach) for i in frames), strict=True)
+    )
     return {k: float(same[own == k].mean()) for k in range(10) if np.count_nonzero(own == k) > 30}
 
 
@@ -92,8 +81,10 @@ def test_a_cloud_is_sorted_as_in_kitti_and_its_time_follows_the_azimuth(rings: i
     assert ring is not None
     assert time is not None
     assert intensity is not None
-    degrees, firings = MODELS[rings]
-    assert len(cloud) > 0.4 * rings * firings
+    model = plain_scanner(rings).model
+    assert model.table is not None
+    degrees = model.table()[0]
+    assert len(cloud) > 0.4 * rings * model.firings
     elevation = np.rad2deg(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
     np.testing.assert_allclose(elevation, degrees[ring], atol=1e-3)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
@@ -152,7 +143,7 @@ def test_a_distorted_image_fits_camera_project(name: str) -> None:
 
 def box(centre: tuple[float, float, float], half: tuple[float, float, float], kind: Kind = Kind.BOX, **more: object) -> Solids:
     b = Builder()
-    b.add(kind, Surface.PLAIN, Label.OTHER, centre, half, (0.02, 0.02, 0.02), **more)  # type: ignore[arg-type]
+    b.add(kind, Label.OTHER, centre, half, (0.02, 0.02, 0.02), **more)  # type: ignore[arg-type]
     return b.solids()
 
 
