@@ -33,14 +33,10 @@ class SensorFault(Enum):
 
 @dataclass(frozen=True)
 class SensorProblem:
-    """A fault, and a message for a person. Two problems are equal whatever figures their messages give.
-
-    repeated_images: how many images in a row were the same, 0 unless the image is frozen.
-    """
+    """A fault, and a message for a person. Two problems are equal whatever figures their messages give."""
 
     fault: SensorFault
     message: str = field(compare=False)
-    repeated_images: int = 0
 
 
 class SensorHealth:
@@ -82,7 +78,7 @@ class SensorHealth:
             return None
         n = self._repeated_images
         message = f"the image has not changed for {n} frames while the scans do: restart the camera driver"
-        return SensorProblem(SensorFault.IMAGE_FROZEN, message, n)
+        return SensorProblem(SensorFault.IMAGE_FROZEN, message)
 
     def _is_frozen(self, frame: Frame) -> bool:
         points = frame.cloud.xyz[:: max(len(frame.cloud) // COMPARED_POINTS, 1)]

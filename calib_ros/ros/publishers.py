@@ -90,6 +90,7 @@ class OverlayPublisher:
     """
 
     def __init__(self, node: Node, period_s: float) -> None:
+        self._context = node.context
         self.publisher = node.create_publisher(Image, "~/overlay", 1)
         self.period_s = period_s
         self._last = 0.0
@@ -97,7 +98,9 @@ class OverlayPublisher:
     def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
         """Draw a frame with the current extrinsic below the initial one; at_once: whatever the period."""
         due = at_once or time.monotonic() - self._last >= self.period_s
-        if recalibrator is None or frame is None or not due or self.publisher.get_subscription_count() == 0:
+        if recalibrator is None or frame is None or not due or not self._context.ok():  # not ok: the node is being stopped
+            return
+        if self.publisher.get_subscription_count() == 0:
             return
         self._last = time.monotonic()
         extrinsic, initial = recalibrator.current, recalibrator.tracker.initial

@@ -50,12 +50,12 @@ def scan(rng: np.random.Generator, rings: int = 16, columns: int = 100) -> dict[
 
 
 class MessageFuzzer:
-    """Mutated messages of one family ("rosbags" or "rclpy"). wild: also what cannot be sent over a network."""
+    """Mutated messages of one family ("rosbags" or "rclpy"); those of rosbags also as they cannot be sent over a network."""
 
-    def __init__(self, seed: int, family: str, wild: bool = True) -> None:
+    def __init__(self, seed: int, family: str) -> None:
         self.rng = np.random.default_rng(seed)
         self.make = Messages(family)
-        self.sizes = WILD_SIZES if wild and family == "rosbags" else SIZES
+        self.sizes = WILD_SIZES if family == "rosbags" else SIZES
 
     # ---- choices ------------------------------------------------------------------------------------------------------
 
