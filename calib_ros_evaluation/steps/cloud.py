@@ -11,11 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import RangeImage, range_image
 from calib_ros.lidar.segmentation import Plane
 from calib_ros.overlay import BAR, put, text_width
+from calib_ros.registration.score.point_score import project
 from calib_ros_evaluation.steps.pictures import (
     HIDDEN,
     NAMES,
@@ -25,8 +27,10 @@ from calib_ros_evaluation.steps.pictures import (
     RegisteredFrame,
     Scale,
     Step,
+    enlarged,
+    over,
 )
-from calib_ros_semantics.class_pictures import BACKGROUND, sizes
+from calib_ros_semantics.class_pictures import BACKGROUND, from_above, sizes
 from calib_ros_thesis.cloud import (
     GROUND_SHARE,
     NO_OBJECT,
@@ -48,9 +52,13 @@ Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 SECTION = "3.3"
 step = partial(Step, SECTION)
+TELLING = 0.05  # a configured filter that removes a smaller share of the points is shown with another threshold
 REFLECTIVITY = Scale("reflectivity, share of full scale", 0, 1, PLASMA)
 HEIGHT = 320  # px that all rings together are at least high
 GROUND = (40, 120, 200)  # BGR, orange
+GROUND_LEVEL, OTHER_LEVEL = 1, 2
+GROUND_PALETTE = np.zeros((256, 3), np.uint8)
+GROUND_PALETTE[[GROUND_LEVEL, OTHER_LEVEL]] = GROUND, (200, 170, 60)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +74,11 @@ class Panorama:
     @staticmethod
     def of(scan: RangeImage, T: Matrix, camera: Camera) -> Panorama:
         """The camera at T_camera_lidar (4, 4) sees what lies between the borders."""
+        rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T
+        ahead = rays @ se3.inverse(T)[:3, :3].T
         columns = scan.index.shape[1]
-        borders = tuple(int(c) for c in np.rint((np.pi - camera_azimuths(T, camera)) / (2 * np.pi) * (columns - 1)))
+        azimuth = np.arctan2(ahead[:, 1], ahead[:, 0])
+        borders = tuple(int(c) for c in np.rint((np.pi - azimuth) / (2 * np.pi) * (columns - 1)))
         return Panorama(np.ascontiguousarray(scan.index[:, ::-1]), borders)
 
     def draw(self, colors: Image, scale: Scale | None = None) -> Image:
@@ -153,56 +164,90 @@ def cloud_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
 
 
 def _filters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
-    """Each filter at limits that show its effect; those of the run keep nearly everything."""
-    config, xyz, scale = thesis_of(scene.config), cloud.points.xyz, depth_scale(cloud.depth)
+    xyz, scale = cloud.points.xyz, depth_scale(cloud.depth)
     colors = scale.palette[scale.levels(cloud.depth)]
-    floor = float(np.percentile(xyz[:, 2], 10)) if cloud.plane is None else cloud.plane.offset / float(cloud.plane.normal[2])
-    low = round(floor + 0.3, 1)
-    left, right = camera_azimuths(scene.T, scene.frame.camera)
-    width = np.angle(np.exp(1j * (left - right)))
-    middle, half = np.rad2deg([np.angle(np.exp(1j * (right + width / 2))), abs(width) / 2])
-    filters = {
-        "height": (
-            "A floor under the heights takes away ground and kerbs.",
-            f"{low:g} to {config.max_height:g} m from the LiDAR",
-            by_height(xyz, low, config.max_height),
-        ),
-        "angle": (
-            "Directions that the camera does not see are of no use.",
-            f"{half:.0f} deg around {round(middle)} deg, the camera's field",
-            by_angle(xyz, float(middle), float(half)),
-        ),
-        "range": (
-            "What is very near (the vehicle itself) or very far has no clear edges in the image.",
-            "5 to 30 m",
-            by_range(xyz, 5, 30),
-        ),
-    }
-    if cloud.reflectivity is not None:
-        bright = max(round(float(np.percentile(cloud.reflectivity, 95)), 2), 0.01)
-        filters["reflectivity"] = (
-            "Only what reflects well stays: signs, plates, markings, some poles.",
-            f"{bright:g} to 1",
-            by_reflectivity(cloud.reflectivity, bright),
+    rows: list[tuple[str, ...]] = [("filter", "kept in this run", "removed", "kept in the picture", "removed")]
+    for name, text, own, own_mask, other, other_mask in _choices(scene, cloud):
+        removed = 1 - float(own_mask.mean())
+        shown, mask = (own, own_mask) if removed >= TELLING else (other, other_mask)
+        rows.append((name, own, f"{removed:.1%}", shown, f"{1 - mask.mean():.1%}"))
+        why = (
+            "the limits of this run" if shown == own else f"chosen for the picture, since this run ({own}) removes {removed:.1%}"
         )
-    for name, (text, limits, mask) in filters.items():
         yield step(
             f"Filter by {name}",
-            f"Figure 3.8. {text} Coloured: kept by {limits}, chosen for the picture. Grey: the {np.count_nonzero(~mask)} points "
-            f"removed, {1 - mask.mean():.1%} of all. By the limits of this run {cloud.passed.mean():.1%} pass all filters.",
+            f"Figure 3.8. {text} Coloured: kept, {shown} ({why}). Grey: the {np.count_nonzero(~mask)} points removed, "
+            f"{1 - mask.mean():.1%} of all.",
             cloud.panorama.draw(np.where(mask[:, None], colors, np.uint8(HIDDEN[0])), scale),
             wide=True,
         )
+    yield step(
+        "Threshold filters together",
+        f"Of {len(xyz)} points, {np.count_nonzero(cloud.passed)} pass all filters of this run and go on.",
+        table=tuple(rows),
+        wide=True,
+    )
 
 
-def camera_azimuths(T: Matrix, camera: Camera) -> Matrix:
-    """Of the left and right border of the camera's picture, in the LiDAR's frame, rad (2,)."""
-    rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T @ T[:3, :3]
-    return np.asarray(np.arctan2(rays[:, 1], rays[:, 0]))
+def _choices(scene: RegisteredFrame, cloud: Cloud) -> Iterator[tuple[str, str, str, Mask, str, Mask]]:
+    """Filter, what it is for, the limits of this run and which points pass, limits that show its effect, and which pass those."""
+    config, xyz = thesis_of(scene.config), cloud.points.xyz
+    floor = float(np.percentile(xyz[:, 2], 10)) if cloud.plane is None else cloud.plane.offset / float(cloud.plane.normal[2])
+    low = round(floor + 0.3, 1)
+    yield (
+        "height",
+        "A floor under the heights takes away ground and kerbs.",
+        f"{config.min_height:g} to {config.max_height:g} m",
+        by_height(xyz, config.min_height, config.max_height),
+        f"{low:g} to {config.max_height:g} m from the LiDAR",
+        by_height(xyz, low, config.max_height),
+    )
+    if cloud.reflectivity is not None:
+        bright = max(round(float(np.percentile(cloud.reflectivity, 95)), 2), 0.01)
+        yield (
+            "reflectivity",
+            "Only what reflects well stays: signs, plates, markings, some poles.",
+            f"{config.min_reflectivity:g} to 1",
+            by_reflectivity(cloud.reflectivity, config.min_reflectivity),
+            f"{bright:g} to 1",
+            by_reflectivity(cloud.reflectivity, bright),
+        )
+    middle, half = _camera_azimuths(scene)
+    yield (
+        "angle",
+        "Directions that the camera does not see are of no use.",
+        f"{config.azimuth_half_width_deg:g} deg around {config.azimuth_deg:g} deg",
+        by_angle(xyz, config.azimuth_deg, config.azimuth_half_width_deg),
+        f"{half:.0f} deg around {round(middle)} deg, the camera's field",
+        by_angle(xyz, middle, half),
+    )
+    yield (
+        "range",
+        "What is very near (the vehicle itself) or very far has no clear edges in the image.",
+        f"{config.min_depth:g} to {config.max_depth:g} m",
+        by_range(xyz, config.min_depth, config.max_depth),
+        "5 to 30 m",
+        by_range(xyz, 5, 30),
+    )
+
+
+def _camera_azimuths(scene: RegisteredFrame) -> tuple[float, float]:
+    """Middle and half width of the camera's horizontal field, in the LiDAR's azimuth, deg."""
+    camera, R = scene.frame.camera, scene.T[:3, :3]
+    rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T @ R
+    left, right = np.arctan2(rays[:, 1], rays[:, 0])
+    width = float(np.angle(np.exp(1j * (left - right))))
+    middle = float(np.angle(np.exp(1j * (right + width / 2))))
+    return float(np.rad2deg(middle)), float(np.rad2deg(abs(width) / 2))
 
 
 def object_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     """The ground found and removed, then clusters of what is left."""
+    yield from _ground(scene, cloud)
+    yield from _clusters(scene, cloud)
+
+
+def _ground(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     config = thesis_of(scene.config)
     scale = depth_scale(cloud.depth)
     colors = scale.palette[scale.levels(cloud.depth)]
@@ -232,6 +277,23 @@ def object_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
         cloud.panorama.draw(colors, scale),
         wide=True,
     )
+    order = np.argsort(cloud.points.xyz[:, 2], kind="stable")
+    yield step(
+        "Ground from above",
+        "The ground from above, ahead is up: ground in orange, all else by depth. Look for kerbs and slopes that are taken for "
+        "ground, or are not.",
+        from_above(cloud.points.xyz[order], marked[order]),
+    )
+    levels = np.where(cloud.ground, GROUND_LEVEL, OTHER_LEVEL)
+    yield step(
+        "Ground on the image",
+        "The same on the image, projected with the extrinsic of this page (eq. 2.30): ground in orange, all else in blue.",
+        over(scene.gray, enlarged(_on_image(scene, cloud, np.where(cloud.passed, levels, 0))), GROUND_PALETTE),
+    )
+
+
+def _clusters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
+    config = thesis_of(scene.config)
     colors = NAMES[cloud.label]
     colors[cloud.label == NO_OBJECT] = HIDDEN
     sizes = np.sort(np.bincount(cloud.label)[1:])[::-1]
@@ -245,3 +307,26 @@ def object_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
         cloud.panorama.draw(colors),
         wide=True,
     )
+    order = np.argsort(cloud.label > 0, kind="stable")
+    yield step(
+        "Clusters from above",
+        "The same from above. Look for objects that have grown together and for walls that fall apart: their borders become "
+        "edges.",
+        from_above(cloud.points.xyz[order], colors[order]),
+    )
+    labels = _on_image(scene, cloud, cloud.label)
+    seen = len(np.unique(labels[labels > 0]))
+    yield step(
+        "Clusters on the image",
+        f"{seen} of the objects are in the camera's picture, projected with the extrinsic of this page (eq. 2.30).",
+        over(scene.gray, enlarged(labels), NAMES),
+    )
+
+
+def _on_image(scene: RegisteredFrame, cloud: Cloud, levels: NDArray[np.generic]) -> Image:
+    """Levels (n,) of the points on the pixels (h, w) they fall on; 0 elsewhere. The nearest point counts."""
+    camera, far_first = scene.frame.camera, np.argsort(-cloud.depth, kind="stable")
+    u, v, inside = project(cloud.points.xyz[far_first], scene.T, camera)
+    picture = np.zeros((camera.height, camera.width), np.uint8)
+    picture[v, u] = levels[far_first][inside]
+    return picture

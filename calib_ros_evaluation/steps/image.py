@@ -6,8 +6,10 @@ import dataclasses
 from collections.abc import Iterator
 from functools import partial
 
+import cv2
 import numpy as np
 
+from calib_ros.config import ImageConfig
 from calib_ros.image.edges import GRADIENT_PERCENTILE, REFERENCE_FOCAL_LENGTH
 from calib_ros.image.enhance import (
     BILATERAL_COLOR,
@@ -48,10 +50,38 @@ def preparation_steps(scene: RegisteredFrame) -> Iterator[Step]:
     color = "The source is grey already." if image.ndim == 2 else "The edge operators work on one channel."
     yield preparation_step(
         "Grey image",
-        f"{color} Grey levels spread by {gray.std():.0f} around a mean of {gray.mean():.0f}.",
+        f"{color} Grey levels spread by {gray.std():.0f} around a mean of {gray.mean():.0f}. This is also what equalisation "
+        f"'none' leaves.{_used(config, 'none')}",
         gray,
     )
-    equalized = {method: equalize(gray, dataclasses.replace(config, equalization=method)) for method in METHODS}
+    equalized = {method: equalize(gray, _with(config, method)) for method in METHODS}
+    yield from _equalized(scene, equalized)
+    yield from _filtered(scene, equalize(gray, config))
+
+
+def _equalized(scene: RegisteredFrame, equalized: dict[str, Image]) -> Iterator[Step]:
+    config, image = scene.config.image, scene.frame.image
+    tiles_text = f"{CLAHE_TILES} x {CLAHE_TILES} tiles"
+    texts = {
+        "global": "Global equalisation, eq. 3.1 to 3.4: the distribution of all pixels becomes the curve that maps grey levels. "
+        "Look for bright and dark areas that run together.",
+        "adaptive": f"Adaptive equalisation: a curve for each of {tiles_text}. Shadows open up, but so does the noise of flat "
+        "areas, as of sky and road.",
+        "clahe": f"CLAHE: as adaptive, but each tile's histogram is clipped at {CLAHE_CLIP:g} times its mean, so that "
+        "flat areas stay calm.",
+    }
+    for method, text in texts.items():
+        picture = equalized[method]
+        numbers = f" Grey levels spread by {picture.std():.0f} instead of {scene.gray.std():.0f}."
+        name = "CLAHE" if method == "clahe" else f"Equalised, {method}"
+        yield preparation_step(name, text + numbers + _used(config, method), picture)
+    if image.ndim == 3:
+        yield preparation_step(
+            "CLAHE on colour",
+            "Figure 3.5: CLAHE on the blue, green and red channel by themselves. Colours shift where the channels' histograms "
+            "differ. Not used: the method works on the grey image.",
+            equalize(image, _with(config, "clahe")),
+        )
     yield preparation_step(
         "Histograms",
         "Figure 3.3: share of pixels of each grey level (blue, eq. 3.1) and their distribution (orange, eq. 3.2 and 3.3). Global "
@@ -60,26 +90,35 @@ def preparation_steps(scene: RegisteredFrame) -> Iterator[Step]:
         histograms({METHODS[method]: picture for method, picture in equalized.items()}),
         wide=True,
     )
-    window = busiest(outlines(equalized["clahe"]) - outlines(gray), *_size(gray))
+    window = busiest(outlines(equalized["clahe"]) - outlines(scene.gray), *_size(scene.gray))
     yield preparation_step(
         "Equalisation, magnified",
-        f"Figure 3.4, where CLAHE strengthens outlines most. Global, eq. 3.1 to 3.4: one curve for all pixels. Adaptive: a curve "
-        f"for each of {CLAHE_TILES} x {CLAHE_TILES} tiles; shadows open up, but so does the noise of flat areas. CLAHE: each "
-        f"tile's histogram is clipped at {CLAHE_CLIP:g} times its mean. Used in this run: {config.equalization}. Look for "
-        "outlines that only the local methods show.",
-        tiles([p[window] for p in equalized.values()], list(METHODS), 4, camera.width),
+        f"Figure 3.4: the part of the image where CLAHE strengthens outlines most, rows {window[0].start} to "
+        f"{window[0].stop}, columns {window[1].start} to {window[1].stop}. Look for outlines that only the local methods show.",
+        tiles([p[window] for p in equalized.values()], list(METHODS), 4, scene.frame.camera.width),
         wide=True,
     )
-    before = equalize(gray, config)
-    done = {name: smooth(before, dataclasses.replace(config, filter=name)) for name in ("bilateral", "gaussian")}
-    window = busiest(outlines(before), *_size(before))
+
+
+def _filtered(scene: RegisteredFrame, equalized: Image) -> Iterator[Step]:
+    config = scene.config.image
+    texts = {
+        "bilateral": f"Bilateral filter, eq. 3.5: the mean over {BILATERAL_DIAMETER} px of pixels that are near (sigma "
+        f"{BILATERAL_SPACE:g} px) and alike (sigma {BILATERAL_COLOR:g} grey levels). Texture goes, edges stay.",
+        "gaussian": f"Gaussian filter, eq. 3.6 and 3.7, sigma {GAUSSIAN_SIGMA:g} px. Texture and edges are blurred alike.",
+    }
+    done: dict[str, Image] = {}
+    for name, text in texts.items():
+        done[name] = smooth(equalized, dataclasses.replace(config, filter=name))
+        change = float(cv2.absdiff(done[name], equalized).mean())
+        used = " Used in this run." if config.filter == name else ""
+        text += f" A pixel changes by {change:.1f} grey levels on average.{used}"
+        yield preparation_step(f"{name.capitalize()} filter", text, done[name])
+    window = busiest(outlines(equalized), *_size(equalized))
     yield preparation_step(
         "Filters, magnified",
-        f"Where the image has its strongest outlines. Bilateral, eq. 3.5: the mean over {BILATERAL_DIAMETER} px of pixels that "
-        f"are near (sigma {BILATERAL_SPACE:g} px) and alike (sigma {BILATERAL_COLOR:g} grey levels); texture goes, edges "
-        f"stay. Gaussian, eq. 3.6 and 3.7, sigma {GAUSSIAN_SIGMA:g} px: both are blurred alike. "
-        f"Used in this run: {config.filter}.",
-        tiles([p[window] for p in (before, *done.values())], ["before", *done], 3, camera.width),
+        "Before, bilateral and Gaussian, where the image has its strongest outlines. Compare how sharp outlines and texture are.",
+        tiles([p[window] for p in (equalized, *done.values())], ["before", *done], 3, scene.frame.camera.width),
         wide=True,
     )
 
@@ -132,6 +171,14 @@ def edge_steps(scene: RegisteredFrame) -> Iterator[Step]:
         tiles(pictures, names, len(names), scene.frame.camera.width),
         wide=True,
     )
+
+
+def _with(config: ImageConfig, equalization: str) -> ImageConfig:
+    return dataclasses.replace(config, equalization=equalization)
+
+
+def _used(config: ImageConfig, method: str) -> str:
+    return " Used in this run." if config.equalization == method else ""
 
 
 def _size(gray: Image) -> tuple[int, int]:

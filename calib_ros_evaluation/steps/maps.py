@@ -70,12 +70,28 @@ def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
     seen = sparse_depth[sparse_depth != EMPTY]
     low, high = np.round((far + 1 - np.percentile(seen, [99, 1])) / DEPTH_UNITS) if len(seen) else (0, far / DEPTH_UNITS)
     inverted = Scale(f"{far / DEPTH_UNITS:g} m - depth, m", float(low), max(float(high), float(low) + 1), VIRIDIS)
+    texts = {
+        "inversion": "Depth is inverted, so that near points are large and win where the next steps take a maximum. Points are "
+        "drawn larger.",
+        "dilation": "Dilation by a diamond of 5 px: every point fills the pixels next to it.",
+        "closing": f"Closing by {SMALL} px: gaps between the points of a surface fill up, its outline stays.",
+        "middle holes": f"Empty pixels take the largest value within {MIDDLE} px; filled ones stay.",
+        "large holes": f"The same within {LARGE} px. Look at the borders: objects grow into sky and ground by up "
+        f"to {LARGE // 2} px, which is why edges count only where a point lies.",
+    }
+    for name, text in texts.items():
+        levels = dict(stages)[name]
+        shown = levels != EMPTY
+        draw = inverted.dots if name == "inversion" else inverted.dense
+        yield step(
+            f"Completion: {name}",
+            f"Figure 3.13. {text} {shown.mean():.1%} of the pixels are filled.",
+            draw(levels / DEPTH_UNITS, shown),
+        )
     yield step(
         "Completion, magnified",
-        "Figure 3.13 on the part of the picture with the strongest jumps, pixel by pixel: from single points to a surface. Depth "
-        "is inverted, so that near points win where the next steps take a maximum; points fill a diamond of 5 px; a closing by "
-        f"{SMALL} px fills gaps; empty pixels take the largest value within {MIDDLE}, then {LARGE} px, by which objects grow "
-        f"into sky and ground by up to {LARGE // 2} px; a median blur takes away what sticks out of a surface.",
+        "Figure 3.13 on the part of the picture with the strongest jumps, pixel by pixel: from single points to a surface. "
+        "The last step but the inversion back is a median blur, which takes away what sticks out of a surface.",
         _magnified(stages, scene.maps.discontinuity, inverted),
         wide=True,
     )
@@ -110,6 +126,7 @@ def map_steps(scene: RegisteredFrame) -> Iterator[Step]:
         f"{(jumps > 0.5).mean():.1%} of the points jump by more than 0.5 m; {MAX_DISCONTINUITY:g} m count in full.",
         Scale("root of xi / full xi", 0, 1, GREYS).dots(np.sqrt(D), lidar.occupied),
     )
+    yield from _sparse(scene)
     yield from completion_steps(scene)
     yield from _dense(scene, size)
     yield from _edges(scene)
@@ -127,6 +144,31 @@ def _points(scene: RegisteredFrame) -> NDArray[np.uint8]:
 
 def _depth_scale(lidar: EdgeMaps) -> Scale:
     return depth_scale(lidar.sparse_depth[lidar.sparse_depth != EMPTY] / np.float32(DEPTH_UNITS))
+
+
+def _sparse(scene: RegisteredFrame) -> Iterator[Step]:
+    lidar = scene.maps.lidar
+    shown = lidar.sparse_depth != EMPTY
+    yield step(
+        "Sparse depth",
+        f"The sparse projection map Psi of depth, without the ground: {shown.mean():.1%} of the pixels hold a value. Points are "
+        "drawn larger than their pixel.",
+        _depth_scale(lidar).dots(lidar.sparse_depth / DEPTH_UNITS, shown),
+    )
+    if scene.features.has_reflectivity:
+        shown = lidar.sparse_reflectivity != EMPTY
+        yield step(
+            "Sparse reflectivity",
+            f"Psi of reflectivity, ground and all: {shown.mean():.1%} of the pixels hold a value.",
+            REFLECTIVITY.dots((lidar.sparse_reflectivity - 1) / REFLECTIVITY_UNITS, shown),
+        )
+    shown = lidar.sparse_object > 0
+    yield step(
+        "Sparse objects",
+        f"Psi of the clusters: {len(np.unique(lidar.sparse_object[shown]))} objects on {shown.mean():.1%} of the pixels. "
+        "Colours are names only.",
+        NAMES[enlarged(lidar.sparse_object)],
+    )
 
 
 def _dense(scene: RegisteredFrame, size: int) -> Iterator[Step]:

@@ -14,9 +14,9 @@ from calib_ros.config.semantics import BUILTIN
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.deskew import deskewed_frame
-from calib_ros.registration.classes import EDGE_SHARE, OF_CLASSES, FrameSemantics
+from calib_ros.registration.classes import EDGE_SHARE, OF_CLASSES, FrameSemantics, edge_weights
 from calib_ros_evaluation.steps.pictures import Image, Matrix, RegisteredFrame, Step, busiest, edge_picture, enlarged, over, tiles
-from calib_ros_semantics.class_pictures import classes_on_image, edges_on_image, palette, with_legend
+from calib_ros_semantics.class_pictures import classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
 from calib_ros_semantics.first_guess.guess import first_guess
 from calib_ros_semantics.models.class_borders import WEIGHTS
 from calib_ros_thesis.config import thesis_of
@@ -48,6 +48,8 @@ def semantic_steps(scene: RegisteredFrame) -> Iterator[Step]:
         yield from _image_steps(scene, semantics.classes)
     if semantics.labels is not None:
         yield from _cloud_steps(scene, semantics.labels)
+    if semantics.classes is not None or semantics.labels is not None:
+        yield _numbers(scene, semantics.classes, semantics.labels)
 
 
 def _edge_steps(scene: RegisteredFrame, semantics: FrameSemantics, edges: NDArray[np.float32]) -> Iterator[Step]:
@@ -105,11 +107,16 @@ def _image_steps(scene: RegisteredFrame, classes: Classes) -> Iterator[Step]:
 
 
 def _cloud_steps(scene: RegisteredFrame, labels: Classes) -> Iterator[Step]:
-    frame = deskewed_frame(scene.source, scene.config.motion)
+    known = float((labels != UNLABELLED).mean())
     yield step(
         "Classes of points",
-        f"Classes by the model for clouds, at the extrinsic of this page; {(labels != UNLABELLED).mean():.0%} of the "
-        f"{len(labels)} points have a class. Look for colours that stray beyond the outline of their object.",
+        f"Classes by the model for clouds, from above; {known:.0%} of the {len(labels)} points have a class.",
+        cloud_from_above(scene.source, labels),
+    )
+    frame = deskewed_frame(scene.source, scene.config.motion)
+    yield step(
+        "Classes of points on the image",
+        "The same points at the extrinsic of this page. Look for colours that stray beyond the outline of their object.",
         fitted(points_on_image(frame, frame.cloud.xyz, labels, scene.T), scene),
     )
 
@@ -125,6 +132,23 @@ def points_on_image(frame: Frame, xyz: NDArray[np.float32], labels: Classes, T: 
     dots = np.zeros((height, width), np.uint8)
     dots[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] = labels[far_first] + 1  # 0 is no dot
     return with_legend(over(frame.image, enlarged(dots), np.roll(palette(), 1, axis=0)), np.unique(labels[known]))
+
+
+def _numbers(scene: RegisteredFrame, classes: Classes | None, labels: Classes | None) -> Step:
+    fast = scene.features.plain or scene.features
+    of_edges = fast.points.label
+    rows: list[tuple[str, ...]] = [("class", "pixels", "points", "edge points", "weight of an edge")]
+    for c in (*C, UNLABELLED):
+        shares = ["-" if own is None else f"{(own == c).mean():.1%}" for own in (classes, labels, of_edges)]
+        weight = edge_weights(np.array([c], np.uint8))[0]
+        rows.append(("unknown" if c == UNLABELLED else C(c).name.lower(), *shares, "-" if labels is None else f"{weight:g}"))
+    return step(
+        "Classes in numbers",
+        "Shares of the classes among the image's pixels, the cloud's points, and the points on its edges, which the fast score "
+        "uses; and what an edge of each class counts.",
+        table=tuple(rows),
+        wide=True,
+    )
 
 
 def fitted(picture: Image, scene: RegisteredFrame) -> Image:
@@ -153,6 +177,17 @@ def guess_steps(scene: RegisteredFrame) -> Iterator[Step]:
         f"It is {_off(scene, guesses[0].T)} away from the extrinsic of this page. It is only where the registration "
         "starts; a vehicle guesses from several keyframes.",
         fitted(points_on_image(frame, frame.cloud.xyz, scene.semantics.labels, guesses[0].T), scene),
+    )
+    rows: list[tuple[str, ...]] = [("hypothesis", "score", "margin", "from", "objects met", "away from this page's extrinsic")]
+    for k, h in enumerate(guesses, start=1):
+        rows.append((str(k), f"{h.score:.3f}", f"{h.margin:.3f}", h.kind, str(h.inliers), _off(scene, h.T)))
+    yield step(
+        "Hypotheses",
+        "What the classes would allow, best first, from centroids of objects (3.5) or from a sweep over all directions. Score: "
+        "mean log likelihood ratio of the points in view times the root of their share, 0 by chance. Those that score nearly as "
+        "much as the best are all registered, and their edges decide.",
+        table=tuple(rows),
+        wide=True,
     )
 
 
