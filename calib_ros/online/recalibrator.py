@@ -133,7 +133,7 @@ class Recalibrator:
         with self._lock:
             return self.buffer[-1] if self.buffer else None
 
-    def evidence(self) -> tuple[list[FrameFeatures], Config, Result]:
+    def snapshot(self) -> tuple[list[FrameFeatures], Config, Result]:
         """The keyframes that an estimate would use, oldest first, the configuration of their features, the current extrinsic."""
         with self._lock:
             return self._informative() or list(self.buffer), self.config, self.current.result

@@ -131,7 +131,7 @@ class Calibrator:
             start = nominal() if first.initial is None else first.initial
             return self._with_camera(camera)._calibrated(_seen_by(camera, frames), start, box, progress, ())
 
-        # Of other objectives the edges confirm the place, not the covariance; see Acceptance.check_uncertainty.
+        # Of other objectives the edges confirm the place, not the covariance; see Acceptance._check_uncertainty.
         asked = not box.is_empty and other_objective(self.config) is None
         limits = self.config.refine if asked else None
         result = refined_with_camera(first, self.extract.source_camera, near, whole, self.config.camera, limits)

@@ -101,7 +101,7 @@ def check_keyframes(
     no keyframe.
     """
     started, cpu = time.perf_counter(), cpu_time()
-    kept, config, current = recalibrator.evidence()
+    kept, config, current = recalibrator.snapshot()
     if not kept:
         raise CalibrationError(NO_KEYFRAME)
     chosen = [kept[k].edges_only for k in spread_positions(request.max_keyframes or len(kept), len(kept))]

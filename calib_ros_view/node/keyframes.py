@@ -86,7 +86,7 @@ def keyframe_pictures(recalibrator: Recalibrator, count: int = 0, width: int = 0
     width = width or DEFAULT_WIDTH
     if not LEAST_WIDTH <= width <= MOST_WIDTH:
         raise BadInputError(f"pictures of keyframes are {LEAST_WIDTH} to {MOST_WIDTH} px wide, not {width}")
-    kept = list(recalibrator.evidence()[0])
+    kept = list(recalibrator.snapshot()[0])
     if not kept:
         raise CalibrationError(NO_KEYFRAME)
     T = recalibrator.current.result.T_camera_lidar

@@ -1,7 +1,8 @@
 """Is the optimum of an estimate to be used? What speaks for it, and the checks that may refuse it.
 
-`Acceptance.refusal` is the acceptance test; its single checks are functions of significance.py and of nuisance/. The node's
-second test, over time, is the gate of online/tracker.py.
+`Acceptance.refusal` is the acceptance test: no better than the start, other intrinsics or clocks, at the end of the trust region,
+no better than chance, not known well enough, another objective elsewhere. Its limits are those of the stage ``refine``. Two more
+tests follow elsewhere: of refined intrinsics (camera_rounds.py), and of the node, over time (the gate of online/tracker.py).
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ class Acceptance:
         """Why the extrinsic of an estimate is not to be used: the first check that fails."""
         return (
             _check_improvement(found)
-            or self._check_sensors(found)
+            or self._check_intrinsics_and_clocks(found)
             or _check_distance(found)
             or self._check_match(found)
             or self._check_uncertainty(found)
@@ -102,7 +103,7 @@ class Acceptance:
         limited = refine.tolerance_deg < NO_LIMIT_DEG or refine.tolerance_m < NO_LIMIT_M
         return self.searched and limited and evidence.p_value <= refine.max_p_value
 
-    def _check_sensors(self, found: Estimate) -> Refusal | None:
+    def _check_intrinsics_and_clocks(self, found: Estimate) -> Refusal | None:
         """Are the intrinsics others than given, or the offset of the clocks?"""
         optimised, objective, evidence = found.optimised, found.objective, found.evidence
         wrong = self._check_offset(optimised)
