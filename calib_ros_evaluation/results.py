@@ -6,9 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from calib_ros_evaluation.curves import Curves
 
+Matrix = NDArray[np.float64]
 SUCCESS_DEG, SUCCESS_M = 0.5, 0.1  # a trial that ends nearer than both to the reference has found it
+SET = 3  # frames whose curves are averaged, as in figure 4.16
+THESIS_THRESHOLD = 0.7  # of similarity (section 3.6)
 # What makes a trial the same in two evaluations, which are compared trial by trial.
 IDENTITY = ("experiment", "method", "scene", "frames", "start_deg", "start_m", "seed")
 TWIST_AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
@@ -94,6 +100,58 @@ class CurveResult:
     curves: Curves
 
 
+@dataclass(frozen=True, eq=False)
+class Averaging:
+    """Curves of n single frames, to be averaged by eq. 3.16 (figure 4.16). weights: (n,) w_j. shares: (n, 10) of each class among
+    the pixels that have one (figures 4.5, 4.8, 4.11). classes_of: where these come from, for people."""
+
+    method: str
+    scene: str
+    names: tuple[str, ...]
+    weights: Matrix
+    shares: Matrix
+    single: tuple[Curves, ...]
+    classes_of: str
+
+    @property
+    def shown(self) -> list[int]:
+        """SET of the frames: the least, the middle and the most important one."""
+        order = np.argsort(self.weights, kind="stable")
+        return [int(order[k]) for k in (0, len(order) // 2, -1)]
+
+    def average(self, frames: Sequence[int], weighted: bool) -> Curves:
+        """Eq. 3.16: J is linear in the frames' J_j, and so are its curves. Weights that are all 0 count as alike."""
+        w = self.weights[list(frames)]
+        values = np.average([self.single[k].values for k in frames], axis=0, weights=w if weighted and w.any() else None)
+        return Curves(self.single[0].offsets, values)
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """How alike frames of a scene are (figures 3.22, 3.23). frames: positions (n,) in the scene. matrix: (n, n) rho of eq. 3.15.
+    threshold: the configured one. histograms: position -> (channels, bins) shares of pixels by brightness, of some frames."""
+
+    scene: str
+    frames: tuple[int, ...]
+    matrix: Matrix
+    threshold: float
+    histograms: dict[int, Matrix]
+
+    @property
+    def keyframes(self) -> dict[float, list[int]]:
+        """Rows that algorithm 6 selects at the thesis's threshold and at the configured one."""
+        return {threshold: algorithm_6(self.matrix, threshold) for threshold in sorted({THESIS_THRESHOLD, self.threshold})}
+
+
+def algorithm_6(matrix: Matrix, threshold: float) -> list[int]:
+    """Rows of similarities (n, n) that algorithm 6 selects: the first, then each below the threshold to the one before."""
+    chosen = [0]
+    for k in range(1, len(matrix)):
+        if matrix[chosen[-1], k] < threshold:
+            chosen.append(k)
+    return chosen
+
+
 @dataclass(frozen=True)
 class Cost:
     """What a method costs on one scene, CPU time of one core. memory_mb: most that arrays took while features were made and the
@@ -127,3 +185,5 @@ class Results:
     costs: Sequence[Cost] = ()
     failures: Sequence[tuple[str, str]] = ()  # what other job failed, and why
     trusts: Sequence[Trust] = ()
+    averagings: Sequence[Averaging] = ()
+    similarities: Sequence[Similarity] = ()

@@ -11,16 +11,19 @@ import numpy as np
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
+from calib_ros_evaluation.experiments.frames import averaging, similarities
 from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
 from calib_ros_evaluation.experiments.trial import cost, loss_curves, trial, trust
-from calib_ros_evaluation.results import Cost, CurveResult, Results, Trial, Trust
+from calib_ros_evaluation.results import Averaging, Cost, CurveResult, Results, Similarity, Trial, Trust
 
 T = TypeVar("T")
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
 KINDS: dict[str, Callable[[WorkerCache, EvaluationJob], Answer]] = {
     **dict.fromkeys(TRIALS, trial),
     "curves": loss_curves,
+    "averaging": averaging,
+    "similarity": similarities,
     "cost": cost,
     "trust": trust,
 }
@@ -78,6 +81,17 @@ def trial_of(job: EvaluationJob, answer: Answer) -> Trial:
     return Trial(job.experiment, job.method, job.scene, job.frames, **size, **(answer | scores | twists))
 
 
+def _averaging(job: EvaluationJob, answer: Answer) -> Averaging:
+    names, weights, shares, values = zip(*answer["frames"], strict=True)
+    single = tuple(_curves(answer["offsets"], own) for own in values)
+    return Averaging(job.method, job.scene, names, np.array(weights), np.array(shares), single, answer["classes_of"])
+
+
+def _similarity(job: EvaluationJob, answer: Answer) -> Similarity:
+    histograms = {int(position): np.array(shares, float) for position, shares in answer["histograms"].items()}
+    return Similarity(job.scene, job.frames, np.array(answer["matrix"], float), answer["threshold"], histograms)
+
+
 def _curves(offsets: Any, values: Any) -> Curves:
     return Curves(np.array(offsets, float), np.array(values, float))
 
@@ -88,6 +102,8 @@ SCORES = ("score_start", "score_end", "score_reference")
 READ: dict[str, tuple[str, Callable[[EvaluationJob, Answer], Any]]] = {
     **dict.fromkeys(TRIALS, ("trials", trial_of)),
     "curves": ("curves", lambda j, a: CurveResult(j.experiment, j.method, a["label"], _curves(a["offsets"], a["values"]))),
+    "averaging": ("averagings", _averaging),
+    "similarity": ("similarities", _similarity),
     "cost": ("costs", lambda j, a: Cost(j.method, j.scene, len(j.frames), *(a[name] for name in COSTS))),
     "trust": ("trusts", lambda j, a: Trust(j.scene, a["right"], tuple((deg, m, share) for deg, m, share in a["wrong"]))),
 }

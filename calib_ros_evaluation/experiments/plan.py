@@ -10,7 +10,9 @@ import numpy as np
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
+from calib_ros_evaluation.results import SET
 
+AVERAGED = ("thesis", "ours")  # whose curves are averaged
 TRUSTED = "levinson"  # whose test of a calibration is tried
 TOGETHER = 8  # jobs given to a worker at once; so many are lost at most when it is killed
 
@@ -29,6 +31,7 @@ class Plan:
     sizes: tuple[tuple[float, float], ...] = ((0.5, 0.05), (1.0, 0.1), (2.0, 0.2), (5.0, 0.3), (10.0, 0.5))
     counts: tuple[int, ...] = (1, 2, 5, 10)
     sets: int = 5
+    averaged_frames: int = 10
     cost_frames: int = 3
     trust_frames: int = 24
     seed: int = 0
@@ -43,6 +46,7 @@ QUICK = Plan(
     sizes=((0.5, 0.05), (2.0, 0.2)),
     counts=(1, 4),
     sets=1,
+    averaged_frames=4,
     cost_frames=2,
     trust_frames=4,
 )
@@ -68,9 +72,8 @@ def groups(todo: Sequence[EvaluationJob]) -> list[list[EvaluationJob]]:
 
 
 def _curves(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    options = {"deg": plan.curve_reach[0], "m": plan.curve_reach[1], "samples": plan.curve_samples}
     chosen = shared_out(summaries, plan.curve_frames)
-    return [job("curves", method, label, [k], options) for label, k in chosen for method in methods]
+    return [job("curves", method, label, [k], _around(plan)) for label, k in chosen for method in methods]
 
 
 def _single(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
@@ -105,6 +108,16 @@ def _frames(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[st
     return list(dict.fromkeys(out))  # a set that is drawn twice, as that of all frames, is one
 
 
+def _averaging(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
+    averaged = [method for method in AVERAGED if method in methods]
+    sets = [(one.label, spread(group, plan.averaged_frames)) for one in summaries for group in one.groups if len(group) >= SET]
+    return [job("averaging", method, label, frames, _around(plan)) for label, frames in sets for method in averaged]
+
+
+def _similarity(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
+    return [job("similarity", "", one.label, one.frames) for one in summaries if len(one.frames) > 1]
+
+
 def _cost(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     one = max(summaries, key=lambda s: len(s.groups[0]))
     chosen = spread(one.groups[0], plan.cost_frames)
@@ -117,6 +130,10 @@ def _trust(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str
     return [job("trust", TRUSTED, label, [k], {"seed": plan.seed}) for label, k in shared_out(summaries, plan.trust_frames)]
 
 
+def _around(plan: Plan) -> dict[str, float | int | str]:
+    return {"deg": plan.curve_reach[0], "m": plan.curve_reach[1], "samples": plan.curve_samples}
+
+
 def _start(size: tuple[float, float], seed: int) -> dict[str, float | int | str]:
     return {"start_deg": size[0], "start_m": size[1], "seed": seed}
 
@@ -127,6 +144,8 @@ MAKERS = {
     "single": _single,
     "starts": _starts,
     "frames": _frames,
+    "averaging": _averaging,
+    "similarity": _similarity,
     "cost": _cost,
     "trust": _trust,
 }

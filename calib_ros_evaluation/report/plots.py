@@ -1,4 +1,4 @@
-"""Plots of the report: loss curves, errors per axis, success against the start, errors against frames."""
+"""Plots of the report: loss curves and their averages, similarity of frames, errors per axis, success, errors by frames."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.frame import SemanticClass
 from calib_ros_evaluation.curves import AXES, Curves
 from calib_ros_evaluation.rendering import COLORS, empty_figure, six_axes
 from calib_ros_evaluation.report.statistics import OURS, axis_errors, errors, quantile, start_sizes, wilson
-from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Trial
+from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, Similarity, Trial
 
 Matrix = NDArray[np.float64]
 # Okabe and Ito: distinct for colour-blind eyes too. Their yellow cannot be seen on white, brown stands for it.
 OUR_COLOR, BAD, GOOD = COLORS
 OTHERS = ("#e69f00", "#56b4e9", GOOD, "#cc79a7", BAD, "#333333", "#8c510a")
 DASHES: tuple[Any, ...] = ("--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)))
+SCENES = (OTHERS[0], GOOD, "#9467bd")  # orange, green and purple, as figure 4.16 has them
+CHANNELS = (OUR_COLOR, GOOD, BAD)  # blue, green, red
+KEYFRAME_MARKS = ({"marker": "D", "color": BAD, "markersize": 8}, {"marker": "o", "color": "white", "markersize": 4})
 MARKERS = ("s", "^", "D", "v", "P", "X", "*")
 LONGEST = 70  # letters of a name in a plot
 LIMITS = (SUCCESS_DEG, 100 * SUCCESS_M)  # deg, cm
@@ -112,6 +116,53 @@ def mean_curves(curves: Sequence[Curves]) -> Curves:
     offsets = kept[0].offsets
     values = [[np.interp(x, *pair) for x, *pair in zip(offsets, c.offsets, c.scaled(), strict=True)] for c in kept]
     return Curves(offsets, np.mean(values, axis=0))
+
+
+def averaging(name: str, one: Averaging) -> Plot:
+    """Three frames: their curves and averages (figure 4.16), and how many of their pixels are of each class (4.5, 4.8, 4.11)."""
+    figure = empty_figure(13, 9.8)
+    above, below = figure.subfigures(2, 1, height_ratios=(2.3, 1))
+    places, bars = np.arange(len(SemanticClass)), below.add_subplot()
+    lines = list[tuple[Curves, dict[str, Any]]]()
+    for n, (k, color) in enumerate(zip(one.shown, SCENES, strict=True)):
+        label = plain(f"{one.names[k]}, w = {one.weights[k]:.3f}")
+        lines.append((one.single[k], {"color": color, "linewidth": 1.3, "label": label}))
+        bars.bar(places + 0.27 * (n - 1), 100 * one.shares[k], 0.25, color=color)
+    for label, weighted, dash in (("weighted average", True, "-"), ("unweighted average", False, DASHES[0])):
+        style = {"color": OUR_COLOR, "linewidth": 2.4, "linestyle": dash, "label": label}
+        lines.append((one.average(one.shown, weighted), style))
+    for axis, axes in enumerate(six_axes(above, "score, scaled")):
+        for found, style in lines:
+            axes.plot(found.offsets[axis], found.scaled()[axis], **style)
+    above.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False, fontsize=11)
+    bars.set_xticks(places, [own.name.lower() for own in SemanticClass])
+    bars.set(title="classes", ylabel="pixels, %")
+    caption = f"w: share of main classes among pixels with a class, {one.classes_of}. Every curve is scaled to 0..1."
+    return finished(figure, name, f"Weighted and unweighted averages: {one.method}, {one.scene}", caption)
+
+
+def similarity(name: str, one: Similarity) -> Plot:
+    """Figures 3.23 and 3.22: similarity of every frame with every other, keyframes, and histograms of some frames."""
+    figure = empty_figure(13, 5.2)
+    grid = figure.add_gridspec(2, 4)
+    axes = figure.add_subplot(grid[:, :2])
+    figure.colorbar(axes.imshow(one.matrix, cmap="viridis", vmax=1), ax=axes, label="similarity ρ, 1 = the same")
+    for (threshold, chosen), style in zip(one.keyframes.items(), KEYFRAME_MARKS, strict=False):
+        label = f"{len(chosen)} keyframes, threshold {threshold:g}"
+        axes.plot(chosen, chosen, linestyle="none", markeredgecolor="black", clip_on=False, label=label, **style)
+    ticks = np.linspace(0, len(one.frames) - 1, min(len(one.frames), 8), dtype=int)
+    texts = [str(one.frames[k]) for k in ticks]
+    axes.set(xlabel="frame", ylabel="frame", xticks=ticks, yticks=ticks, xticklabels=texts, yticklabels=texts)
+    axes.legend(loc="lower left", fontsize=10)
+    for k, (position, shares) in enumerate(one.histograms.items()):
+        axes = figure.add_subplot(grid[k // 2, 2 + k % 2])
+        for share, color in zip(shares, CHANNELS if len(shares) == len(CHANNELS) else ("0.3",), strict=True):
+            axes.plot(np.linspace(0, 255, len(share)), 100 * share, color=color)
+        # A few saturated levels may stand out of the picture; else they would flatten all others.
+        top = max(130 * float(np.sort(shares, axis=1)[:, -3].max()), 1.0)
+        axes.set(title=f"frame {position}", xlim=(0, 255), ylim=(0, top), xlabel="brightness", ylabel="pixels, %")
+    caption = "Left: ρ of eq. 3.15, and keyframes of algorithm 6 on the diagonal. Right: pixels by brightness and channel."
+    return finished(figure, name, f"Histogram similarity and keyframes, {one.scene}", caption)
 
 
 def boxes(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:

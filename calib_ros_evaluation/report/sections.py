@@ -41,6 +41,14 @@ STARTS = (
 FRAMES = (
     "What more frames bring: trials from the same sort of start, with one score over so many frames of a scene (section 3.6)."
 )
+AVERAGING = (
+    "Curves of the least, the middle and the most important of the frames, and their averages, as in figure 4.16: eq. 3.16 "
+    "weights a frame's score by its share of main classes (vehicles, persons, poles, signs; figures 4.5, 4.8, 4.11)."
+)
+SIMILARITY = (
+    "How alike the images of a drive are by their histograms (eq. 3.15, figures 3.22 and 3.23), and which become keyframes by "
+    "algorithm 6: those whose similarity to the last keyframe falls below a threshold."
+)
 TRUST = (
     "Levinson and Thrun judge an extrinsic by the share F_C of its 728 neighbours, one step away along any of the axes, that "
     "score less: 1 at the peak of a good score, one half where nothing fits."
@@ -75,6 +83,8 @@ def sections(results: Results) -> list[Section]:
     ended = {name: own for name, own in one.items() if len(axis_errors(own))}
     boxes = (plots.boxes(ended, styles),) if ended else ()
     trusts, costs = results.trusts, results.costs
+    averages = tuple(plots.averaging(f"averaging_{k}", own) for k, own in enumerate(results.averagings, start=1))
+    similar = tuple(plots.similarity(f"similarity_{k}", own) for k, own in enumerate(results.similarities, start=1))
     made = [
         Section("summary", "Summary", SUMMARY, methods=titles, tables=(whole,) if whole.rows else ()),
         _loss_curves(results, styles),
@@ -93,6 +103,8 @@ def sections(results: Results) -> list[Section]:
             tables=tuple(tables.frames(results)) if frames else (),
             plots=(plots.frames(frames, styles),) if frames else (),
         ),
+        Section("averaging", "Weighted averaging", AVERAGING, tables=tables.averaging(results), plots=averages),
+        Section("similarity", "Similarity and keyframes", SIMILARITY, tables=tables.keyframes(results), plots=similar),
         Section("trust", "Is a calibration right?", TRUST, tables=(tables.detection(trusts),) if trusts else ()),
         Section("cost", "Cost", COST, tables=(tables.cost(results),) if costs else ()),
         Section("troubles", "What was refused or failed", TROUBLES, tables=tuple(tables.troubles(results))),

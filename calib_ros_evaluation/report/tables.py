@@ -6,6 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from calib_ros_evaluation.report.statistics import (
     wilson,
 )
 from calib_ros_evaluation.report.table import NONE, Rows, Table, centimetres, degrees, figures, number, percent, table
-from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Results, Trial, Trust
+from calib_ros_evaluation.results import SET, SUCCESS_DEG, SUCCESS_M, THESIS_THRESHOLD, Results, Trial, Trust
 
 AXIS_HEADER = ("r_x deg", "r_y deg", "r_z deg", "t_x cm", "t_y cm", "t_z cm")
 # Table 4.4 of the thesis, rad and m, as printed.
@@ -253,6 +254,32 @@ def basin(results: Results) -> Table:
     ]
     header = ["method", "statistic", "scenes", *AXIS_HEADER]
     return table("From how far away the curves rise", header, rows, notes)
+
+
+def averaging(results: Results) -> tuple[Table, ...]:
+    """How far the peaks of single frames and of their averages lie from the reference."""
+    rows: Rows = []
+    for one in results.averagings:
+        sets = list(combinations(range(len(one.names)), SET))
+        kinds = {f"{len(one.names)} single frames": list(one.single)}
+        for name, weighted in (("unweighted", False), ("weighted", True)):
+            kinds[f"{name}, {len(sets)} averages of {SET}"] = [one.average(own, weighted) for own in sets]
+        for name, found in kinds.items():
+            rows.append([one.scene, one.method, name, *axis_cells(map(mean, np.transpose([peak_distances(c) for c in found])))])
+    notes = [f"Mean distance of the peaks from the reference, without sign, over frames and over all sets of {SET} of them."]
+    header = ["scene", "method", "curves", *AXIS_HEADER]
+    return (table("How far the peaks of averages lie from the reference", header, rows, notes),) if rows else ()
+
+
+def keyframes(results: Results) -> tuple[Table, ...]:
+    """Which frames algorithm 6 selects, by threshold."""
+    rows: Rows = []
+    for one in results.similarities:
+        for threshold, own in one.keyframes.items():
+            which = "frames " + ", ".join(str(one.frames[k]) for k in own)
+            rows.append([one.scene, f"{threshold:g}", f"{len(own)} of {len(one.frames)}", which])
+    notes = [f"The thesis's threshold is {THESIS_THRESHOLD:g}; the node uses the configured one, and limits of time besides."]
+    return (table("Keyframes of algorithm 6", ["scene", "threshold", "keyframes", "which"], rows, notes),) if rows else ()
 
 
 def cost(results: Results) -> Table:

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 
 from calib_ros import se3
+from calib_ros.camera import Camera
 from calib_ros.cli import main
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame, PointCloud, SemanticClass
 from calib_ros.result import Result
 from calib_ros_evaluation.commands import sources_in
 from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
+from calib_ros_evaluation.experiments.frames import classes_of_points
 from calib_ros_evaluation.experiments.job import job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import (
@@ -35,6 +38,7 @@ from calib_ros_evaluation.experiments.setup import (
 )
 from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.results import TWIST_AXES
+from calib_ros_thesis.features import importance
 
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
 TINY = replace(QUICK, curve_frames=1, curve_samples=5, single_frames=2, size_frames=1, counts=(1, 2))
@@ -124,7 +128,27 @@ def test_every_experiment_of_every_method_answers(tmp_path: Path) -> None:
     assert all(abs(c.curves.peaks[1]) < 0.5 for c in results.curves if c.method == "ours")
     assert {c.method for c in results.costs} == set(NAMES)
     assert all(c.memory_mb > 0.1 for c in results.costs)
+    assert {a.method for a in results.averagings} == {"thesis", "ours"}
+    assert all(abs(a.shares.sum(axis=1) - 1).max() < 1e-9 and (a.weights >= 0).all() for a in results.averagings)
+    (similar,) = results.similarities
+    assert np.allclose(np.diag(similar.matrix), 1)
+    assert np.allclose(similar.matrix, similar.matrix.T)
+    assert list(similar.keyframes) == [0.7, Config().online.similarity_threshold]
+    page = found.files[0].read_text()
     assert found.files[0].name == "report.html"
+    assert 'id="averaging"' in page
+    assert 'id="similarity"' in page
+
+
+def test_weights_by_points_in_the_picture() -> None:
+    """A vehicle and a wall of as many points at 10 m: half each. The wall moved before the vehicle hides it."""
+    camera = Camera(np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 100, 100)
+    grid = np.stack(np.meshgrid(np.arange(-2, 2, 0.2), np.arange(-2, 2, 0.2), [10.0]), -1).reshape(-1, 3)
+    vehicle, label = grid - [2, 0, 0], np.repeat(np.uint8([SemanticClass.VEHICLE, SemanticClass.BUILDING]), len(grid))
+    for other, share in ((grid - [-2.2, 0, 0], 0.5), (0.5 * vehicle, 0.0)):
+        frame = Frame(np.zeros((100, 100), np.uint8), PointCloud(np.float32([*vehicle, *other])), camera)
+        assert importance(classes_of_points(frame, label, np.eye(4), Config())) == pytest.approx(share, abs=0.05)
+    assert importance(classes_of_points(frame, None, np.eye(4), Config())) is None
 
 
 def test_another_configuration_is_refused(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,8 +20,10 @@ from calib_ros_evaluation.report.page import write_report
 from calib_ros_evaluation.report.sections import sections
 from calib_ros_evaluation.report.statistics import basins, median, peak_distances, quantile, wilson
 from calib_ros_evaluation.report.table import Table, as_markdown, escaped, figures
-from calib_ros_evaluation.results import Cost, CurveResult, Results, Trial, Trust
+from calib_ros_evaluation.results import Averaging, Cost, CurveResult, Results, Similarity, Trial, Trust, algorithm_6
 
+# Frame 1 is like 0; frame 2 is unlike 0, though like 1; frame 3 is like 2.
+ALIKE = np.array([[1, 0.8, 0.5, 0.1], [0.8, 1, 0.8, 0.2], [0.5, 0.8, 1, 0.9], [0.1, 0.2, 0.9, 1]])
 FACTS = {"Source": "drive & <odd> name", "Command": "calib-ros evaluate drive --out x"}
 
 
@@ -81,7 +83,11 @@ def fake(methods: tuple[str, ...], n: int) -> Results:
     costs = [Cost(method, "drive 5", 1, 20.0 * (k + 1), 0.05, 5.0) for k, method in enumerate(methods)]
     titles = {method: f"{method.capitalize()} and others: edges of the one with edges of the other" for method in methods}
     trusts = [Trust("drive 7", 0.99, ((0.5, 0.0, 0.6 + 0.02 * k), (0.0, 0.1, 0.8))) for k in range(4)]
-    return Results(titles, trials, curves, costs, [("curves|nid|drive 7|3|", "nothing to see")], trusts)
+    shape = tuple("abc"), np.array([0.1, 0.3, 0.2]), np.full((3, 10), 0.1), (bell(0.1), bell(), bell(-0.1)), "by points"
+    averagings = [Averaging(method, "drive 5", *shape) for method in methods if method in ("thesis", "ours")]
+    similarities = [Similarity("drive 5", (0, 2, 4, 6), ALIKE, 0.95, {0: np.full((3, 64), 1 / 64), 6: np.eye(1, 64)})]
+    failures = [("curves|nid|drive 7|3|", "nothing to see")]
+    return Results(titles, trials, curves, costs, failures, trusts, averagings, similarities)
 
 
 def column(table: Table, name: str, key: int = 0) -> dict[str, str]:
@@ -200,6 +206,33 @@ def test_peaks_and_basins_of_curves() -> None:
     assert "reach 2 deg and 30 cm" in tables.basin(found).notes[1]
 
 
+def test_weighted_average_of_curves() -> None:
+    """Eq. 3.16: two frames with peaks at -1 and +1; with weights 3 and 1 the average is 0.75 J_1 + 0.25 J_2."""
+    offsets = np.tile([-1.0, 0, 1], (6, 1))
+    single = Curves(offsets, np.tile([4.0, 0, 0], (6, 1))), Curves(offsets, np.tile([0.0, 0, 8], (6, 1)))
+    one = Averaging("ours", "a", ("f", "g"), np.array([3.0, 1]), np.zeros((2, 10)), single, "told")
+    assert one.average([0, 1], weighted=True).values[0] == pytest.approx([3, 0, 2])
+    assert one.average([0, 1], weighted=False).values[0] == pytest.approx([2, 0, 4])
+    without = dataclasses.replace(one, weights=np.zeros(2))  # nothing important: all alike
+    assert without.average([0, 1], weighted=True).values[0] == pytest.approx([2, 0, 4])
+
+
+def test_peaks_of_averages() -> None:
+    (table,) = tables.averaging(fake(("ours",), n=4))
+    kinds = column(table, "r_x deg", 2)
+    assert kinds["3 single frames"] == "0.133"  # 0.2, 0 and 0.2
+    assert abs(float(kinds["unweighted, 1 averages of 3"])) < 0.001
+    assert float(kinds["weighted, 1 averages of 3"]) == pytest.approx(0.033, abs=0.002)  # (0.1 * 0.2 - 0.2 * 0.2) / 0.6
+
+
+def test_algorithm_6_compares_with_the_last_keyframe() -> None:
+    assert algorithm_6(ALIKE, 0.7) == [0, 2]
+    assert algorithm_6(ALIKE, 0.95) == [0, 1, 2, 3]
+    assert algorithm_6(ALIKE, 0.05) == [0]
+    (table,) = tables.keyframes(Results({}, similarities=[Similarity("a", (0, 2, 4, 6), ALIKE, 0.95, {})]))
+    assert table.rows == (("a", "0.7", "2 of 4", "frames 0, 4"), ("a", "0.95", "4 of 4", "frames 0, 2, 4, 6"))
+
+
 def test_cost_of_features_and_of_a_whole_estimate() -> None:
     costs = [Cost("nid", "a", 1, 5.0, 2.0, 9.0), Cost("ours", "a", 3, 20.0, 0.5, 10.0)]
     table = tables.cost(Results({}, [trial(cpu_s=c) for c in (1.0, 2.0, 9.0)], costs=costs))
@@ -240,7 +273,18 @@ def test_the_report_is_one_page_and_its_parts(report: list[Path], results: Resul
     assert "url(" not in page.read_text()
     assert "@import" not in page.read_text()
     assert [f"#{key}" for key in found.ids] == found.links  # the navigation names every section
-    assert found.ids == ["summary", "curves", "single", "starts", "frames", "trust", "cost", "troubles"]
+    assert found.ids == [
+        "summary",
+        "curves",
+        "single",
+        "starts",
+        "frames",
+        "averaging",
+        "similarity",
+        "trust",
+        "cost",
+        "troubles",
+    ]
     assert "drive & <odd> name" in found.text
     assert "score: {a: 1 & 2}" in found.text
     assert "<odd>" not in page.read_text()
@@ -252,7 +296,7 @@ def test_the_report_is_one_page_and_its_parts(report: list[Path], results: Resul
     assert plots == named == sorted(path.name for path in (page.parent / "plots").iterdir())
     for path in report[1:-1]:
         assert cv2.imread(str(path)).shape[1] > 700
-    for one in (tables.summary(results), tables.axes(results), tables.cost(results)):
+    for one in (tables.summary(results), tables.axes(results), *tables.averaging(results), *tables.keyframes(results)):
         assert as_markdown(one) in text.read_text()
 
 
