@@ -64,6 +64,7 @@ class Pipeline:
         self._inputs = inputs
         self._segmentation = models_of(config.semantics)
         self._requests, self._deferred = Requests(), Deferred()
+        self.dropped_pairs = 0  # that a newer one replaced before they were ingested
         self._lock = threading.Lock()
         self._announcer = Announcer(sink)
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
@@ -110,7 +111,7 @@ class Pipeline:
     def _hand_over(self, found: list[Intake]) -> None:
         """With the lock held: to the ingest worker."""
         for intake in found:
-            self._ingester.put(intake)
+            self.dropped_pairs += sum(replaced.paired for replaced in self._ingester.put(intake))
 
     def _add(self, take: Callable[[int, Any], list[Intake]], stamp: int, message: Any) -> None:
         with self._lock:
@@ -218,11 +219,6 @@ class Pipeline:
         """The models, loaded ones where there are some: loading takes seconds."""
         last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
         return last if last.config == self.config.semantics else models_of(self.config.semantics)
-
-    @property
-    def dropped_pairs(self) -> int:
-        """Pairs that a newer one replaced before they were ingested."""
-        return self._ingester.dropped
 
     @property
     def taking_in(self) -> bool:

@@ -47,10 +47,22 @@ class Recalibrator:
     `ingest` takes frames, `segment_keyframe` adds semantics to a keyframe, `estimate` estimates from all keyframes. Each of them
     may run on a thread of its own: an estimate works on a copy of the buffer's references.
 
-    camera: intrinsics of all frames. initial: T_camera_lidar (4, 4) to start from, or a result that has it, which `reset` goes
-    back to. config: all constants, replaced by `configure`. camera_frame, lidar_frame: names of the frames, for the results.
-    current: the extrinsic to go on with, where it is another. speed_gate: one that is fed with odometry from outside.
-    segmentation: the models, where they are loaded already.
+    Parameters
+    ----------
+    camera : Camera
+        Intrinsics of all frames.
+    initial : (4, 4) array or Result
+        T_camera_lidar to start from, which `reset` goes back to.
+    config : Config, optional
+        All constants; replaced by `configure`.
+    camera_frame, lidar_frame : str
+        Names of the frames, for the results.
+    current : Result, optional
+        The extrinsic to go on with, where it is another than the initial one.
+    speed_gate : SpeedGate, optional
+        One that is fed with odometry from outside.
+    segmentation : Segmentation, optional
+        The models, where they are loaded already.
     """
 
     def __init__(

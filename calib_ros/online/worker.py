@@ -22,8 +22,7 @@ class Worker(Generic[Item]):
     """Runs `work(item)` on a thread with a queue of one item: a newer item replaces the one that waits.
 
     on_error: called on the worker thread with whatever `work` raises; the thread goes on. nice: by how much it yields to others
-    where all cores are busy, 0 to 19. on_idle: called on the worker thread whenever it has nothing left to do. dropped: items
-    replaced so far.
+    where all cores are busy, 0 to 19. on_idle: called on the worker thread whenever it has nothing left to do.
     """
 
     def __init__(
@@ -39,21 +38,20 @@ class Worker(Generic[Item]):
         self._waiting: list[Item] = []
         self._busy = self._stopping = False
         self._busy_since = 0.0
-        self.dropped = 0
         self.busy_s = 0.0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def put(self, item: Item) -> None:
-        """Put an item into the queue; never blocks. After stop() it is ignored."""
+    def put(self, item: Item) -> list[Item]:
+        """Put an item into the queue; never blocks. Returns those that it replaces. After stop() it is ignored."""
         with self._changed:
             if self._stopping:
-                return
+                return []
             # One that an idle thread has been woken for is as good as begun: on a busy machine it may take a while to run.
-            begun = self._waiting[: not self._busy]
-            self.dropped += len(self._waiting) - len(begun)
-            self._waiting = [*begun, item]
+            begun = int(not self._busy)
+            replaced, self._waiting = self._waiting[begun:], [*self._waiting[:begun], item]
             self._changed.notify_all()
+        return replaced
 
     @property
     def stopping(self) -> bool:

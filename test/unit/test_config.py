@@ -59,7 +59,7 @@ def test_values_that_contradict_each_other_are_refused():
         ({"thesis": {"canny_low": 0.6}}, "thesis.canny_low = 0.6 must be less than thesis.canny_high = 0.6"),
         ({"thesis": {"min_depth": 8, "max_depth": 7}}, "thesis.min_depth = 8 must be less than thesis.max_depth = 7"),
         ({"thesis": {"cluster_max_depth": 1.5}}, "thesis.min_depth = 2 must be less than thesis.cluster_max_depth = 1.5"),
-        ({"thesis": {"smoothing": []}}, "thesis.smoothing must hold at least one level; 0 = no smoothing"),
+        ({"thesis": {"smoothing": []}}, "thesis.smoothing has 0 levels; give 1 to 8"),
         ({"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}}, "levenberg_marquardt needs a gradient"),
         ({"semantics": {"segment_anything_decoder": "decoder.onnx"}}, "segment_anything_decoder is set without"),
     ):

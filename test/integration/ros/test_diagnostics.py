@@ -102,7 +102,7 @@ def motion_unknown(watched: Watched, keyframes: int) -> None:
 
 def pairs_dropped(watched: Watched, computed: float) -> None:
     watched.pipeline.synchronizer.counts.pairs += 20
-    watched.pipeline._ingester.dropped += 15
+    watched.pipeline.dropped_pairs += 15
     watched.pipeline._ingester.busy_s += 4.0
     watched.load.add(Work.KEYFRAMES, computed * 4.0)
 

@@ -81,7 +81,7 @@ def test_keyframes_are_drawn_with_score_and_age(watch, peer, vehicle):
 
 
 def test_the_overlay_is_only_drawn_for_lookers(watch, peer, vehicle):
-    publisher = peer.calibration.overlay._publisher
+    publisher = peer.calibration.overlay.publisher
     assert publisher.get_subscription_count() == 0
     lookers = [watch.look(), watch.look()]
     until(publisher.get_subscription_count, "a subscription")

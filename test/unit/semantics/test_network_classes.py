@@ -242,7 +242,7 @@ REFUSED = [
     ({"classes": 3, "outputs": "s 1 3 256 512"}, "labels: [object, void, unknown]", "none of its classes is of use here"),
     ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "scores of 7 classes, which are of no known dataset"),
     ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "inputs: input float32 1x3x256x512; outputs: o float32 1x7x256x512"),
-    (MEANS, "", "(mean 1x19x1x1); known are scores NxCxHxW"),
+    (MEANS, "", "this looks like a classifier of whole pictures"),
     ({"classes": 256, "inputs": "1 3 64 64", "outputs": "s 1 256 64 64"}, "", "encoder of Segment Anything, for semantics"),
     ({"inputs": "1 5 64 1024", "outputs": "o 1 19 64 1024", "normal": ([0] * 5, [1] * 5)}, "", "takes one picture as 1x3xHxW"),
     (
