@@ -10,6 +10,8 @@ vehicles      is what is accepted right, and what is right accepted: single fram
               is known to 0.9 deg / 25 cm only, and of the synthetic --rigs
 vehicle_parts the same with one part of the method switched off at a time
 monitor_hours hours of quiet driving and knocks, driving and standing: SOURCE of 10 Hz, or six synthetic rigs, lap after lap
+chance        images with scans of another place, and mirrored ones: are they accepted as rarely as p values say? SOURCE, --rigs
+sensitivity   the cases of vehicles with each constant of the acceptance test and the covariance 30 % less and more
 covariance    normalised errors squared of estimates from subsets of frames of SOURCE, or synthetic drives and KITTI
 classes       single KITTI frames from 5 deg / 0.3 m per axis, with and without the classes of the package's networks
 first_guess   first guesses from classes: sets of 1, 5 and 10 KITTI frames, the LiDAR turned by any yaw within 45 deg and moved
@@ -45,6 +47,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import (
+    study_acceptance,
     study_checks,
     study_contract,
     study_hours,
@@ -285,6 +288,7 @@ def thesis(optimizer: str, **own: Any) -> Variant:
 
 STUDIES: dict[str, Study] = {
     **study_registration.STUDIES,
+    **study_acceptance.STUDIES,
     "monitor_hours": study_hours.STUDY,
     "classes": Study(
         single_frames,
