@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -36,7 +37,7 @@ MISSING_DATA = re.compile(r"(?:External data path does not exist: |No such file 
 OPSET = re.compile(r"\bopset\b|\bIR version\b", re.IGNORECASE)
 
 
-class SegmentationModel:
+class SegmentationModel(ABC):
     """A loaded model, of whatever kind: what there is to say of it."""
 
     fallback = ""  # why it does not run on the configured provider
@@ -44,13 +45,13 @@ class SegmentationModel:
     needed = ""  # what a mask needs to count
     known: frozenset[int] | None = None  # SemanticClasses that a network tells apart, once it has run
 
+    @abstractmethod
     def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Any:
         """Its part of FrameSemantics; of pixels PixelClasses, with borders if requested. Raises ModelError, BudgetError."""
-        raise NotImplementedError
 
+    @abstractmethod
     def describe(self) -> str:
         """Kind, inputs and outputs, as text."""
-        raise NotImplementedError
 
 
 class OnnxModel:

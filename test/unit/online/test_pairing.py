@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -312,6 +313,28 @@ def ingested(frames: list[Frame], reference: np.ndarray) -> tuple[list[int], Ext
     extrinsic = pipeline.request_estimate().result(60)
     assert pipeline.stop()
     return stamps, extrinsic
+
+
+def test_a_first_look_that_is_replaced_is_no_pair_that_was_dropped(street: list[Frame]) -> None:
+    """While the sweep is not known, messages are looked at before they are paired."""
+    begun, go = threading.Event(), threading.Event()
+
+    def start(*_: object) -> Result:
+        begun.set()
+        assert go.wait(60)
+        return Result(street[0].reference, INITIAL)
+
+    inputs = Inputs(lambda image, *_: image, lambda *_: ("camera", "lidar"), start, lambda cloud: cloud.cloud)
+    pipeline = Pipeline(config(mode="manual"), inputs, lambda event: None)
+    pipeline.set_camera(street[0].camera)
+    for frame in street[:4]:  # the second look and the third are replaced
+        pipeline.add_image(frame.stamp, frame)
+        pipeline.add_cloud(frame.moment_of_cloud, frame)
+        assert begun.wait(60)
+    go.set()
+    assert pipeline.wait_idle(60)
+    assert pipeline.dropped_pairs == 0
+    assert pipeline.stop()
 
 
 def test_every_stamping_gives_the_same_pairs_and_the_same_extrinsic(street: list[Frame], drive: SyntheticDrive) -> None:
