@@ -79,11 +79,15 @@ setup(
     ],
     packages=find_packages(include=[pattern for name in PACKAGES for pattern in (name, f"{name}.*")]),
     package_data={name: ["py.typed"] for name in PACKAGES}
-    | {f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/LICENSE"]},
+    | {
+        f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/LICENSE"],
+        f"{PACKAGE}_thesis": ["py.typed", "presets/*.yaml"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", glob("config/*")),
+        (f"share/{PACKAGE}/config/presets", glob(f"{PACKAGE}_thesis/presets/*.yaml")),
         (f"share/{PACKAGE}/launch", glob("launch/*.launch.py")),
     ],
     python_requires=">=3.10",
@@ -108,6 +112,10 @@ setup(
         ],
         "calib_ros.stages": [
             "thesis = calib_ros_thesis.config:ThesisConfig",
+        ],
+        "calib_ros.presets": [
+            "thesis = calib_ros_thesis.presets:THESIS",
+            "thesis-literal = calib_ros_thesis.presets:LITERAL",
         ],
         "calib_ros.sources": [
             "synthetic = calib_ros_synthetic.drive:SyntheticDrive.from_text",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from calib_ros.cli.arguments import SOURCE, add_camera_and_topics, add_source, add_yaw_and_config
+from calib_ros.cli.arguments import SOURCE, add_camera_and_topics, add_preset, add_source, add_yaw_and_config
 from calib_ros.errors import BadInputError
 
 
@@ -52,6 +52,7 @@ class Evaluate:
         command.add_argument("--seed", type=int, help="of the starts (default 0)")
         command.add_argument("--reference", metavar="FILE", help="result file that counts as true, instead of the sources' own")
         command.add_argument("--config", metavar="YAML", help="configuration of all methods; see config/calib_ros.yaml")
+        add_preset(command)
         command.add_argument("--workers", type=int, metavar="N", help="processes (default one per core)")
         command.add_argument(
             "--scheduler", metavar="ADDRESS", help="of a running Dask cluster, as tcp://host:8786, to work there"

@@ -107,7 +107,7 @@ def setup_of(args: argparse.Namespace) -> Setup:
         reference = tuple(map(tuple, result.load(args.reference).T_camera_lidar.tolist()))
     chosen = tuple(topics(args).items())
     scenes = (SourceSpec(label, path, args.camera, chosen, reference) for label, path in zip(labels(paths), paths, strict=True))
-    return Setup(tuple(scenes), configuration(args.config))
+    return Setup(tuple(scenes), configuration(args.config, preset_name=args.preset))
 
 
 def sources_in(text: str) -> list[str]:
@@ -150,7 +150,7 @@ def run_steps(args: argparse.Namespace) -> str:
 
     The extrinsic is the reference where there is one, else nominal, unless --initial says otherwise.
     """
-    config = configuration(args.config)
+    config = configuration(args.config, preset_name=args.preset)
     source, position = open_named_source(args), args.frame
     if not 0 <= position < len(source):
         raise BadInputError(f"--frame {position}: position is outside 0..{len(source) - 1} of this source")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from calib_ros.cli.arguments import add_preset
+
 
 class Demo:
     """The main job on the built-in synthetic drive, with real processes."""
@@ -14,12 +16,13 @@ class Demo:
         """See `calib-ros demo --help`."""
         command.add_argument("--out", default="demo_out", help="folder for bag, pictures and result (default demo_out)")
         command.add_argument("--seed", type=int, default=0, help="seed of the street and of the wrong start")
+        add_preset(command)
 
     def run(self, args: argparse.Namespace) -> int:
         """Run it; 0 if the extrinsic was recovered, else 1."""
         from calib_ros_synthetic.demo import run
 
-        return 0 if run(args.out, args.seed) else 1
+        return 0 if run(args.out, args.seed, args.preset) else 1
 
 
 DEMO = Demo()

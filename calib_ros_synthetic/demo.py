@@ -49,8 +49,9 @@ def wrong_start(truth: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     return start
 
 
-def run(out: str, seed: int) -> bool:
-    """Run the demo and leave everything in the folder `out`; True if the extrinsic was recovered to 0.2 deg and 5 cm."""
+def run(out: str, seed: int, preset: str = "") -> bool:
+    """Run the demo and leave everything in the folder `out`; True if the extrinsic was recovered to 0.2 deg and 5 cm. preset: of
+    the node."""
     try:
         from calib_ros.ros.client import ExtrinsicClient
     except ImportError as error:
@@ -74,7 +75,7 @@ def run(out: str, seed: int) -> bool:
     goal = f"an extrinsic that the node calls converged, within {GOAL_DEG} deg and {100 * GOAL_M:g} cm of the truth"
     print(f"goal: {goal}", flush=True)
     with (
-        _Process("node", _node_command(start, folder), env, folder / "node.log") as node,
+        _Process("node", _node_command(start, folder, preset), env, folder / "node.log") as node,
         ExtrinsicClient(domain_id=domain) as client,
     ):
         client.get_extrinsic(timeout_s=IDLE_S)  # the node is up
@@ -128,7 +129,7 @@ def _report(
     return recovered
 
 
-def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:
+def _node_command(start: NDArray[np.float64], folder: Path, preset: str) -> list[str]:
     numbers = [",".join(f"{v:.9f}" for v in values) for values in (start[:3, 3], se3.quaternion_from_rotation(start[:3, :3]))]
     command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args"]
     for topic in TOPICS:
@@ -138,6 +139,7 @@ def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:
         f"initial_quaternion_xyzw:=[{numbers[1]}]",
         f"state_file:={folder / 'state.json'}",
         "overlay_period_s:=0.0",  # one for every frame: they are counted
+        *([f"preset:={preset}"] if preset else []),
     ):
         command += ["-p", parameter]
     return command

@@ -62,7 +62,7 @@ def _view_node(args: argparse.Namespace, address: Address) -> None:
 
 def _session(args: argparse.Namespace) -> Session:
     """Frames, their edges, and the start."""
-    config = configuration(args.config)
+    config = configuration(args.config, preset_name=args.preset)
     if args.out is not None:
         check_output(args.out, "--out")
     source = open_named_source(args, config)

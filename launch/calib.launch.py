@@ -24,8 +24,11 @@ def dds_profile() -> list[SetEnvironmentVariable]:
 
 
 def node(context: LaunchContext) -> list[Node]:
-    """The state file is a parameter only if the argument is given: an empty one would override that of the parameter file."""
-    state_file = LaunchConfiguration("state_file").perform(context)
+    """The state file is a parameter only if the argument is given: an empty one would override that of the parameter file. A
+    preset holds where no parameter file does, and the usual one names all parameters."""
+    state_file, preset = (LaunchConfiguration(name).perform(context) for name in ("state_file", "preset"))
+    params_file = LaunchConfiguration("params_file").perform(context)
+    usual = PathJoinSubstitution([CONFIG, "calib_ros.yaml"]).perform(context)
     managed = LaunchConfiguration("managed").perform(context).lower() == "true"
     return [
         Node(
@@ -34,9 +37,10 @@ def node(context: LaunchContext) -> list[Node]:
             name="calib_ros",
             namespace=LaunchConfiguration("namespace"),
             parameters=[
-                LaunchConfiguration("params_file"),
+                *([] if preset and params_file == usual else [params_file]),
                 {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)},
                 *([{"state_file": state_file}] if state_file else []),
+                *([{"preset": preset}] if preset else []),
             ],
             remappings=[(topic, LaunchConfiguration(topic)) for topic in TOPICS],
             output="screen",
@@ -52,6 +56,7 @@ def generate_launch_description() -> LaunchDescription:
                 default_value=PathJoinSubstitution([CONFIG, "calib_ros.yaml"]),
                 description="YAML file with the node's parameters",
             ),
+            DeclareLaunchArgument("preset", default_value="", description="thesis = the thesis's own system; empty = none"),
             DeclareLaunchArgument("namespace", default_value="", description="namespace of the node"),
             DeclareLaunchArgument(
                 "state_file", default_value="", description="keeps the last good extrinsic; empty = params_file's"

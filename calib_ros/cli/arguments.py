@@ -8,7 +8,7 @@ from argparse import ArgumentTypeError
 from collections.abc import Mapping
 from typing import Any
 
-from calib_ros.extensions import OBJECTIVES, Command, names
+from calib_ros.extensions import OBJECTIVES, PRESETS, Command, names
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # turning about, and shifting along, x, y, z of the camera's optical frame
 Three = tuple[float, float, float]
@@ -194,6 +194,13 @@ def add_yaw_and_config(command: argparse.ArgumentParser) -> None:
         "--yaw-deg", type=float, default=0.0, help="yaw of the nominal camera to the left of the LiDAR's +x axis; 180 = backward"
     )
     command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
+    add_preset(command)
+
+
+def add_preset(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--preset", choices=names(PRESETS), default="", help="thesis = the thesis's own system; other options hold before it"
+    )
 
 
 def _search(command: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib_ros import result
 from calib_ros.cli.arguments import AXES, Three
-from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, update
+from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, preset, update
 from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.open import is_bag
@@ -105,8 +105,9 @@ def configuration(
     constraints: ConstraintOptions | None = None,
     threads: int | None = None,
     intrinsics: str | None = None,
+    preset_name: str = "",
 ) -> Config:
-    """The configuration of a YAML file, or the defaults, with the given options applied."""
+    """The defaults, or a preset; with the values of a YAML file; with the given options."""
     stages = load_stages(path) if path else {}
     for stage, name, value in (
         ("search", "seed", seed),
@@ -116,7 +117,7 @@ def configuration(
     ):
         if value is not None and isinstance(stages.get(stage) or {}, dict):
             stages[stage] = {**(stages.get(stage) or {}), name: value}
-    config = Config.from_dict(stages)
+    config = update(preset(preset_name), stages)
     return constraints.apply_to(config) if constraints else config
 
 

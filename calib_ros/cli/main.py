@@ -84,7 +84,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     constraints = constraint_options(args)
     constraints.check_search(args.search_deg, args.search_m)
     check_json(args.json)
-    config = configuration(args.config, args.seed, args.objective, constraints, args.threads, args.intrinsics)
+    config = configuration(args.config, args.seed, args.objective, constraints, args.threads, args.intrinsics, args.preset)
     check_camera_info(args.camera_info, config.camera)
     result = calibrate(
         *(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config),
@@ -117,7 +117,7 @@ def _replay(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import configuration, constraint_options, open_named_source
     from calib_ros.result import CONVERGED, TENTATIVE
 
-    config = configuration(args.config, constraints=constraint_options(args))
+    config = configuration(args.config, constraints=constraint_options(args), preset_name=args.preset)
     converged = False
     for line in replay(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config):
         print(json.dumps(line), flush=True)

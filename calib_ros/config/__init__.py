@@ -121,6 +121,17 @@ def _get(config: Config, name: str) -> Any:
     return getattr(config, name) if name in OWN_STAGES else config.stage(_other_stages()[name])
 
 
+def preset(name: str) -> Config:
+    """The configuration that an installed package calls by this name, as the thesis's own; the defaults for an empty name.
+    ConfigError names those there are."""
+    config, known = Config(), extensions.names(extensions.PRESETS)
+    if name and name not in known:
+        raise ConfigError(f"there is no preset {name!r}; there are {', '.join(known) or 'none: no package that brings one'}")
+    for path in extensions.load(extensions.PRESETS, name) if name else ():
+        config = update(config, load_stages(path))
+    return config
+
+
 def former_names() -> dict[str, str]:
     """Former name of a parameter (``stage.field``) -> its current name, of all that were renamed."""
     return {

@@ -44,6 +44,8 @@ class RosInterface:
         given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
         for line in parameters.misspelt(given, node._parameters):
             node.get_logger().warning(line)
+        for line in parameters.replaced(self.parameters["preset"], self.parameters.config, given):
+            node.get_logger().info(line)
         # What may be missing is asked for before anything is made that would have to be taken back.
         motion = motion_source(self.parameters["motion_source"])
         self.tf = StaticTf(node, self.parameters["initial_from_tf"], self.parameters["publish_tf"], self.health.error)

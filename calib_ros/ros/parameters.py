@@ -17,10 +17,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calib_ros import se3
-from calib_ros.config import Config, former_names, load_stages, stages, update
+from calib_ros.config import Config, former_names, load_stages, preset, stages, update
 from calib_ros.config.options import checked, option
 from calib_ros.config.removed import REMOVED, notices
 from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.extensions import PRESETS, names
 from calib_ros.result import INITIAL, InitialSource, Result
 
 # Prefixes of the parameters that every ROS node has.
@@ -29,6 +30,12 @@ OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_override
 
 # The node's own settings, beside the constants of the stages.
 SETTINGS: dict[str, dataclasses.Field[Any]] = {
+    "preset": option(
+        "",
+        "configuration to begin with instead of the defaults: thesis = the thesis's own system; parameters given beside it hold "
+        "before it; empty = none",
+        choices=("", *names(PRESETS)),
+    ),
     "image_transport": option(
         "raw",
         "type of the image topic: raw = sensor_msgs/Image, compressed = sensor_msgs/CompressedImage",
@@ -162,10 +169,11 @@ def declare(node: Node) -> Parameters:
     """
     _take_over_former_names(node)
     for name, f in SETTINGS.items():
-        _declare(node, name, f, read_only=name not in LIVE)
+        _declare(node, name, f.default, f, read_only=name not in LIVE)
+    chosen = preset(node.get_parameter("preset").value).to_dict()
     for stage, cls in stages().items():
         for f in dataclasses.fields(cls):
-            _declare(node, f"{stage}.{f.name}", f)
+            _declare(node, f"{stage}.{f.name}", chosen[stage][f.name], f)
     settings = {name: checked(name, _plain(node.get_parameter(name).value), f) for name, f in SETTINGS.items()}
     values = {
         stage: {f.name: _plain(node.get_parameter(f"{stage}.{f.name}").value) for f in dataclasses.fields(cls)}
@@ -181,20 +189,28 @@ def misspelt(given: Mapping[str, Any], declared: Iterable[str]) -> list[str]:
 
     given: name -> value.
     """
-    names, former = sorted(declared), former_names()
+    known, former = sorted(declared), former_names()
     lines = notices({name: _plain(value) for name, value in given.items() if name in REMOVED})
-    for name in sorted(set(given) - set(names) - set(REMOVED)):
+    for name in sorted(set(given) - set(known) - set(REMOVED)):
         if name.startswith(OF_EVERY_NODE):
             continue
         if name in former:
             lines.append(f"parameter '{name}' is now called '{former[name]}'; its value is used")
             continue
-        near = difflib.get_close_matches(name, names, 1)
+        near = difflib.get_close_matches(name, known, 1)
         lines.append(
             f"parameter '{name}' is unknown and has no effect; "
             + (f"did you mean '{near[0]}'?" if near else "config/calib_ros.yaml lists all there are")
         )
     return lines
+
+
+def replaced(name: str, config: Config, given: Iterable[str]) -> list[str]:
+    """A line that names what the preset `name` would set, and parameters that are given set otherwise; no line if nothing."""
+    ours, own = preset(name).to_dict(), config.to_dict()
+    differing = (f"{stage}.{field}" for stage in own for field in own[stage] if own[stage][field] != ours[stage][field])
+    other = sorted(set(differing) & set(given))
+    return [f"the preset {name} is changed by the parameters given: {', '.join(other)}"] if name and other else []
 
 
 def on_change(parameters: Parameters, changed: list[Parameter]) -> tuple[SetParametersResult, Parameters]:
@@ -231,10 +247,10 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, array.array) else value  # rclpy hands lists over as array.array
 
 
-def _declare(node: Node, name: str, f: dataclasses.Field[Any], read_only: bool = False) -> None:
+def _declare(node: Node, name: str, default: Any, f: dataclasses.Field[Any], read_only: bool = False) -> None:
     if node.has_parameter(name):
         return
-    default, low, high = list(f.default) if isinstance(f.default, tuple) else f.default, f.metadata["low"], f.metadata["high"]
+    default, low, high = list(default) if isinstance(default, tuple) else default, f.metadata["low"], f.metadata["high"]
     # Dynamic typing where a person writes 10 for 10.0, which rclpy would refuse; the configuration checks the type itself.
     dynamic = isinstance(default, (float, list))
     descriptor = ParameterDescriptor(description=f.metadata["doc"], read_only=read_only, dynamic_typing=dynamic)

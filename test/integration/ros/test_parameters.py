@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from ros_peer import Peer, camera_info_message
 from vehicle import vehicle_fixture  # noqa: F401  # a fixture
 
-from calib_ros.config import SearchConfig, stages
+from calib_ros.config import SearchConfig, preset, stages, update
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.online import recalibrator as recalibrator_module
 from calib_ros.ros import parameters
@@ -55,6 +55,18 @@ def test_misspelt_former_and_removed_names_are_logged_once_at_the_start(capfd):
     (line,) = [line for line in lines if "have no effect any more; remove them" in line]
     assert "lidar.jump_min" in line
     assert "score.sigma" in line
+
+
+def test_a_preset_holds_where_no_parameter_says_otherwise(capfd):
+    with Peer(preset="thesis", thesis__cluster_eps=0.5, use_sim_time=False) as peer:
+        config = peer.calibration.parameters.config
+        whole = update(preset("thesis"), {"thesis": {"cluster_eps": 0.5}})
+        assert (config.refine, config.others, config.initial) == (whole.refine, whole.others, whole.initial)
+        assert peer.node.get_parameter("refine.objective").value == "thesis"
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "the preset thesis is changed by the parameters" in line]
+    assert line.endswith(", thesis.cluster_eps")  # beside those that every test of the node sets
+    with pytest.raises(ConfigError, match="there is no preset 'thesys'; there are thesis, thesis-literal"):
+        Peer(preset="thesys")
 
 
 def test_a_parameter_under_both_names_is_refused():
