@@ -318,7 +318,7 @@ def between_rays(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
         angle = OUTWARD_SHIFT * scan.azimuth_step * found.side
         P += angle * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
         return _samples(scan, P, index, found.strength)
-    parts = _upward_parts(scan)
+    parts = upward_parts(float(np.median(-np.diff(scan.elevation))) if len(scan.elevation) > 1 else 0.0)
     part = np.tile(np.arange(parts), len(row))
     row, column, strength = (np.repeat(a, parts) for a in (row, column, found.strength / np.float32(parts)))
     index = scan.index[row, column]
@@ -339,9 +339,8 @@ def _samples(scan: RangeImage, P: NDArray[np.float64], index: NDArray[np.integer
     return scan.pose.to_cloud(P).astype(np.float32), index.astype(np.int32), strength
 
 
-def _upward_parts(scan: RangeImage) -> int:
-    """Number of points that share the strength of an upward edge: fewer where rings are close together."""
-    spacing = float(np.median(-np.diff(scan.elevation))) if len(scan.elevation) > 1 else 0.0
+def upward_parts(spacing: float) -> int:
+    """Number of points that share the strength of an upward edge, of rings so far apart (rad): fewer where they are close."""
     return int(np.clip(round(spacing / PART_HEIGHT), 1, MAX_PARTS))
 
 

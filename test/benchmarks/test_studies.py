@@ -6,13 +6,19 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.records import append_records, read_records
+from benchmarks.study_registration import bound
 from benchmarks.study_runner import Case, End, Record, Study, Variant, interval, run, table
 from calib_ros import se3
+from calib_ros.config import Config
+from calib_ros.lidar.edges import UPWARD, upward_parts
+from calib_ros.lidar.range_image import range_image
+from calib_ros.registration.features import FeatureExtractor
 from calib_ros.result import RefusalCode, Result
 from calib_ros_synthetic.drive import SyntheticDrive
 
@@ -98,3 +104,28 @@ def test_an_estimate_is_recorded_with_what_it_says_of_itself() -> None:
     assert record.nees == pytest.approx(2.0)
     assert record.refusal == "not_significant"
     assert not record.accepted
+
+
+def test_the_bound_is_that_of_least_squares_over_the_edge_points_in_view() -> None:
+    """With numerical derivatives of the camera's own projection."""
+    frame = SyntheticDrive(3, frames=1, rings=32, width=320, height=96)[0]
+    config, T = Config(), frame.reference
+    own = FeatureExtractor(frame.camera, config)(frame)
+    step = range_image(frame.cloud, config.lidar).azimuth_step
+    points, camera = own.points, own.camera
+    parts = upward_parts(points.ring_spacing)
+
+    def seen(xi: Any) -> Any:
+        return camera.project(se3.transform(se3.exp(xi) @ T, points.xyz.astype(float)))
+
+    _, inside = seen(np.zeros(6))
+    slopes = np.stack([(seen(1e-6 * one)[0] - seen(-1e-6 * one)[0]) / 2e-6 for one in np.eye(6)], axis=2)
+    information = np.zeros((6, 6))
+    for k in np.flatnonzero(inside):
+        up = points.kind[k] in UPWARD
+        pixels = camera.K[int(up), int(up)] * np.linalg.norm(points.xyz[k]) / se3.transform(T, points.xyz[k])[2]
+        width = pixels * (points.ring_spacing * np.sqrt(parts) if up else step)
+        information += np.outer(slopes[k, int(up)], slopes[k, int(up)]) * 12 / (width**2 + 1)
+    once = bound([own], [frame], T, config)
+    np.testing.assert_allclose(once, np.linalg.inv(information), rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(bound([own, own], [frame, frame], T, config), once / 2)
