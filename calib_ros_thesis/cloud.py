@@ -119,7 +119,8 @@ def by_angle(xyz: Floats, center_deg: float, half_width_deg: float) -> Mask:
 
 def ground_plane(xyz: Floats, config: ThesisConfig) -> Plane | None:
     """The ground plane of points (n, 3), LiDAR frame; None if there is none."""
-    return fit_ground(xyz, config.ground_distance, config.ground_iterations, GROUND_TILT_DEG, GROUND_SHARE, SEED)
+    limits = config.ground_distance, config.ground_iterations, GROUND_TILT_DEG, GROUND_SHARE
+    return fit_ground(xyz, *limits, SEED, compared=max(len(xyz), 1))
 
 
 def ground_points(xyz: Floats, plane: Plane | None, config: ThesisConfig) -> Mask:

@@ -32,10 +32,17 @@ class Plane:
 
 
 def fit_ground(
-    xyz: NDArray[np.float32], threshold: float, iterations: int, max_tilt_deg: float, min_share: float, seed: int
+    xyz: NDArray[np.float32],
+    threshold: float,
+    iterations: int,
+    max_tilt_deg: float,
+    min_share: float,
+    seed: int,
+    compared: int = SCORED_POINTS,
 ) -> Plane | None:
     """The plane with the most points of xyz (n, 3) within `threshold` m, of `iterations` planes through three of them that are
     tilted by at most max_tilt_deg, refitted to its inliers; None if it holds less than min_share. Deterministic for a seed.
+    compared: about so many of the points decide.
 
     RANSAC (thesis 3.3.2, algorithm 1; Fischler and Bolles 1981).
     """
@@ -49,7 +56,7 @@ def fit_ground(
     level = (length > 1e-6) & (normals[:, 2] >= np.cos(np.deg2rad(max_tilt_deg)))
     normals, offsets = normals[level], np.einsum("ij,ij->i", normals[level], P[level, 0])
     best, most = None, 2
-    few = xyz[:: (n // SCORED_POINTS) | 1]  # odd: a power of two would take the same lasers of every firing
+    few = xyz[:: (n // compared) | 1]  # odd: a power of two would take the same lasers of every firing
     points = np.ascontiguousarray(few.T)
     for k in range(0, len(normals), BATCH):
         distance = normals[k : k + BATCH].astype(np.float32) @ points - offsets[k : k + BATCH, None].astype(np.float32)

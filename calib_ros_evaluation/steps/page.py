@@ -35,7 +35,7 @@ SECTIONS = {
     "3.4.4": ("Registration", "Where edges of both sensors meet, the score of eq. 3.12 adds up; the best extrinsic has most."),
     "3.5": ("Semantics", "Masks and classes: clearer edges (3.4.2), a first guess (3.5), weights of frames (3.6)."),
 }
-EXPECTED = 69  # steps of a colour image and a scan with reflectivity, with the builtin classes; for progress only
+EXPECTED = 70  # steps of a colour image and a scan with reflectivity, with the builtin classes; for progress only
 SAMPLES = 41  # of a loss curve
 
 # The parts of the page that differ from the report.

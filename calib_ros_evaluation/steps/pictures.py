@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -283,6 +283,16 @@ def histograms(images: Mapping[str, Image]) -> Image:
         cumulated.plot(np.arange(256), np.cumsum(share), color=COLORS[1], linewidth=1.6)
         cumulated.set(ylim=(0, 1.02), yticks=[0, 0.5, 1] if k == len(images) - 1 else [])
         cumulated.set_ylabel("distribution" if k == len(images) - 1 else "", color=COLORS[1])
+    return _picture(figure)
+
+
+def class_histogram(pixels: Mapping[str, int], main: Collection[str]) -> Image:
+    """Name of a class -> its number of pixels, as bars on a logarithmic axis; those of `main` in another colour."""
+    figure = empty_figure(13, 3.4)
+    axes = figure.add_subplot()
+    bars = axes.bar(list(pixels), list(pixels.values()), color=[COLORS[name in main] for name in pixels])
+    axes.bar_label(bars, fmt="{:,.0f}")
+    axes.set(ylabel="pixels", yscale="log", ylim=(1, 10 * max(*pixels.values(), 1)))
     return _picture(figure)
 
 

@@ -12,10 +12,21 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config.semantics import BUILTIN
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.frame import UNLABELLED, Frame, SemanticClass
+from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.registration.classes import EDGE_SHARE, OF_CLASSES, FrameSemantics, edge_weights
-from calib_ros_evaluation.steps.pictures import Image, Matrix, RegisteredFrame, Step, busiest, edge_picture, enlarged, over, tiles
+from calib_ros_evaluation.steps.pictures import (
+    Image,
+    Matrix,
+    RegisteredFrame,
+    Step,
+    busiest,
+    class_histogram,
+    edge_picture,
+    enlarged,
+    over,
+    tiles,
+)
 from calib_ros_semantics.class_pictures import classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
 from calib_ros_semantics.first_guess.guess import first_guess
 from calib_ros_semantics.models.class_borders import WEIGHTS
@@ -103,6 +114,12 @@ def _image_steps(scene: RegisteredFrame, classes: Classes) -> Iterator[Step]:
         "Classes of pixels",
         f"Classes by the model for images. {weight} Several frames {used}.",
         fitted(classes_on_image(scene.source, classes), scene),
+    )
+    counts = np.bincount(classes.ravel(), minlength=256)
+    yield step(
+        "Pixels by class",
+        "Histogram of the classes' pixels (figures 4.5, 4.8 and 4.11); in orange those of eq. 3.16.",
+        class_histogram({c.name.lower(): int(counts[c]) for c in C}, [c.name.lower() for c in MAIN_CLASSES]),
     )
 
 

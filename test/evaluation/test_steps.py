@@ -14,12 +14,13 @@ from html_pages import Page
 
 from calib_ros import Config, Frame, PointCloud, open_dataset, se3
 from calib_ros.cli import main
+from calib_ros.frame import MAIN_CLASSES, SemanticClass
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
 from calib_ros_evaluation.steps.cloud import Cloud
 from calib_ros_evaluation.steps.maps import completion_stages
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
-from calib_ros_evaluation.steps.pictures import VIRIDIS, RegisteredFrame, Scale, Step, busiest, enlarged
+from calib_ros_evaluation.steps.pictures import VIRIDIS, RegisteredFrame, Scale, Step, busiest, class_histogram, enlarged
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.maps import complete
 
@@ -155,7 +156,7 @@ def test_a_covered_lens(drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("calib_ros_semantics.models.segmentation.implausible", lambda classes, known: said)
     black = dataclasses.replace(drive[0], image=np.zeros_like(drive[0].image))
     made = {step.name: step for step in make_steps(black, drive.reference, NONE, FEW)}
-    assert len(made) == EXPECTED - 8
+    assert len(made) == EXPECTED - 9
     assert float(made["Scores"].table[1][1]) < 1  # the equalisation leaves traces of its tiles
     classified = {step.name: step for step in make_steps(black, drive.reference, Config(), FEW)}
     # What a network finds in darkness is no evidence: its step says so, and what would follow from its classes is left out.
@@ -176,8 +177,8 @@ def masks_of(frame: Frame, folder: Path) -> Path:
 def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> None:
     text = (made / "index.html").read_text()
     names = [path.name[3:-4] for path in sorted(made.glob("*.png"))]
-    assert names[-7:] == [
-        *("borders_of_classes", "blended_edges", "blended_edges_magnified", "classes_of_pixels"),
+    assert names[-8:] == [
+        *("borders_of_classes", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "pixels_by_class"),
         *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
     ]
     assert "the builtin network sees" in text
@@ -191,7 +192,7 @@ def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> Non
 def test_page_without_semantics_has_a_note(drive: SyntheticDrive) -> None:
     made = list(make_steps(drive[1], drive.reference, NONE, FEW))
     found = {step.name: step for step in made}
-    assert len(made) == EXPECTED - 8
+    assert len(made) == EXPECTED - 9
     assert [step.name for step in made if step.section == "3.5"] == ["No semantics"]
     assert "No model is configured" in found["No semantics"].caption
     assert "No semantic edges are blended in" in found["Smoothing, magnified"].caption
@@ -214,13 +215,16 @@ def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pyte
     assert "Boundaries of masks are blended in" in text
     assert "score blends 50% of them into its edges of either direction" in text
     assert "No model" not in text
+    counts = {c.name.lower(): int((labels.image == c).sum()) for c in SemanticClass}
+    bars = class_histogram(counts, [c.name.lower() for c in MAIN_CLASSES])
+    np.testing.assert_array_equal(cv2.imread(str(next(out.glob("*pixels_by_class.png")))), bars)
     row = re.search(r"<td>vehicle</td><td>([0-9.]+)%</td><td>([0-9.]+)%</td>", text)
     assert row
     assert float(row[1]) == pytest.approx(100 * np.mean(labels.image == 1), abs=0.06)
     assert float(row[2]) == pytest.approx(100 * np.mean(labels.points == 1), abs=0.06)
     names = [path.name[3:-4] for path in sorted(out.glob("*.png"))]
-    assert names[-7:] == [
-        *("boundaries_of_masks", "blended_edges", "blended_edges_magnified", "classes_of_pixels"),
+    assert names[-8:] == [
+        *("boundaries_of_masks", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "pixels_by_class"),
         *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
     ]
     assert len({path.read_bytes() for path in out.glob("*.png")}) >= len(names) - 1  # one edge operator is that of the run
@@ -232,7 +236,7 @@ def test_failing_model_is_shown_as_a_failed_step(drive: SyntheticDrive, tmp_path
     made = list(make_steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
     assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
     assert "none.onnx" in made[-1].caption
-    assert len(made) == EXPECTED - 8
+    assert len(made) == EXPECTED - 9
 
 
 def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:

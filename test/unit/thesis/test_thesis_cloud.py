@@ -24,6 +24,7 @@ from calib_ros_thesis.cloud import (
     by_reflectivity,
     depth,
     discontinuity,
+    ground_plane,
     object_labels,
 )
 from calib_ros_thesis.config import ThesisConfig
@@ -158,6 +159,19 @@ def blob(center: tuple[float, float, float], n: int, seed: int, spread: float = 
 
 
 BLOBS = np.vstack([blob((0, 0, 0), 40, 0), blob((5, 0, 0), 120, 1), blob((0, 6, 0), 70, 2), points((50, 0, 0), (0, 50, 0))])
+
+
+def test_all_points_decide_which_plane_is_the_ground():
+    """Of every third point, which is what a comparison on 5000 of them sees, all lie on the smaller plane."""
+    rng = np.random.default_rng(5)
+    xyz = np.c_[rng.uniform(-20, 20, (15000, 2)), np.full(15000, -1.0)].astype(np.float32)
+    xyz[::3, 2] = -2.0
+    plane = ground_plane(xyz, ThesisConfig())
+    assert plane is not None
+    assert plane.offset == pytest.approx(-1.0)
+    few = fit_ground(xyz, 0.2, 128, 15.0, 0.05, 0)
+    assert few is not None
+    assert few.offset == pytest.approx(-2.0)
 
 
 @pytest.mark.filterwarnings("error")
