@@ -94,11 +94,14 @@ SIGNIFICANCE, CHECKS, COVARIANCE = ROOM + "acceptance.significance.", ROOM + "ac
 PARAMETERS, HALVES = ROOM + "nuisance.parameters.", ROOM + "acceptance.split_half."
 CONSTANTS: dict[str, tuple[str, ...]] = {
     "UNDOUBTED_Z": (SIGNIFICANCE, CHECKS, ROOM + "search.search.", ROOM + "joint."),
-    **dict.fromkeys(("HIGHEST_DECOY_Z", "GUMBEL_SCALE", "WITH_90_PERCENT", "OUTLIER_SHARE", "MIN_MEDIAN_Z"), (SIGNIFICANCE,)),
+    **dict.fromkeys(
+        ("HIGHEST_DECOY_Z", "LOWEST_DECOY_Z", "GUMBEL_SCALE", "WITH_90_PERCENT", "OUTLIER_SHARE", "MIN_MEDIAN_Z"), (SIGNIFICANCE,)
+    ),
     **dict.fromkeys(("AGREEING", "MOST"), (HALVES,)),
     "SYSTEMATIC_ERROR": (COVARIANCE, HALVES),
     **dict.fromkeys(("USUAL_NOISE", "USUAL_CELLS", "FEW_POINTS", "LEAST_CURVATURE", "PROFILE_CHANGE"), (COVARIANCE,)),
     **dict.fromkeys(("SIGNIFICANCE", "GROSSLY", "OPEN_PROBABILITY"), (PARAMETERS,)),
+    "SIGNIFICANT_Z": (PARAMETERS, ROOM + "nuisance.time_offset."),
 }
 FACTORS = (0.7, 1.3)
 
