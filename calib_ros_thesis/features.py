@@ -30,7 +30,8 @@ class ThesisFeatures:
 
     camera: pinhole of the maps. points: LiDAR frame, far ones first. map_levels: their levels in the maps. image_edges: E^I
     (h, w) in 0..1, for every smoothing. levels: these at the resolutions of the edges' own score, (1, h, w) standardised.
-    importance: w_j of eq. 3.16; None where classes are not known, or frames are not weighted.
+    importance: w_j of eq. 3.16; None where classes are not known, or frames are not weighted. blended: what semantic edges in E^I
+    are the boundaries of, see FrameSemantics; "" = there are none.
     """
 
     camera: Camera
@@ -39,6 +40,7 @@ class ThesisFeatures:
     image_edges: list[Map]
     levels: list[EdgeLevel]
     importance: float | None = None
+    blended: str = ""
 
 
 def thesis_features(
@@ -68,6 +70,7 @@ def thesis_features(
         [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in thesis.smoothing],
         blurred_levels([edges], focal_length),
         importance,
+        "" if semantic is None else edges_of,
     )
 
 

@@ -12,7 +12,7 @@ from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.image.edges import SIGMAS
 from calib_ros.lidar.deskew import deskewed_points
-from calib_ros.registration.classes import OF_MASKS, FrameSemantics
+from calib_ros.registration.classes import OF_CLASSES, OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.objective import AFTER_SEARCH, FIRST_STEP_DEG, FastObjective, optimise_smooth
 from calib_ros.registration.progress import SILENT, Progress
@@ -73,6 +73,14 @@ class ThesisObjective:
                 importance = share_of_main_classes(extractor.working(semantics.classes, nearest=True))
         at_image, kind = deskewed_points(frame, config.motion), OF_MASKS if semantics is None else semantics.edges_of
         return thesis_features(frame.cloud, image, features.camera, config, edges, at_image, kind, importance)
+
+    @property
+    def remark(self) -> str:
+        """What the semantic edges of 3.4.2 are, where they are not of Segment Anything in all frames."""
+        blended = {f.own.blended for f in self.edges.features}
+        if OF_CLASSES in blended:
+            return "semantic edges are borders of classes, since there are no masks of Segment Anything"
+        return "" if blended == {OF_MASKS} else "no semantic edges: no masks of Segment Anything, no classes"
 
     def value(self, T: Matrix) -> float:
         """J at the last smoothing; with edges attached once per level, the smooth score of those attached at T."""

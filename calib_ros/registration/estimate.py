@@ -106,6 +106,7 @@ class Estimate:
         reasons = [
             str(refusal) if refusal else "",
             *notes,
+            objective.remark,
             outliers_note(outliers) if outliers else "",
             unobservable_note(self.pose.unobservable) if self.pose.unobservable else "",
             "" if all(f.has_reflectivity for f in features) else NO_INTENSITY,

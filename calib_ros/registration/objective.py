@@ -49,13 +49,16 @@ class Objective(Protocol):
 
     edges: the score of edges of the same frames, which searches, and tests whether LiDAR and image match at all. constraints:
     limits and prior, which it obeys. systematic_error: standard deviations (6,) of its bias, rad and m. agreement: deg and m
-    within which the edges' own optimum has to lie for this one to be trusted; None = its covariance is validated. Every method
-    may raise TooFewFeaturesError if too little falls into the image.
+    within which the edges' own optimum has to lie for this one to be trusted; None = its covariance is validated. remark: for
+    the reason of every result, or "". Every method may raise TooFewFeaturesError if too little falls into the image.
     """
 
     systematic_error: Matrix
     agreement: tuple[float, float] | None
     constraints: PoseConstraints
+
+    @property
+    def remark(self) -> str: ...
 
     @property
     def edges(self) -> FastObjective: ...
@@ -123,6 +126,7 @@ class FastObjective:
 
     systematic_error = SYSTEMATIC_ERROR
     agreement: tuple[float, float] | None = None
+    remark = ""
 
     def __init__(
         self,

@@ -289,7 +289,13 @@ def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, 
     calibrator = Calibrator(frame.camera, config)
     seen = replace(calibrator.segmentation(frame), edges_of=edges_of)
     assert semantic_share(thesis_of(config), edges_of) == share
-    features = calibrator.extract(frame, seen).own
+    whole = calibrator.extract(frame, seen)
+    objective = calibrator.objectives([whole], frame.reference, frame.reference)
+    assert objective.remark.startswith("semantic edges are borders of classes" if edges_of == OF_CLASSES else "")
+    assert bool(objective.remark) == (edges_of == OF_CLASSES)
+    plain = calibrator.extract(frame)
+    assert calibrator.objectives([plain], frame.reference, frame.reference).remark.startswith("no semantic edges")
+    features = whole.own
     image = calibrator.extract.working_image(frame.image)
     gradient = gradient_edges(prepare(image, config.image), thesis_of(config))
     expected = blend(gradient, np.minimum(seen.edges.sum(axis=0), 1), share)
