@@ -68,4 +68,4 @@ clean:
 	find calib_ros* benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv calib_ros/registration/score/kernel*.so
+	rm -rf .venv calib_ros/registration/score/kernel*.so calib_ros_thesis/kernel*.so

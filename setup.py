@@ -67,15 +67,16 @@ setup(
         "Topic :: Scientific/Engineering :: Image Recognition",
         "Typing :: Typed",
     ],
-    # The inner loop of the scores, called by calib_ros/registration/score/sampler.py through ctypes: a C compiler builds it.
+    # The inner loops of the scores, called through ctypes: a C compiler builds them.
     ext_modules=[
         Extension(
-            f"{PACKAGE}.registration.score.kernel",
-            [f"{PACKAGE}/registration/score/kernel.c"],
+            f"{module.replace('/', '.')}.kernel",
+            [f"{module}/kernel.c"],
             # No fused operations: the same bits on processors with and without them. The last two let more loops become vector
             # instructions, and change no result.
             extra_compile_args=["-std=gnu99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"],
         )
+        for module in (f"{PACKAGE}/registration/score", f"{PACKAGE}_thesis")
     ],
     packages=find_packages(include=[pattern for name in PACKAGES for pattern in (name, f"{name}.*")]),
     package_data={name: ["py.typed"] for name in PACKAGES}

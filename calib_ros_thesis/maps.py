@@ -6,20 +6,25 @@ level wins: depth is inverted first, so that near objects keep their outline.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.registration.score.sampler import load_library
 from calib_ros_thesis.cloud import PointAttributes
 from calib_ros_thesis.config import ThesisConfig
-from calib_ros_thesis.image import SOBEL_GAIN, Grey, magnitude, share
+from calib_ros_thesis.image import SOBEL_GAIN
 from calib_ros_thesis.image import edges as operator_edges
 
 Levels = NDArray[np.int16]
 Floats = NDArray[np.float32]
-Pixels = NDArray[np.intp]
+Places = NDArray[np.int32]
+Points = NDArray[np.int64]
+MAX_GRADIENT = 32767.0  # of cv2.Canny's thresholds
 EMPTY = 0
 DEPTH_UNITS = 100.0  # levels per metre
 REFLECTIVITY_UNITS = 1000.0  # levels of full scale; 1 is added, since 0 is EMPTY
@@ -78,7 +83,7 @@ class EdgeMaps:
 
 
 def edge_maps(pixels: NDArray[np.intp], levels: PointLevels, shape: tuple[int, int], config: ThesisConfig) -> EdgeMaps:
-    """All maps of an image of `shape` (h, w). The readable form; FastEdgeMaps gives the same E^L several times faster.
+    """All maps of an image of `shape` (h, w). The readable form; FastEdgeMaps gives the same E^L.
 
     pixels: (n,) flat indices, each at most once, of the nearest points. levels: of these points.
     """
@@ -148,92 +153,92 @@ def _square(size: int) -> NDArray[np.uint8]:
     return np.ones((size, size), np.uint8)
 
 
+class _Rule(ctypes.Structure):
+    """The struct Rule of kernel.c: change both together."""
+
+    _fields_ = (
+        *((name, ctypes.c_int32) for name in ("inverse", "least", "weak", "strong")),
+        ("full", ctypes.c_float),
+        *((name, ctypes.c_int32) for name in ("sobel", "canny")),
+    )
+
+    @classmethod
+    def of(cls, config: ThesisConfig, step: float, inverse: int = 0, least: int = 0) -> _Rule:
+        """How edges of a map are found where a step of so many levels is a full one."""
+        full, operator = SOBEL_GAIN * step, config.operator
+        weak, strong = (int(min(part * full, MAX_GRADIENT) ** 2) for part in (config.canny_low, config.canny_high))
+        return cls(inverse, least, weak, strong, full, operator != "canny", operator != "sobel")
+
+
+def _load_kernel() -> ctypes.CDLL:
+    library = load_library(Path(__file__).with_name("kernel.c"), "thesis_rule_size", _Rule)
+    address, count, number = ctypes.c_void_p, ctypes.c_ssize_t, ctypes.c_int32
+    shape, points = (address, count, count), (address, count, address)
+    library.thesis_space.argtypes, library.thesis_space.restype = (count, count), count
+    library.thesis_visible.argtypes = (address, count, count, count, *[address] * 4)
+    library.thesis_visible.restype = count
+    library.thesis_places.argtypes = (count, address, address, count, number, number, address)
+    library.thesis_complete.argtypes = (*shape, number, number, address, address)
+    library.thesis_level_edges.argtypes = (*shape, ctypes.POINTER(_Rule), address, address, *points)
+    library.thesis_object_edges.argtypes = (*shape, ctypes.POINTER(_Rule), address, *points)
+    for name in ("places", "complete", "level_edges", "object_edges"):
+        library[f"thesis_{name}"].restype = None
+    return library
+
+
+KERNEL = _load_kernel()
+
+
+def _space(width: int, height: int) -> NDArray[np.uint8]:
+    """Memory that kernel.c works in, for maps of up to this size."""
+    return np.empty(KERNEL.thesis_space(width, height), np.uint8)
+
+
+def complete_fast(sparse: Levels, inverse: int = 0) -> Levels:
+    """As `complete`, by kernel.c and to the bit. inverse: far + 1 = as `complete_depth`, but for depth inverted about it."""
+    (h, w), sparse = sparse.shape, np.ascontiguousarray(sparse)
+    out, space = np.empty_like(sparse), _space(w, h)
+    KERNEL.thesis_complete(space.ctypes.data, w, h, inverse, EMPTY, sparse.ctypes.data, out.ctypes.data)
+    return out
+
+
 class FastEdgeMaps:
-    """E^L at the pixels of the points only, computed in the part of the image that has points, for images of one size (px)."""
+    """E^L at the pixels of the points only, by kernel.c, in the part of the image that has points; images have one size (px)."""
 
     def __init__(self, height: int, width: int, config: ThesisConfig) -> None:
-        self.height, self.width, self.config, size = height, width, config, height * width
-        self._sparse, self._gx, self._gy = (np.empty(size, np.int16) for _ in range(3))
-        self._labels, self._closed, self._canny = (np.empty(size, np.uint8) for _ in range(3))
-        self._complete = DensityCompletion(size)
-        self._far, self._low = far_level(config), low_level(config)
+        self.height, self.width, self.config = height, width, config
+        self._space, self._last = _space(width, height), np.empty(height * width, np.int32)
+        self._labels, self._closed = (np.empty(height * width, np.uint8) for _ in range(2))
+        self._depth = _Rule.of(config, DEPTH_STEP * DEPTH_UNITS, far_level(config) + 1)
+        self._reflectivity = _Rule.of(config, REFLECTIVITY_STEP * REFLECTIVITY_UNITS, least=low_level(config))
+        self._object = _Rule.of(config, OBJECT_STEP)
         # Farther than this from points - their reach, and three pixels of the operators - all maps are empty.
         self._margin = max(REACH, 2 * (config.closing // 2)) + 3
 
-    def __call__(self, u: Pixels, v: Pixels, levels: PointLevels) -> Floats:
-        """E^L (n,) at pixels (u, v), each at most once, of the nearest points. levels: of these points."""
-        if len(u) == 0:
-            return np.zeros(0, np.float32)
+    def visible(self, xyz: Floats) -> tuple[Places, Places, Points]:
+        """Points (3, n) times the intrinsics, far first -> columns, rows and indices of the nearest on each pixel."""
+        n, xyz = xyz.shape[1], np.ascontiguousarray(xyz)
+        u, v, points = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int64)
+        into = (a.ctypes.data for a in (self._last, u, v, points))
+        m = KERNEL.thesis_visible(xyz.ctypes.data, n, self.width, self.height, *into)
+        return u[:m], v[:m], points[:m]
+
+    def __call__(self, u: Places, v: Places, points: Points, levels: PointLevels) -> Floats:
+        """E^L (n,) at pixels (u, v), each at most once, of these of the points. levels: of all points."""
+        n, total = len(u), np.zeros(len(u), np.float32)
+        if n == 0:
+            return total
         left, top = max(int(u.min()) - self._margin, 0), max(int(v.min()) - self._margin, 0)
         w = min(int(u.max()) + self._margin + 1, self.width) - left
         h = min(int(v.max()) + self._margin + 1, self.height) - top
-        pixels = (v - top) * w + (u - left)
-
-        config, total = self.config, np.empty(len(u), np.float32)
-        sparse = self._sparse[: h * w]
-        sparse.fill(EMPTY)
-        sparse[pixels] = np.where(levels.depth != EMPTY, np.int16(self._far + 1) - levels.depth, np.int16(EMPTY))
-        dense = self._complete.depth(sparse.reshape(h, w), self._far)
-        total[:] = self._edges(dense, pixels, DEPTH_STEP * DEPTH_UNITS)
-
-        sparse[pixels] = levels.reflectivity
-        dense = self._complete(sparse.reshape(h, w))
-        cv2.threshold(dense, self._low, 0, cv2.THRESH_TOZERO, dst=dense)
-        total += self._edges(dense, pixels, REFLECTIVITY_STEP * REFLECTIVITY_UNITS)
-
+        at = np.empty(n, np.int32)
+        KERNEL.thesis_places(w, u.ctypes.data, v.ctypes.data, n, left, top, at.ctypes.data)
+        shape, where = (self._space.ctypes.data, w, h), (at.ctypes.data, n, total.ctypes.data)
+        for rule, of_points in ((self._depth, levels.depth), (self._reflectivity, levels.reflectivity)):
+            KERNEL.thesis_level_edges(*shape, rule, of_points.ctypes.data, points.ctypes.data, *where)
         labels = self._labels[: h * w]
         labels.fill(0)
-        labels[pixels] = levels.label
-        closed = close_gaps(labels.reshape(h, w), config.closing, self._closed[: h * w].reshape(h, w))
-        total += self._edges(closed, pixels, OBJECT_STEP)
+        labels[(v - top) * w + (u - left)] = levels.label[points]
+        closed = close_gaps(labels.reshape(h, w), self.config.closing, self._closed[: h * w].reshape(h, w))
+        KERNEL.thesis_object_edges(*shape, self._object, closed.ctypes.data, *where)
         return np.asarray(total * np.float32(1 / 3), np.float32)
-
-    def _edges(self, dense: Grey, pixels: Pixels, step: float) -> Floats:
-        """`image.edges` of a map at some of its pixels."""
-        gx, gy = (buffer[: dense.size].reshape(dense.shape) for buffer in (self._gx, self._gy))
-        cv2.Sobel(dense, cv2.CV_16S, 1, 0, dst=gx)
-        cv2.Sobel(dense, cv2.CV_16S, 0, 1, dst=gy)
-        config = self.config
-        if config.operator != "sobel":
-            unit, found = SOBEL_GAIN * step, self._canny[: dense.size].reshape(dense.shape)
-            cv2.Canny(gx, gy, config.canny_low * unit, config.canny_high * unit, edges=found, L2gradient=True)
-            thin = np.asarray(found.ravel()[pixels] / np.float32(255), np.float32)
-            if config.operator == "canny":
-                return thin
-        strength = share(magnitude(gx.ravel()[pixels], gy.ravel()[pixels]), step)
-        return strength if config.operator == "sobel" else np.asarray(0.5 * strength + 0.5 * thin, np.float32)
-
-
-class DensityCompletion:
-    """`complete` and `complete_depth` with reused buffers, for maps of up to `size` pixels; the results are bit-identical."""
-
-    def __init__(self, size: int) -> None:
-        self._a, self._b = np.empty(size, np.int16), np.empty(size, np.int16)
-        self._empty = np.empty(size, np.uint8)
-
-    def depth(self, inverted: Levels, far: int) -> Levels:
-        """As `complete_depth`, for inverted depth (far + 1 - depth); valid until the next call."""
-        dense = self(inverted)
-        out = self._a[: dense.size].reshape(dense.shape)
-        np.subtract(np.int16(far + 1), dense, out=out)
-        cv2.copyTo(dense, self._where_empty(dense), out)
-        return np.asarray(out)
-
-    def __call__(self, sparse: Levels) -> Levels:
-        """As `complete`; valid until the next call."""
-        a, b = (buffer[: sparse.size].reshape(sparse.shape) for buffer in (self._a, self._b))
-        cv2.dilate(sparse, NEAREST, dst=b)
-        cv2.dilate(b, _square(SMALL), dst=a)
-        cv2.erode(a, _square(SMALL), dst=b)
-        for size in (MIDDLE, LARGE):
-            cv2.dilate(b, _square(size), dst=a)
-            cv2.copyTo(a, self._where_empty(b), b)
-        cv2.medianBlur(b, BLUR, dst=a)
-        self._a, self._b = self._b, self._a
-        return np.asarray(a, np.int16)
-
-    def _where_empty(self, dense: Levels) -> NDArray[np.uint8]:
-        """Mask (h, w), valid until the next call. cv2.compare fails for a map of one pixel."""
-        empty = self._empty[: dense.size].reshape(dense.shape)
-        np.equal(dense, EMPTY, out=empty.view(np.bool_))
-        return empty

@@ -26,6 +26,7 @@ from calib_ros_thesis.score import ThesisScore
 Matrix = NDArray[np.float64]
 # Size of the first simplex and largest gradient step, and 17 cm per degree, halved on each level: more leaves the basin.
 FIRST_SIMPLEX_DEG = 1.6
+LAST_SIZE = 0.005  # of it, when a simplex is done: a tenth of a pixel at 720 px focal length
 # rad, m; 0.13-0.18 deg and 3.6-4.9 cm remain on 4 to 10 spread KITTI scenes.
 SYSTEMATIC_ERROR = np.array([np.deg2rad(0.1)] * 3 + [0.03] * 3)
 FIRST_ATTACHED = 2  # level of the attached form; on the coarser, edges of no direction lead degrees away on some scenes
@@ -126,7 +127,8 @@ class ThesisObjective:
         step, limits = FIRST_SIMPLEX_DEG / 2 ** (level % self.score.n_levels), self.constraints.limits
         if optimizer == "barzilai_borwein":
             return barzilai_borwein(score, T, step, evaluations=evaluations, limits=limits, penalty=self.constraints.cost)[0]
-        return nelder_mead(score, T, step, evaluations, self.constraints.cost, limits)[0]
+        # Points fall on whole pixels: scores of vertices differ until the simplex is nothing, and only its size tells.
+        return nelder_mead(score, T, step, evaluations, self.constraints.cost, limits, (LAST_SIZE, np.inf))[0]
 
     def _attached_level(self, level: int, T: Matrix, step_deg: float) -> Matrix:
         """The optimum on one level with edges attached at T."""

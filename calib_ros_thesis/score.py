@@ -75,10 +75,10 @@ class ThesisScore:
     def shown(self, j: int, T: Matrix) -> tuple[NDArray[np.intp], NDArray[np.intp], Map]:
         """Frame j at T_camera_lidar (4, 4): flat pixels (m,) with a point, the visible points, their W D + E^L."""
         frame, camera = self._frames[j], self.camera
-        u, v, inside = project(frame.xyz, T, camera)
-        pixels, points = nearest_per_pixel(v * camera.width + u, inside, camera.height * camera.width)
-        v, u = np.divmod(pixels, camera.width)
-        return pixels, points, frame.matched[points] + self._maps(u, v, frame.levels.select(points))
+        M = (camera.K @ T[:3]).astype(np.float32)
+        u, v, points = self._maps.visible(M[:, :3] @ frame.xyz.T + M[:, 3:])
+        pixels = v.astype(np.intp) * camera.width + u
+        return pixels, points, frame.matched[points] + self._maps(u, v, points, frame.levels)
 
     def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
         """J_j (n_frames,) at T_camera_lidar (4, 4), normalised if so configured; 0 for a frame without a point in the image."""

@@ -25,7 +25,7 @@ PYTHON = VENV / "bin" / "python"
 STAMPS = VENV / "stamps"
 PIP_INSTALL = [PYTHON, "-m", "pip", "install", "-q", "--no-input", "--disable-pip-version-check"]
 PIP_RUNNING = VENV / "pip-is-running"
-KERNEL = "calib_ros/registration/score/kernel.c"
+KERNELS = ["calib_ros/registration/score/kernel.c", "calib_ros_thesis/kernel.c"]
 MESSAGE_PACKAGES = ["tools/pip_only/tf2_msgs", "calib_ros_msgs"]
 SHARE = {
     "config": "calib_ros/config",
@@ -158,7 +158,7 @@ STEPS = [
     ("create .venv", create_venv, ["tools/make_env.py"]),
     ("install requirements", install_requirements, ["requirements.txt", "constraints.txt"]),
     ("build messages", build_messages, MESSAGE_PACKAGES),
-    ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/__init__.py", KERNEL]),
+    ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/__init__.py", *KERNELS]),
 ]
 
 

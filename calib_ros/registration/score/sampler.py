@@ -42,21 +42,28 @@ class _View(ctypes.Structure):
     )
 
 
-def load_kernel() -> ctypes.CDLL:
-    """The library made of kernel.c. Raises MissingDependencyError where it was not built from these sources."""
-    path = next((path for suffix in EXTENSION_SUFFIXES if (path := Path(__file__).with_name(f"kernel{suffix}")).exists()), None)
+def load_library(source: Path, size_function: str, struct: type[ctypes.Structure]) -> ctypes.CDLL:
+    """The library made of a C file; its size_function gives the size of the struct that both sides know. Raises
+    MissingDependencyError where it was not built from these sources."""
+    path = next((path for suffix in EXTENSION_SUFFIXES if (path := source.with_suffix(suffix)).exists()), None)
     library = None
     with suppress(OSError, AttributeError):  # built for another machine, or something else
         library = ctypes.CDLL(str(path)) if path else None
         if library is not None:
-            library.calib_view_size.restype = ctypes.c_ssize_t
-            if library.calib_view_size() != ctypes.sizeof(_View):
+            library[size_function].restype = ctypes.c_ssize_t
+            if library[size_function]() != ctypes.sizeof(struct):
                 library = None
     if library is None:
         state = "was not built" if path is None else f"({path}) was built from other sources or for another machine"
         raise MissingDependencyError(
             f"the compiled kernel of calib_ros {state}: install gcc, then `pip install .` or `colcon build` in the sources"
         )
+    return library
+
+
+def load_kernel() -> ctypes.CDLL:
+    """The library made of kernel.c, see load_library."""
+    library = load_library(Path(__file__).with_name("kernel.c"), "calib_view_size", _View)
     address, count = ctypes.c_void_p, ctypes.c_ssize_t
     view = ctypes.POINTER(_View)
     library.calib_samples.argtypes = (view, address, count, address)

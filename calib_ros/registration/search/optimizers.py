@@ -153,11 +153,13 @@ def nelder_mead(
     evaluations: int = 120,
     penalty: Callable[[Matrix], float] | None = None,
     limits: Limits | None = None,
+    tolerances: tuple[float, float] = (0.02, 1e-5),
 ) -> tuple[Matrix, float]:
     """Downhill simplex (thesis 3.4.4, figure 3.19) on left twists; robust where the slope misleads.
 
     step_deg: size of the first simplex in rotation, deg; in translation METRES_PER_RADIAN times that. penalty: subtracted
-    from the score. Returns the better of start and optimum, and the score less the penalty.
+    from the score. tolerances: share of its first size, and difference of scores, at which it ends. Returns the better of start
+    and optimum, and the score less the penalty.
     """
     limits = limits or unlimited(T)
     T = limits.clip(T)
@@ -176,7 +178,7 @@ def nelder_mead(
         return T, -start
     # The simplex surrounds the start: one vertex below it on all axes, one above on each.
     simplex = np.vstack([np.zeros(n), np.eye(n)]) - 0.3 / np.sqrt(n)
-    options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 0.02, "fatol": 1e-5}
+    options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": tolerances[0], "fatol": tolerances[1]}
     found = minimize(cost, np.zeros(n), method="Nelder-Mead", options=options)
     if not found.fun < start:  # NaN too
         return T, -start

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from calib_ros.camera import Camera
+from calib_ros.registration.score.point_score import nearest_per_pixel, project
+from calib_ros_thesis import maps as thesis_maps
 from calib_ros_thesis.cloud import PointAttributes
 from calib_ros_thesis.config import ThesisConfig
 from calib_ros_thesis.maps import (
     EMPTY,
     FAR_LEVEL,
     REACH,
-    DensityCompletion,
     EdgeMaps,
     FastEdgeMaps,
     PointLevels,
     close_gaps,
     complete,
     complete_depth,
+    complete_fast,
     edge_maps,
     far_level,
     low_level,
@@ -93,17 +98,16 @@ def test_the_larger_level_grows_by_two_pixels_and_the_smaller_one_keeps_the_rest
     assert np.array_equal(complete_depth(300 - halves, FAR), 300 - grown)
 
 
-def test_buffers_give_the_same_to_the_bit_however_often_and_for_whatever_shape():
-    fast = DensityCompletion(120 * 160)
+def test_the_compiled_completion_gives_the_same_to_the_bit_for_whatever_shape():
     shapes = [(120, 160), (30, 40), (160, 120), (1, 1), (4, 1), (1, 4), (2, 2), (3, 200), (199, 7), (120, 160), (61, 61)]
     for (seed, shape), share in itertools.product(enumerate(shapes), (0.0, 0.01, 0.2, 1.0)):
         sparse = sparse_map(shape, share, seed)
         before = sparse.copy()
-        dense = fast(sparse)
+        dense = complete_fast(sparse)
         assert (dense.shape, dense.dtype) == (shape, np.int16)
         assert np.array_equal(dense, complete(sparse))
         inverted = np.where(sparse != 0, FAR + 1 - sparse, 0).astype(np.int16)
-        assert np.array_equal(fast.depth(inverted, FAR), complete_depth(sparse, FAR))
+        assert np.array_equal(complete_fast(inverted, FAR + 1), complete_depth(sparse, FAR))
         assert np.array_equal(sparse, before)
 
 
@@ -269,10 +273,14 @@ def scattered(seed: int, shape: tuple[int, int], share: float, region: tuple[sli
     return u, v, PointLevels.of(attributes_of(np.clip(depth, 2, 60), reflectivity, rng.random(len(u)) < 0.3, label))
 
 
+def edges_of(fast: FastEdgeMaps, u: np.ndarray, v: np.ndarray, levels: PointLevels) -> np.ndarray:
+    return fast(u.astype(np.int32), v.astype(np.int32), np.arange(len(u)), levels)
+
+
 def same(fast: FastEdgeMaps, u: np.ndarray, v: np.ndarray, levels: PointLevels) -> np.ndarray:
     shape = (fast.height, fast.width)
     expected = edge_maps(v * shape[1] + u, levels, shape, fast.config).lidar_edges[v, u]
-    found = fast(u, v, levels)
+    found = edges_of(fast, u, v, levels)
     assert found.dtype == np.float32
     assert np.array_equal(found, expected)
     return found
@@ -295,7 +303,7 @@ def test_the_fast_form_gives_the_same_edges_to_the_bit(operator):
     for region in (*regions, (slice(-20, None), slice(-20, None)), ONE):
         assert len(same(fast, *scattered(5, (130, 240), 1.0, region)))
     order = np.random.default_rng(9).permutation(len(u))
-    assert np.array_equal(fast(u[order], v[order], levels.select(order)), before[order])
+    assert np.array_equal(edges_of(fast, u[order], v[order], levels.select(order)), before[order])
 
 
 SETTINGS = [
@@ -320,4 +328,27 @@ def test_the_fast_form_is_exact_for_pictures_of_any_size():
     maps = edge_maps(nothing, none, (30, 40), CONFIG)
     assert maps.lidar_edges.shape == (30, 40)
     assert not maps.lidar_edges.any()
-    assert FastEdgeMaps(30, 40, CONFIG)(nothing, nothing, none).tolist() == []
+    assert edges_of(FastEdgeMaps(30, 40, CONFIG), nothing, nothing, none).tolist() == []
+
+
+def test_of_the_points_on_a_pixel_the_nearest_is_visible():
+    """The same as by project and nearest_per_pixel of point_score."""
+    rng = np.random.default_rng(2)
+    fast = FastEdgeMaps(20, 30, CONFIG)
+    depth = np.linspace(30, -2, 5000).astype(np.float32)
+    u, v = rng.uniform(-8, 38, 5000), rng.uniform(-8, 28, 5000)
+    xyz = np.array([u * depth, v * depth, depth], np.float32)
+    columns, rows, points = fast.visible(xyz)
+    u, v, inside = project(xyz.T, np.eye(4), Camera(np.eye(3), 30, 20))
+    pixels, expected = nearest_per_pixel(v * 30 + u, inside, 600)
+    assert np.array_equal(rows * 30 + columns, pixels)
+    assert np.array_equal(points, expected)
+    assert 500 < len(points) < len(inside)
+
+
+def test_the_rule_of_c_is_that_of_python():
+    """A field more on one side would shift all that follow."""
+    source = Path(thesis_maps.__file__).with_name("kernel.c").read_text(encoding="utf-8")
+    start = source.index("typedef struct {\n    int32_t inverse")
+    struct = re.sub(r"/\*.*?\*/", "", source[start : source.index("} Rule;")], flags=re.DOTALL)
+    assert re.findall(r"(\w+)\s*[,;]", struct) == [field[0] for field in thesis_maps._Rule._fields_]
