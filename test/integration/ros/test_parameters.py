@@ -73,6 +73,10 @@ def test_a_parameter_under_both_names_is_refused():
         ({"overlay_period_s": -1}, "overlay_period_s"),
         ({"overlay_period_s": "often"}, "overlay_period_s"),
         ({"constraints__sigma_m": [1.0, 2.0]}, "constraints.sigma_m"),
+        (
+            {"refine__objective": "thesis", "thesis__completion": "no.onnx"},
+            "thesis.completion: model no.onnx: there is no such file",
+        ),
     ],
 )
 def test_bad_parameters_at_the_start(wrong, text):
