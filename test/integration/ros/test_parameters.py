@@ -171,6 +171,22 @@ def test_rapid_changes_while_data_flow(vehicle, monkeypatch):
     vehicle.assert_kept()
 
 
+def test_a_completion_network_that_cannot_be_used_is_refused_at_run_time(vehicle):
+    """In one line; the node keeps its extrinsic and what it had."""
+    peer = vehicle.peer
+    client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
+    peer.change(refine__objective="thesis")
+    wrong = Parameter("thesis.completion", value="no.onnx").to_parameter_msg()
+    answer = peer.call(client, SetParameters.Request(parameters=[wrong])).results[0]
+    assert not answer.successful
+    assert "thesis.completion: model no.onnx: there is no such file" in answer.reason
+    assert "\n" not in answer.reason
+    assert peer.pipeline.config.to_dict()["thesis"]["completion"] == "morphological"
+    vehicle.assert_kept()
+    peer.change(refine__objective="fast")
+    vehicle.assert_kept()
+
+
 def test_settings_take_effect_at_run_time(vehicle, tmp_path):
     peer, state = vehicle.peer, tmp_path / "state.json"
     recalibrator = peer.recalibrator
