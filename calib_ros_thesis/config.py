@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from calib_ros.config import Config
 from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
+from calib_ros_thesis.completion import check_completion
 
 THESIS_ORDER = (
     ("canny_low", "canny_high"),
@@ -15,6 +16,7 @@ THESIS_ORDER = (
     ("min_reflectivity", "max_reflectivity"),
     ("min_depth", "cluster_max_depth"),
 )  # of each pair the first must be less
+MORPHOLOGICAL = "morphological"
 MAX_SMOOTHINGS = 8  # each keeps a map per frame
 
 
@@ -53,6 +55,11 @@ class ThesisConfig(Stage):
     low_reflectivity: float = option(
         0.3, "lower values of the dense reflectivity map are set to 0, share of full scale", low=0.0, high=1.0
     )
+    completion: str = option(
+        MORPHOLOGICAL,
+        "how the sparse depth map becomes dense: morphological = eq. 3.11, network = the completion network of this package, or "
+        "the ONNX file of another one (sparse depth, image -> depth)",
+    )
     closing: int = option(9, "size of the morphological closing of the object map, px", low=1, high=63)
     normalize: bool = option(
         True, "divide J of eq. 3.12 by the number of LiDAR edges in the image, since a plain sum grows with it"
@@ -78,6 +85,8 @@ class ThesisConfig(Stage):
             )
         if config.refine.objective != "thesis":
             return
+        if self.completion != MORPHOLOGICAL:
+            check_completion(self.completion, config.semantics)
         if config.image.projection == "cylinder":
             raise ConfigError("image.projection = cylinder does not go with refine.objective = thesis, which needs a pinhole")
         if self.dense_edges == "every_evaluation" and config.refine.optimizer == "levenberg_marquardt":

@@ -15,7 +15,8 @@ from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH, EdgeLevel, blurred_lev
 from calib_ros.image.enhance import prepare
 from calib_ros.registration.classes import OF_CLASSES, OF_MASKS
 from calib_ros_thesis.cloud import PointAttributes, attributes
-from calib_ros_thesis.config import ThesisConfig, thesis_of
+from calib_ros_thesis.completion import FrameCompletion
+from calib_ros_thesis.config import MORPHOLOGICAL, ThesisConfig, thesis_of
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
 from calib_ros_thesis.maps import PointLevels
 
@@ -31,7 +32,8 @@ class ThesisFeatures:
     camera: pinhole of the maps. points: LiDAR frame, far ones first. map_levels: their levels in the maps. image_edges: E^I
     (h, w) in 0..1, for every smoothing. levels: these at the resolutions of the edges' own score, (1, h, w) standardised.
     importance: w_j of eq. 3.16; None where classes are not known, or frames are not weighted. blended: what semantic edges in E^I
-    are the boundaries of, see FrameSemantics; "" = there are none.
+    are the boundaries of, see FrameSemantics; "" = there are none. completion: the network that makes the depth map dense; None =
+    eq. 3.11.
     """
 
     camera: Camera
@@ -41,6 +43,7 @@ class ThesisFeatures:
     levels: list[EdgeLevel]
     importance: float | None = None
     blended: str = ""
+    completion: FrameCompletion | None = None
 
 
 def thesis_features(
@@ -63,6 +66,7 @@ def thesis_features(
     gradient = gradient_edges(prepare(image, config.image), thesis)
     edges = blend(gradient, semantic, semantic_share(thesis, edges_of))
     focal_length = float(camera.K[0, 0])
+    learned = thesis.completion != MORPHOLOGICAL
     return ThesisFeatures(
         camera,
         points,
@@ -71,6 +75,7 @@ def thesis_features(
         blurred_levels([edges], focal_length),
         importance,
         "" if semantic is None else edges_of,
+        FrameCompletion(thesis.completion, config.semantics, image) if learned else None,
     )
 
 

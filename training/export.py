@@ -54,7 +54,7 @@ def export(network: Network, file: str | Path, size: tuple[int, int] | None = No
         )
     assert program is not None  # None is of the old exporter
     model = program.model_proto
-    _halve(model.graph)
+    halve(model.graph)
     if size is None:
         _name_sizes(model.graph)
     model.ir_version = IR_VERSION
@@ -66,7 +66,7 @@ def export(network: Network, file: str | Path, size: tuple[int, int] | None = No
     _compare(network, file, size or (192, 640))
 
 
-def _halve(graph: Any) -> None:
+def halve(graph: Any) -> None:
     """Stores large float32 tensors as float16, with a Cast each that onnxruntime computes once, when it loads the file."""
     casts, kept = [], []
     for tensor in graph.initializer:

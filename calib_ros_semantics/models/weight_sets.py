@@ -28,9 +28,9 @@ class WeightSet(NamedTuple):
         return f"{self.name} ({licence}; SHA-256 {self.sha256[:SHOWN]})"
 
 
-def of_package() -> Path:
-    """The ONNX file of the package's own weights; their licence lies beside it."""
-    return Path(__file__).parent / "weights" / "streets.onnx"
+def of_package(name: str = "streets") -> Path:
+    """The ONNX file of weights of the package's own; their licence lies beside it."""
+    return Path(__file__).parent / "weights" / f"{name}.onnx"
 
 
 def file_of(choice: str) -> Path:

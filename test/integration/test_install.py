@@ -57,7 +57,7 @@ def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel):
         path.relative_to(ROOT).as_posix()
         for package in ROOT.glob("calib_ros*/__init__.py")
         for path in package.parent.rglob("*")
-        if path.suffix in (".py", ".typed", ".onnx") or path.name == "LICENSE"
+        if path.suffix in (".py", ".typed", ".onnx", ".yaml") or path.name == "LICENSE"
     }
     files = [ROOT / "package.xml", *(ROOT / "config").iterdir(), *(ROOT / "launch").glob("*.launch.py")]
     shared = {f"calib_ros/{path.relative_to(ROOT).as_posix()}" for path in files} | {

@@ -57,10 +57,15 @@ def picture_of(seed: int, number: int, scale: float = 1.0) -> Picture:
 
 def render(world: World) -> Picture:
     """The picture of a world."""
+    return render_with_depth(world)[:2]
+
+
+def render_with_depth(world: World) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:
+    """The picture of a world, and where each of its rays ends (H, W), in lengths of its direction; infinite in the sky."""
     camera, rng = world.camera, world.stage.rng
     rays = camera.view.rays(camera.R)
     t, ids = unmet(rays.shape)
-    _cast(rays, world.solids, camera.view.jobs(world.solids, camera.R), t, ids)
+    cast_solids(rays, world.solids, camera.view.jobs(world.solids, camera.R), t, ids)
     kerbs = cast_ground(rays, world.layout, camera.height, t, ids)
     light, labels = _shaded(world, rays, t.ravel(), ids.ravel(), kerbs.ravel())
     image = np.ascontiguousarray(light.reshape(3, *ids.shape).transpose(1, 2, 0))
@@ -68,10 +73,10 @@ def render(world: World) -> Picture:
     image, labels = _smooth(image, ids), np.where(camera.view.seen, labels, OTHER).astype(np.uint8)
     levels = exposed(image, labels == SKY, rng)
     levels[~camera.view.seen] = 0
-    return levels, labels
+    return levels, labels, t
 
 
-def _cast(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints) -> None:
+def cast_solids(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints) -> None:
     """As the ray caster's own, with holes in porous solids."""
 
     def pierce(i: int, window: Rays, new: Float32, hit: NDArray[np.bool_]) -> None:
@@ -190,7 +195,7 @@ def _lit(world: World, xyz: Float32, ids: Ints, normal: Float32) -> Float32:
     forward = np.array([np.cos(camera.yaw), np.sin(camera.yaw)])
     view = SunView(light.sun, forward, (low, ahead), wide, (-camera.height, high), TEXEL)
     depth, owner = unmet(view.shape)
-    _cast(view.rays(), world.solids, view.jobs(world.solids), depth, owner)
+    cast_solids(view.rays(), world.solids, view.jobs(world.solids), depth, owner)
     facing = np.flatnonzero((normal * light.sun.astype(np.float32)[:, None]).sum(axis=0) > 0)
     at = view.axes.astype(np.float32) @ xyz[:, facing]
     column, row = ((at[k] - np.float32(view.low[k])) / TEXEL for k in (0, 1))

@@ -85,6 +85,10 @@ def test_a_parameter_under_both_names_is_refused():
         ({"overlay_period_s": -1}, "overlay_period_s"),
         ({"overlay_period_s": "often"}, "overlay_period_s"),
         ({"constraints__sigma_m": [1.0, 2.0]}, "constraints.sigma_m"),
+        (
+            {"refine__objective": "thesis", "thesis__completion": "no.onnx"},
+            "thesis.completion: model no.onnx: there is no such file",
+        ),
     ],
 )
 def test_bad_parameters_at_the_start(wrong, text):
@@ -176,6 +180,22 @@ def test_rapid_changes_while_data_flow(vehicle, monkeypatch):
         assert np.all(np.array(held(name)) == np.array(peer.node.get_parameter(name).value))
     peer.until(lambda: peer.peer.count_publishers("/tf_static") == 0, "the end of TF")
     vehicle.assert_recovers()
+    vehicle.assert_kept()
+
+
+def test_a_completion_network_that_cannot_be_used_is_refused_at_run_time(vehicle):
+    """In one line; the node keeps its extrinsic and what it had."""
+    peer = vehicle.peer
+    client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
+    peer.change(refine__objective="thesis")
+    wrong = Parameter("thesis.completion", value="no.onnx").to_parameter_msg()
+    answer = peer.call(client, SetParameters.Request(parameters=[wrong])).results[0]
+    assert not answer.successful
+    assert "thesis.completion: model no.onnx: there is no such file" in answer.reason
+    assert "\n" not in answer.reason
+    assert peer.pipeline.config.to_dict()["thesis"]["completion"] == "morphological"
+    vehicle.assert_kept()
+    peer.change(refine__objective="fast")
     vehicle.assert_kept()
 
 

@@ -43,9 +43,13 @@ def test_what_is_no_network_has_no_metadata(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_everyone_may_use_the_weights_of_the_package() -> None:
-    assert weights_of(of_package()).licence.startswith("Apache-2.0")
-    assert "Apache-2.0" in (of_package().parent / "LICENSE").read_text()
-    assert [path.name for path in of_package().parent.glob("*.onnx")] == ["streets.onnx"], "no others are installed"
+    files, licence = sorted(of_package().parent.glob("*.onnx")), (of_package().parent / "LICENSE").read_text()
+    assert [path.name for path in files] == ["completion.onnx", "streets.onnx"], "no others are installed"
+    for path in files:
+        assert weights_of(path).licence.startswith("Apache-2.0")
+        assert path.name in licence
+        assert path.stat().st_size < 2e6
+    assert "Apache-2.0" in licence
 
 
 def test_a_model_runs_with_what_its_file_held_when_it_was_loaded(tmp_path: Path) -> None:

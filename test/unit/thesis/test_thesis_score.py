@@ -193,7 +193,7 @@ def test_attached_edges_score_as_they_do_where_they_are(scene):
 
 ONCE = {"dense_edges": "once_per_level"}
 METHODS: dict[str, dict[str, dict[str, object]]] = {
-    "nelder_mead": {"refine": {"objective": "thesis"}, "thesis": {"evaluations": 80}},
+    "nelder_mead": {"refine": {"objective": "thesis"}, "thesis": {"evaluations": 120}},
     "barzilai_borwein": {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}, "thesis": {"evaluations": 80}},
     "attached": {"refine": {"objective": "thesis"}, "thesis": ONCE},
     "attached nelder_mead": {"refine": {"objective": "thesis", "optimizer": "nelder_mead"}, "thesis": ONCE},
