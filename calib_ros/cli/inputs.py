@@ -132,12 +132,12 @@ def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: 
     )
 
 
-def require_classes(config: Config) -> None:
-    """BadInputError if the configuration gives no classes for a first guess (--initial semantic)."""
+def require_classes(config: Config, initial: str) -> None:
+    """BadInputError if the configuration gives no classes for a first guess from them."""
     own = config.semantics
     if own.segmentation == "none" or not own.image_classes or not own.cloud_classes:
         raise BadInputError(
-            "--initial semantic needs classes of pixels and points: leave semantics.segmentation, image_classes and "
+            f"--initial {initial} needs classes of pixels and points: leave semantics.segmentation, image_classes and "
             "cloud_classes in --config at their defaults, or set the classes to an ONNX file, a folder, or 'source' for "
             "synthetic drives"
         )
