@@ -105,8 +105,7 @@ class ClassModels(Protocol):
         """How well labelled points meet pixels of their class; None where the frames show too little in common."""
 
     def first_guess(self, views: Sequence[Any], config: GuessConfig, seed: int, sweep: bool) -> list[Hypothesis]:
-        """Hypotheses of the extrinsic, best first (thesis 3.5), without a sweep those of centroids alone. TooFewFeaturesError
-        where the views show too little."""
+        """Hypotheses of the extrinsic, best first (thesis 3.5); sweep: not by centroids alone. TooFewFeaturesError if too few."""
 
 
 class _NoModels:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -169,7 +170,7 @@ class Consensus:
         p = self.point[best] @ T[:3, :3].T + T[:3, 3]
         distance = np.linalg.norm(p, axis=1)[:, None]
         gradient, scale = np.zeros(6), np.zeros((6, 6))
-        for axis, own, w in zip(self._axes(), off, precision, strict=True):
+        for axis, own, w in zip(self._axes, off, precision, strict=True):
             sine = np.deg2rad(own[0, best])[:, None]
             slope = (axis[best] - sine * p / distance) / distance
             J = np.c_[np.cross(p, slope), slope]
@@ -188,23 +189,34 @@ class Consensus:
         order = np.lexsort((-ratio, self.of_image))
         return np.asarray(order[np.unique(self.of_image[order], return_index=True)[1]])
 
+    @cached_property
     def _axes(self) -> tuple[Matrix, Matrix]:
         """Sideways and upward at every ray, (n, 3) each."""
         x = np.cross([0.0, 1.0, 0.0], self.ray)
         x /= np.linalg.norm(x, axis=1, keepdims=True)
         return x, np.cross(self.ray, x)
 
+    @cached_property
+    def _first(self) -> NDArray[np.intp]:
+        """The first pair of every image's object."""
+        return np.unique(self.of_image, return_index=True)[1]
+
+    @cached_property
+    def _noise(self) -> tuple[Matrix, Matrix]:
+        """core and stray (2, n), with the parallax."""
+        moved = np.rad2deg(self.parallax * BASELINE_M / np.linalg.norm(self.point, axis=1))
+        return np.hypot(self.core, moved), np.hypot(self.stray, moved)
+
     def _ratio(self, transforms: Matrix) -> tuple[Matrix, list[Matrix], list[Matrix]]:
         """Likelihood ratios (k, n), and for both axes how far off pairs are, deg, and their precision, 1/deg^2, (k, n) each."""
         p = np.einsum("kab,nb->kna", transforms[:, :3, :3], self.point) + transforms[:, None, :3, 3]
         p /= np.maximum(np.linalg.norm(p, axis=2, keepdims=True), 1e-6)
-        moved = np.rad2deg(self.parallax * BASELINE_M / np.linalg.norm(self.point, axis=1))
         ratio, off, precision = 1 / (2 * np.pi * self.chance) * (np.einsum("kna,na->kn", p, self.ray) > 0.5), [], []
-        for axis, core, stray in zip(self._axes(), self.core, self.stray, strict=True):
+        for axis, core, stray in zip(self._axes, *self._noise, strict=True):
             own = np.rad2deg(np.einsum("kna,na->kn", p, axis))
             parts = [
                 (share / sigma * np.exp(-0.5 * np.minimum((own / sigma) ** 2, 200)), sigma)
-                for share, sigma in ((1 - STRAY, np.hypot(core, moved)), (STRAY, np.hypot(stray, moved)))
+                for share, sigma in ((1 - STRAY, core), (STRAY, stray))
             ]
             density = sum(part for part, _ in parts)
             off.append(own)
@@ -215,8 +227,7 @@ class Consensus:
     def _evidence(self, transforms: Matrix) -> tuple[Matrix, Matrix]:
         """The evidence (k,), and how often objects of each class are met (k, classes)."""
         ratio = self._ratio(transforms)[0]
-        first = np.unique(self.of_image, return_index=True)[1]
-        best, cls = np.maximum.reduceat(ratio, first, axis=1), self.cls[first]
+        best, cls = np.maximum.reduceat(ratio, self._first, axis=1), self.cls[self._first]
         total, rates = np.zeros(len(transforms)), np.zeros((len(transforms), len(self.counts)))
         for c in np.unique(cls):
             own = best[:, cls == c]
