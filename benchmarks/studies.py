@@ -16,6 +16,7 @@ covariance    normalised errors squared of estimates from subsets of frames of S
 classes       single KITTI frames from 5 deg / 0.3 m per axis, with and without the classes of the package's networks
 first_guess   first guesses from classes: sets of 1, 5 and 10 KITTI frames, the LiDAR turned by any yaw within 45 deg and moved
               by up to 1 m per axis
+centroids     first guesses from centroids, not registered: ten frames of synthetic drives and --kitti, any yaw
 class_weights KITTI frames whose points have classes by the shape of clusters; weights of edges of vegetation and ground
 masks         the KITTI frame with masks of Segment Anything; their share in the edge maps
 time_offset   image stamps altered; SOURCE with consecutive frames, `standing:SOURCE` as if the vehicle stood
@@ -48,6 +49,7 @@ from numpy.typing import NDArray
 
 from benchmarks import (
     study_acceptance,
+    study_centroids,
     study_checks,
     study_contract,
     study_hours,
@@ -300,6 +302,7 @@ STUDIES: dict[str, Study] = {
         trials=2,
     ),
     "first_guess": Study(guessed_sets, first_guess, limits=RIGHT),
+    "centroids": study_centroids.STUDY,
     "class_weights": Study(
         by_shape,
         searched(SearchBox(5, 0.3, 2), 2),

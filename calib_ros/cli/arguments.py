@@ -182,9 +182,9 @@ def _frames_and_start(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5 (positions as info lists them)")
     command.add_argument(
         "--initial",
-        default="nominal",
-        help="nominal, reference, a result file, or a first guess: semantic = from the classes in the scenes, motion = from the "
-        "motion in frames that follow each other, auto = by what is available (default nominal)",
+        help="nominal, reference, a result file, or a first guess: semantic = from the classes in the scenes, centroids = from "
+        "objects alone, motion = from frames that follow each other, auto = by what is available (default nominal, or the "
+        "preset's)",
     )
     add_yaw_and_config(command)
 

@@ -20,7 +20,7 @@ from calib_ros.frame import Frame
 from calib_ros.io import check_output
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.initial_guess import AUTO, GUESSES, MOTION, SEMANTIC, nominal_start
+from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, GUESSES, MOTION, nominal_start
 from calib_ros.registration.search.constraints import NOMINAL_BOX, Axes
 from calib_ros.result import Extrinsic, Result
 
@@ -41,8 +41,8 @@ def calibrate(
     T0 = initial_extrinsic(initial, source, yaw_deg)
     moving = initial in (MOTION, AUTO)
     box = None if moving and search_deg is None and search_m is None else search_box(initial, config, search_deg, search_m)
-    if initial == SEMANTIC:
-        require_classes(config)
+    if initial in BY_CLASSES:
+        require_classes(config, initial)
     if overlay is not None:
         check_output(overlay, "--overlay")
     if initial == "nominal" and not any(config.constraints.limit_m):
@@ -50,7 +50,7 @@ def calibrate(
     chosen = _read(source, positions, config)
     calibrator = Calibrator(chosen[0].camera, config)
     # The models of the package wait until there is doubt; a wrong file of the user is to be told at once.
-    if initial == SEMANTIC or not calibrator.classes_in_doubt_only or not config.semantics.of_package:
+    if initial in BY_CLASSES or not calibrator.classes_in_doubt_only or not config.semantics.of_package:
         for line in calibrator.segmentation.load():
             note(line)
     with progress_bar("estimating") as step:
@@ -113,9 +113,9 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
             f"--initial {initial} is of calibrate, not of replay: run calib-ros calibrate --initial {initial} --json FILE, and "
             "start from --initial FILE"
         )
-    if initial == SEMANTIC:
-        require_classes(config)
-        config = update(config, {"initial": {"method": SEMANTIC}})
+    if initial in BY_CLASSES:
+        require_classes(config, initial)
+        config = update(config, {"initial": {"method": initial}})
         start = nominal_start(yaw_deg)
     recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
     # The recalibrator estimates motion from the previous cloud; where frames are skipped, that one is read for it.

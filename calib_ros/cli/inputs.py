@@ -133,12 +133,12 @@ def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: 
     )
 
 
-def require_classes(config: Config) -> None:
-    """BadInputError if the configuration gives no classes for a first guess (--initial semantic)."""
+def require_classes(config: Config, initial: str) -> None:
+    """BadInputError if the configuration gives no classes for a first guess from them."""
     own = config.semantics
     if own.segmentation == "none" or not own.image_classes or not own.cloud_classes:
         raise BadInputError(
-            "--initial semantic needs classes of pixels and points: leave semantics.segmentation, image_classes and "
+            f"--initial {initial} needs classes of pixels and points: leave semantics.segmentation, image_classes and "
             "cloud_classes in --config at their defaults, or set the classes to an ONNX file, a folder, or 'source' for "
             "synthetic drives"
         )
@@ -171,6 +171,11 @@ def topics(args: argparse.Namespace) -> dict[str, str]:
 def constraint_options(args: argparse.Namespace) -> ConstraintOptions:
     """The constraints given on the command line."""
     return ConstraintOptions(args.rotation_only, args.fix, args.bound, args.prior_deg, args.prior_m, args.time_offset)
+
+
+def initial_of(args: argparse.Namespace, config: Config) -> str:
+    """What ``--initial`` says, else the first guess of the preset, else nominal."""
+    return args.initial or (config.initial.method if args.preset else "nominal")
 
 
 def initial_extrinsic(text: str, source: Source, yaw_deg: float = 0.0) -> NDArray[np.float64]:

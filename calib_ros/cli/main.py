@@ -78,13 +78,14 @@ def _info(args: argparse.Namespace) -> int:
 
 def _calibrate(args: argparse.Namespace) -> int:
     from calib_ros.cli.calibrate import calibrate
-    from calib_ros.cli.inputs import configuration, constraint_options, open_named_source
+    from calib_ros.cli.inputs import configuration, constraint_options, initial_of, open_named_source
     from calib_ros.cli.output import check_camera_info, check_json, print_or_save, save_camera_info, summary
 
     constraints = constraint_options(args)
     constraints.check_search(args.search_deg, args.search_m)
     check_json(args.json)
     config = configuration(args.config, args.seed, args.objective, constraints, args.threads, args.intrinsics, args.preset)
+    args.initial = initial_of(args, config)
     check_camera_info(args.camera_info, config.camera)
     result = calibrate(
         *(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config),
@@ -114,10 +115,11 @@ def _replay(args: argparse.Namespace) -> int:
     import json
 
     from calib_ros.cli.calibrate import replay
-    from calib_ros.cli.inputs import configuration, constraint_options, open_named_source
+    from calib_ros.cli.inputs import configuration, constraint_options, initial_of, open_named_source
     from calib_ros.result import CONVERGED, TENTATIVE
 
     config = configuration(args.config, constraints=constraint_options(args), preset_name=args.preset)
+    args.initial = initial_of(args, config)
     converged = False
     for line in replay(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config):
         print(json.dumps(line), flush=True)

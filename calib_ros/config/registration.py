@@ -43,9 +43,9 @@ class InitialConfig(Stage):
     method: str = option(
         "nominal",
         "first guess of the extrinsic where none is given: nominal = looking along the LiDAR's +x axis; semantic = from "
-        "the classes of online.min_keyframes keyframes; motion = from 5 s of driving; auto = motion, then classes, then "
-        "nominal",
-        choices=("nominal", "semantic", "motion", "auto"),
+        "the classes of online.min_keyframes keyframes; centroids = from their objects alone; motion = from 5 s of driving; "
+        "auto = motion, then classes, then nominal",
+        choices=("nominal", "semantic", "centroids", "motion", "auto"),
     )
 
 

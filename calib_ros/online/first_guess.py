@@ -18,7 +18,7 @@ from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import CLOUD, IMAGE, Hypothesis
 from calib_ros.registration.features import FrameFeatures, views_of
-from calib_ros.registration.initial_guess import AUTO, MOTION, SEMANTIC
+from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, MOTION
 from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.motion_guess.registration import best_registration, better
 from calib_ros.registration.progress import Callback
@@ -58,7 +58,7 @@ class FirstGuess:
 
     @property
     def _uses_classes(self) -> bool:
-        return self.config.initial.method in (SEMANTIC, AUTO)
+        return self.config.initial.method in (*BY_CLASSES, AUTO)
 
     @property
     def _uses_motion(self) -> bool:
@@ -167,7 +167,7 @@ class FirstGuess:
         if known < needed:
             missing = calibrator.segmentation.missing(IMAGE, CLOUD)
             return self._insufficient(initial, missing or f"waiting for the classes of keyframes, {known} of {needed}")
-        return calibrator.guess(features, progress=progress)
+        return calibrator.guess(features, progress=progress, method=self.config.initial.method)
 
     @staticmethod
     def _insufficient(initial: Result, why: str) -> Result:

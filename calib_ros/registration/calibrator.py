@@ -32,7 +32,7 @@ from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.estimate import Estimate, insufficient, observable_pose, refine_start, reject_outlier_frames
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective, views_of
 from calib_ros.registration.frames import usable_frames, with_classes
-from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
+from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import JointSearch
 from calib_ros.registration.motion_guess.registration import Guesser, best_registration
 from calib_ros.registration.nuisance.refinement import joint_optimum
@@ -76,7 +76,7 @@ class Calibrator:
     def calibrate(
         self,
         frames: Sequence[Frame],
-        initial: ArrayLike | Literal["semantic", "motion", "auto"],
+        initial: ArrayLike | Literal["semantic", "centroids", "motion", "auto"],
         search: SearchBox | None = None,
         progress: Callback | None = None,
         consecutive: Sequence[Frame] = (),
@@ -87,9 +87,9 @@ class Calibrator:
         ----------
         frames : sequence of Frame
             At least one. A frame whose scan is empty, or whose times are impossible, is left out and named in the reason.
-        initial : array_like, shape (4, 4), or "semantic", "motion" or "auto"
-            T_camera_lidar to start from; "semantic" finds one from the classes of points and pixels (see `guess`), "motion" from
-            consecutive frames (hand-eye calibration); "auto" tries motion, classes and the nominal one, until one converges.
+        initial : array_like, shape (4, 4), or "semantic", "centroids", "motion" or "auto"
+            T_camera_lidar to start from; "semantic" and "centroids" find one from the classes of points and pixels (see `guess`),
+            "motion" from consecutive frames; "auto" tries motion, classes and the nominal one, until one converges.
         search : SearchBox, optional
             Box of the global search around it; None = refine only.
         progress : callable, optional
@@ -143,7 +143,7 @@ class Calibrator:
     def _calibrated(
         self,
         frames: Sequence[Frame],
-        initial: ArrayLike | Literal["semantic", "motion", "auto"],
+        initial: ArrayLike | Literal["semantic", "centroids", "motion", "auto"],
         search: SearchBox | None,
         progress: Callback | None,
         consecutive: Sequence[Frame],
@@ -156,7 +156,7 @@ class Calibrator:
         if not frames:
             raise BadInputError("no frames given; give at least one")
         _check_same_reference(frames)
-        if T0 is None and initial != SEMANTIC:
+        if T0 is None and initial not in BY_CLASSES:
 
             def register(start: Matrix | str, box: SearchBox | None) -> Result:
                 return self._calibrated(frames, start, box, progress, ())
@@ -169,7 +169,7 @@ class Calibrator:
         used, notes = usable_frames(frames, self.extract, segmentation, Progress(progress, "features"))
         features = [features for _, features in used]
         if T0 is None:
-            result = self.guess(features, search, progress, notes)
+            result = self.guess(features, search, progress, notes, str(initial))
         elif wait:
             seen = partial(with_classes, used, self.extract, self.segmentation, T0, search, Progress(progress, "classes"))
             result = self.estimate_in_doubt(features, seen, T0, search, progress, notes)
@@ -183,15 +183,16 @@ class Calibrator:
         box: SearchBox | None = None,
         progress: Callback | None = None,
         notes: Sequence[str] = (),
+        method: str = SEMANTIC,
     ) -> Result:
         """Estimate without an initial extrinsic: the registration from the best hypotheses that the classes of points and pixels
-        give (thesis 3.5). box: around each; None = SEMANTIC_BOX. A failure is a Result, its transform nominal."""
+        give (thesis 3.5), CENTROIDS without a sweep. box: around each; None = SEMANTIC_BOX. A failure is a Result, nominal."""
         started = time.perf_counter()
         views, models = views_of(features), class_models()
         try:
             if models is None:
                 raise TooFewFeaturesError(self.segmentation.missing())
-            hypotheses = models.first_guess(views, self.config.guess, self.config.search.seed)
+            hypotheses = models.first_guess(views, self.config.guess, self.config.search.seed, method != CENTROIDS)
         except TooFewFeaturesError as error:
             return insufficient(error, nominal(), len(features), notes)
         result, tried = best_registration(

@@ -104,8 +104,8 @@ class ClassModels(Protocol):
     def consistency(self, views: Sequence[Any]) -> PointScore | None:
         """How well labelled points meet pixels of their class; None where the frames show too little in common."""
 
-    def first_guess(self, views: Sequence[Any], config: GuessConfig, seed: int) -> list[Hypothesis]:
-        """Hypotheses of the extrinsic, best first (thesis 3.5). TooFewFeaturesError where the views show too little."""
+    def first_guess(self, views: Sequence[Any], config: GuessConfig, seed: int, sweep: bool) -> list[Hypothesis]:
+        """Hypotheses of the extrinsic, best first (thesis 3.5); sweep: not by centroids alone. TooFewFeaturesError if too few."""
 
 
 class _NoModels:

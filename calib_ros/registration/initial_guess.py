@@ -13,8 +13,9 @@ from calib_ros.registration.search.constraints import Limits
 from calib_ros.result import INITIAL, InitialSource, Result
 
 # Instead of an extrinsic: to be found from the classes of points and pixels, the motion in consecutive frames, or either.
-SEMANTIC, MOTION, AUTO = "semantic", "motion", "auto"
-GUESSES = (SEMANTIC, MOTION, AUTO)
+SEMANTIC, CENTROIDS, MOTION, AUTO = "semantic", "centroids", "motion", "auto"
+BY_CLASSES = (SEMANTIC, CENTROIDS)
+GUESSES = (*BY_CLASSES, MOTION, AUTO)
 
 
 def nominal(yaw_deg: float = 0.0) -> Transform:

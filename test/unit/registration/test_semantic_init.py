@@ -20,7 +20,8 @@ from calib_ros.registration.initial_guess import allowed, poses
 from calib_ros.registration.motion_guess.registration import best_registration, search_boxes
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
-from calib_ros_semantics.first_guess.guess import CANDIDATES, OTHER_WAY_DEG, centroid_poses, first_guess, possible_pairs
+from calib_ros_semantics.first_guess.centroids import agreed_poses, find_pairs
+from calib_ros_semantics.first_guess.guess import CANDIDATES, CENTROIDS, OTHER_WAY_DEG, first_guess
 from calib_ros_semantics.first_guess.score import class_score, label_score, refine_positions
 from calib_ros_semantics.first_guess.view import ClassView, class_view
 
@@ -97,12 +98,54 @@ def test_tilted_and_distant_poses_are_not_allowed() -> None:
     assert allowed(T, config).tolist() == [True, True, False, False, True, False]
 
 
-@pytest.mark.parametrize("yaw", [0.0, 180.0, -97.0])
-def test_centroids_alone_find_the_pose(yaw: float) -> None:
+@pytest.mark.parametrize(("yaw", "wrong", "seen"), [(180.0, 0, 0.5), (-97.0, 30, 1.0), (60.0, 20, 0.7)])
+def test_centroids_alone_find_the_pose(yaw: float, wrong: int, seen: float) -> None:
+    """Objects of the wrong class in the image, and missing in the cloud."""
     T = mounted(yaw)
-    pairs = possible_pairs([balls(T, seed) for seed in range(3)], GuessConfig())
-    found = centroid_poses(pairs, CAMERA.K, GuessConfig(), 0)
-    assert_near(T, max(found, key=pairs.inliers), 1.5, 0.4)
+    views = [balls(T, seed, wrong, 60) for seed in range(3)]
+    kept = [np.linalg.norm(v.xyz, axis=1) < 8 + 17 * seen for v in views]  # the far ones are missing
+    views = [replace(v, xyz=v.xyz[own], label=v.label[own]) for v, own in zip(views, kept, strict=True)]
+    pairs = find_pairs(views, GuessConfig())
+    found = agreed_poses(pairs, GuessConfig(), 0)
+    assert_near(T, found[0], 1.0, 0.3)
+    assert pairs.inliers(found[0]) > 2 * max(pairs.inliers(turned_away(found[0], by)) for by in (40, 130, 220))
+
+
+def turned_away(T: np.ndarray, yaw_deg: float) -> np.ndarray:
+    return T @ se3.from_parts(se3.rotation_from_euler(np.deg2rad(yaw_deg), 0, 0), np.zeros(3))
+
+
+def test_more_frames_bring_centroids_nearer() -> None:
+    T = mounted(70.0, 3)
+    errors = []
+    for count in (1, 4):
+        found = agreed_poses(find_pairs([balls(T, seed, 15, 60) for seed in range(count)], GuessConfig()), GuessConfig(), 0)
+        errors.append(se3.translation_error_m(T, found[0]))
+    assert errors[1] < min(0.7 * errors[0], 0.2)
+
+
+def test_evidence_of_centroids_has_the_slope_that_it_says() -> None:
+    T = mounted(20.0)
+    pairs = replace(find_pairs([balls(T, 0, 15, 60)], GuessConfig()), parallax=1.0)
+    off = se3.perturb(T, [0.6, -0.4, 0.5], [0.1, 0.05, -0.1])
+    gradient, scale = pairs.linearise(off)
+    step = 1e-6
+    slope = [(pairs.value(se3.exp(e) @ off) - pairs.value(se3.exp(-e) @ off)) / (2 * step) for e in step * np.eye(6)]
+    assert gradient == pytest.approx(slope, rel=0.03, abs=1.0)
+    assert (np.linalg.eigvalsh(scale) > 0).all()
+    assert pairs.value(T) > pairs.value(off) > pairs.value(turned_away(T, 90))
+    assert pairs.values(np.stack([T, off])) == pytest.approx([pairs.value(T), pairs.value(off)])
+
+
+def test_centroids_need_no_sweep_and_say_what_they_miss(street_views) -> None:
+    views, T = street_views
+    found = first_guess([turned(v, 120)[0] for v in views], sweep=False)
+    assert_near(T @ turned(views[0], 120)[1], found[0].T, 2.0, 0.5)
+    assert {h.kind for h in found} == {CENTROIDS}
+    surfaces = [replace(v, label=np.where(v.label < C.BUILDING, UNLABELLED, v.label).astype(np.uint8)) for v in views]
+    with pytest.raises(TooFewFeaturesError, match=r"3 whole objects .* of \d+ in the images 0 may be in the clouds"):
+        first_guess(surfaces, sweep=False)
+    assert first_guess(surfaces[:1])[0].kind == "sweep"  # which needs none
 
 
 @pytest.mark.parametrize(("yaw", "wrong"), [pytest.param(180.0, 0, marks=pytest.mark.slow), (25.0, 40)])

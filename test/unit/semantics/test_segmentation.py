@@ -436,8 +436,9 @@ def turned(frame: Frame, yaw_deg: float) -> Frame:
     return replace(frame, cloud=cloud, reference=frame.reference @ se3.from_parts(R.T, np.zeros(3)), twist=None)
 
 
-def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
-    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}, **GUESSED}), **SOURCE)
+@pytest.mark.parametrize("method", ["semantic", "centroids"])
+def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive, method):
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}, "initial": {"method": method}}), **SOURCE)
     frames = [turned(f, -115) for f in drive]
     truth = frames[0].reference
     assert se3.rotation_error_deg(nominal(), truth) > 100
@@ -492,12 +493,13 @@ SMALL = "synthetic:frames=1,rings=16,width=320,height=120"
 STREET = "synthetic:seed=31,frames=3,width=640,height=240,speed=0,stride=30"
 
 
+@pytest.mark.parametrize("initial", ["semantic", "centroids"])
 @pytest.mark.parametrize("command", ["calibrate", pytest.param("replay", marks=pytest.mark.slow)])
-def test_calibrate_and_replay_from_a_semantic_start(tmp_path, capsys, command):
+def test_calibrate_and_replay_from_a_semantic_start(tmp_path, capsys, command, initial):
     quick = {"search": {"rounds": 2, "starts": 64}, "online": {"min_keyframes": 3}, "semantics": SOURCE}
     (tmp_path / "classes.yaml").write_text(yaml.safe_dump(quick))
     written = ("--json", str(tmp_path / "result.json")) if command == "calibrate" else ()
-    code = main.main([command, STREET, "--initial", "semantic", "--config", str(tmp_path / "classes.yaml"), *written])
+    code = main.main([command, STREET, "--initial", initial, "--config", str(tmp_path / "classes.yaml"), *written])
     captured = capsys.readouterr()
     assert code == 0, captured
     found = json.loads((tmp_path / "result.json").read_text() if written else captured.out)

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from calib_ros.cli.arguments import parser
-from calib_ros.cli.inputs import configuration
+from calib_ros.cli.inputs import configuration, initial_of
 from calib_ros.config import Config, load_stages, preset, update
 from calib_ros.errors import ConfigError
 from calib_ros.extensions import commands
@@ -67,6 +67,14 @@ def test_every_command_that_estimates_takes_a_preset(command, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert "'thesys'" in line
     assert "thesis, thesis-literal" in line.replace("'", "")
+
+
+@pytest.mark.parametrize(("options", "start"), [([], "nominal"), (["--preset", "thesis"], "centroids")])
+def test_the_preset_begins_at_its_first_guess_unless_told_another(options, start):
+    args = parser().parse_args(["calibrate", "drive", *options])
+    assert initial_of(args, preset(args.preset)) == start
+    args = parser().parse_args(["calibrate", "drive", "--initial", "reference", *options])
+    assert initial_of(args, preset(args.preset)) == "reference"
 
 
 def test_a_mistyped_name_names_those_there_are():
