@@ -20,14 +20,14 @@ def test_the_thesis_is_chosen_whole():
     assert (config.refine.objective, config.refine.optimizer) == ("thesis", "nelder_mead")
     assert config.semantics.frame_weights
     assert not config.semantics.in_doubt_only
-    assert config.stage(ThesisConfig).dense_edges == "every_evaluation"
+    assert config.stage(ThesisConfig).dense_edges == "once_per_level"
 
 
 def test_the_literal_one_takes_the_raw_sum_without_a_search_and_the_printed_threshold():
     literal = preset("thesis-literal")
     changes = {
         "search": {"rotation_deg": 0.0, "translation_m": 0.0},
-        "thesis": {"normalize": False},
+        "thesis": {"dense_edges": "every_evaluation", "normalize": False},
         "online": {"similarity_threshold": 0.7, "keyframe_spacing_s": 0.0},
     }
     assert literal == update(preset("thesis"), changes)
