@@ -166,7 +166,8 @@ class Calibrator:
             return replace(result, elapsed_s=time.perf_counter() - started)
         wait = T0 is not None and self.classes_in_doubt_only
         segmentation = self.segmentation if self.segmentation.active and not wait else None
-        used, notes = usable_frames(frames, self.extract, segmentation, Progress(progress, "features"))
+        around = None if T0 is None else (T0, search)
+        used, notes = usable_frames(frames, self.extract, segmentation, Progress(progress, "features"), around)
         features = [features for _, features in used]
         if T0 is None:
             result = self.guess(features, search, progress, notes, str(initial))

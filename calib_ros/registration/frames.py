@@ -22,14 +22,20 @@ BESIDE = 0.1  # of the image width: objects at the border have to be seen as a w
 
 
 def usable_frames(
-    frames: Sequence[Frame], extract: FeatureExtractor, segmentation: Segmentation | None, progress: Progress
+    frames: Sequence[Frame],
+    extract: FeatureExtractor,
+    segmentation: Segmentation | None,
+    progress: Progress,
+    around: tuple[Transform, SearchBox | None] | None = None,
 ) -> tuple[list[Used], list[str]]:
-    """The frames that can be used with their features, and notes on others and on failed models. segmentation: None = without."""
+    """The frames that can be used with their features, and notes on others and on failed models. segmentation: None = without.
+    around: T (4, 4) and the box about it, from where points come into view that need a class; None = all do."""
     used: list[Used] = []
     notes: list[str] = []
     for k, frame in enumerate(frames):
         try:
-            semantics = segmentation(frame) if segmentation else None
+            points = points_in_reach(frame, extract, *around) if segmentation and around else None
+            semantics = segmentation(frame, points=points) if segmentation else None
             used.append((frame, extract(frame, semantics)))
             notes += semantics.problems if semantics else ()
             notes += [frame.cloud.time_problem] if frame.cloud.time_problem and frame.cloud.time_problem not in notes else []
