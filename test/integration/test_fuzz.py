@@ -37,7 +37,7 @@ def cases(short: int, long: int) -> pytest.MarkDecorator:
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(100, marks=pytest.mark.slow)])
-@cases(300, 5500)
+@cases(300, 3000)
 def test_mutated_messages(seed, count):
     report = fuzz("messages", count, seed)
     assert total(report, "cloud", "image", "compressed", "camera_info") == count
@@ -47,7 +47,7 @@ def test_mutated_messages(seed, count):
         assert min(report["outcomes"][f"{kind} {what}"] for what in ("taken", "refused")) > count // 200
 
 
-@cases(80, 600)
+@cases(80, 300)
 def test_mutated_messages_in_the_pipeline(count):
     report = fuzz("pipeline", count)
     assert total(report, "pair") == count
