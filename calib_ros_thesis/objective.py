@@ -26,6 +26,7 @@ from calib_ros_thesis.score import ThesisScore
 Matrix = NDArray[np.float64]
 # Size of the first simplex and largest gradient step, and 17 cm per degree, halved on each level: more leaves the basin.
 FIRST_SIMPLEX_DEG = 1.6
+SET_MASKS = "set semantics.segment_anything to its ONNX file or a folder of masks"
 LAST_SIZE = 0.005  # of it, when a simplex is done: a tenth of a pixel at 720 px focal length
 # rad, m; 0.13-0.18 deg and 3.6-4.9 cm remain on 4 to 10 spread KITTI scenes.
 SYSTEMATIC_ERROR = np.array([np.deg2rad(0.1)] * 3 + [0.03] * 3)
@@ -80,8 +81,8 @@ class ThesisObjective:
         """What the semantic edges of 3.4.2 are, where they are not of Segment Anything in all frames."""
         blended = {f.own.blended for f in self.edges.features}
         if OF_CLASSES in blended:
-            return "semantic edges are borders of classes, since there are no masks of Segment Anything"
-        return "" if blended == {OF_MASKS} else "no semantic edges: no masks of Segment Anything, no classes"
+            return f"semantic edges are borders of classes, since there are no masks of Segment Anything: {SET_MASKS}"
+        return "" if blended == {OF_MASKS} else f"no semantic edges, neither of Segment Anything nor of classes: {SET_MASKS}"
 
     def value(self, T: Matrix) -> float:
         """J at the last smoothing; with edges attached once per level, the smooth score of those attached at T."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -54,19 +55,24 @@ def export(network: Network, file: str | Path, size: tuple[int, int] | None = No
         )
     assert program is not None  # None is of the old exporter
     model = program.model_proto
-    halve(model.graph)
     if size is None:
         _name_sizes(model.graph)
-    model.ir_version = IR_VERSION
-    del model.metadata_props[:]
-    for key, value in METADATA.items():
-        model.metadata_props.add(key=key, value=value)
-    onnx.checker.check_model(model)
-    onnx.save(model, str(file))
+    store(model, file, METADATA)
     _compare(network, file, size or (192, 640))
 
 
-def halve(graph: Any) -> None:
+def store(model: Any, file: str | Path, metadata: Mapping[str, str]) -> None:
+    """Write a model with this metadata alone, its large tensors as float16. onnx.checker.ValidationError if it is none."""
+    _halve(model.graph)
+    model.ir_version = IR_VERSION
+    del model.metadata_props[:]
+    for key, value in metadata.items():
+        model.metadata_props.add(key=key, value=value)
+    onnx.checker.check_model(model)
+    onnx.save(model, str(file))
+
+
+def _halve(graph: Any) -> None:
     """Stores large float32 tensors as float16, with a Cast each that onnxruntime computes once, when it loads the file."""
     casts, kept = [], []
     for tensor in graph.initializer:

@@ -154,16 +154,18 @@ class Consensus:
     def values(self, transforms: Matrix) -> Matrix:
         """The evidence (k,) at each of (k, 4, 4)."""
         step = max(BATCH // max(len(self), 1), 1)
-        return np.concatenate([self._evidence(transforms[k : k + step])[0] for k in range(0, len(transforms), step)])
+        return np.concatenate(
+            [self._evidence(self._ratio(transforms[k : k + step])[0])[0] for k in range(0, len(transforms), step)]
+        )
 
     def value(self, T: Matrix) -> float:
         """The evidence at T (4, 4)."""
-        return float(self._evidence(T[None])[0][0])
+        return float(self._evidence(self._ratio(T[None])[0])[0][0])
 
     def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
         """Gradient (6,) and Gauss-Newton scale (6, 6), every object kept with its best pair."""
-        _, rates = self._evidence(T[None])
         ratio, off, precision = self._ratio(T[None])
+        _, rates = self._evidence(ratio)
         best = self._best(ratio[0])
         ratio, rate = ratio[0, best], rates[0, self.cls[best]]
         weight = rate * ratio / (1 - rate + rate * ratio)
@@ -224,11 +226,11 @@ class Consensus:
             ratio = ratio * density
         return ratio, off, precision
 
-    def _evidence(self, transforms: Matrix) -> tuple[Matrix, Matrix]:
-        """The evidence (k,), and how often objects of each class are met (k, classes)."""
-        ratio = self._ratio(transforms)[0]
+    def _evidence(self, ratio: Matrix) -> tuple[Matrix, Matrix]:
+        """Of the likelihood ratios (k, n) of all pairs the evidence (k,), and how often objects of each class are met
+        (k, classes)."""
         best, cls = np.maximum.reduceat(ratio, self._first, axis=1), self.cls[self._first]
-        total, rates = np.zeros(len(transforms)), np.zeros((len(transforms), len(self.counts)))
+        total, rates = np.zeros(len(ratio)), np.zeros((len(ratio), len(self.counts)))
         for c in np.unique(cls):
             own = best[:, cls == c]
             missed = self.counts[c] - own.shape[1]

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx
 import onnxruntime
 import torch
 from numpy.typing import NDArray
@@ -24,7 +23,7 @@ from torch.nn import functional
 from calib_ros_thesis.maps import FAR_LEVEL, complete_depth
 from training.completion.network import GREY, STRIDE, CompletionNetwork
 from training.completion.scenes import Scene, numbers_in, read, render
-from training.export import IR_VERSION, OPSET, halve
+from training.export import OPSET, store
 
 SCENES, STEPS, RATE, SEED = 360, 1600, 4e-3, 1  # what the weights of the package come from
 HELD_OUT = 20  # every 20th scene is validated
@@ -154,16 +153,10 @@ def export(network: CompletionNetwork, file: Path) -> None:
         )
     assert program is not None  # None is of the old exporter
     model = program.model_proto
-    halve(model.graph)
     for tensor in (*model.graph.input, *model.graph.output):
         for axis, name in ((2, "height"), (3, "width")):
             tensor.type.tensor_type.shape.dim[axis].dim_param = name
-    model.ir_version = IR_VERSION
-    del model.metadata_props[:]
-    for key, value in METADATA.items():
-        model.metadata_props.add(key=key, value=value)
-    onnx.checker.check_model(model)
-    onnx.save(model, str(file))
+    store(model, file, METADATA)
     file.with_suffix(".yaml").write_text(SIDECAR)
 
 
