@@ -182,7 +182,10 @@ class Extracting:
 
     @cached_property
     def _extractors(self) -> Extractors:
-        return Extractors(replace(self.config, refine=replace(self.config.refine, objective=self.objective)))
+        refine = self.config.refine
+        # An optimiser that was chosen with another objective, as by a preset, is not this one's.
+        optimizer = refine.optimizer if refine.objective in ("fast", self.objective) else "auto"
+        return Extractors(replace(self.config, refine=replace(refine, objective=self.objective, optimizer=optimizer)))
 
     @cached_property
     def _segmentation(self) -> SegmentationModels:

@@ -9,7 +9,7 @@ import pytest
 from scenes import NEAR, Scene
 
 from calib_ros import se3
-from calib_ros.config import Config
+from calib_ros.config import Config, preset
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
@@ -18,6 +18,7 @@ from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.own import LINEARISATION, Own, _Count
+from calib_ros_evaluation.methods.registry import methods
 from calib_ros_evaluation.methods.thesis import Thesis
 from calib_ros_thesis.score import ThesisScore
 
@@ -150,3 +151,11 @@ def test_semantics_take_part_where_they_are_configured(scene: Scene, kind: type[
     assert plain.points.label is None
     assert seen.points.label is not None
     assert seen.points.label.any()
+
+
+def test_a_preset_leaves_the_other_method_its_optimiser():
+    found = {name: methods(preset("thesis"))[name]._extractors.config.refine for name in ("ours", "thesis")}
+    assert {name: (refine.objective, refine.optimizer) for name, refine in found.items()} == {
+        "ours": ("fast", "auto"),
+        "thesis": ("thesis", "nelder_mead"),
+    }
