@@ -44,9 +44,18 @@ def pytest_unconfigure() -> None:
         shutil.rmtree(os.environ.pop(RENDERINGS, ""), ignore_errors=True)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+@pytest.hookimpl(tryfirst=True)  # before pytest leaves out what -m does not want
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Marks the laboratory, begins with the longest files, and leaves short forms out where the long ones run."""
+
     def folder(item: pytest.Item) -> str:
         return item.path.relative_to(ROOT / "test").parts[0]
+
+    if "not slow" not in config.option.markexpr:
+        long = {item.parent.nodeid + item.originalname for item in items if item.get_closest_marker("slow")}
+        left_out = [i for i in items if i.get_closest_marker("short") and i.parent.nodeid + i.originalname in long]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
 
     for item in items:
         if folder(item) in LABORATORY:

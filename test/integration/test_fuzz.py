@@ -32,8 +32,10 @@ def total(report: dict[str, Any], *kinds: str) -> int:
 
 
 def cases(short: int, long: int) -> pytest.MarkDecorator:
-    """So many cases in `make test`, and at length in `make test-all`."""
-    return pytest.mark.parametrize("count", [short, pytest.param(long, marks=pytest.mark.slow)])
+    """So many cases in `make test`, and instead at length in `make test-all`."""
+    return pytest.mark.parametrize(
+        "count", [pytest.param(short, marks=pytest.mark.short), pytest.param(long, marks=pytest.mark.slow)]
+    )
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(100, marks=pytest.mark.slow)])
