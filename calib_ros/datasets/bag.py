@@ -21,7 +21,19 @@ from calib_ros.datasets.bag_file import (
     is_rectified,
     peek_header,
 )  # fmt: skip
-from calib_ros.datasets.bag_index import MAX_KEPT, BagIndex, Span, TopicIndex, located
+from calib_ros.datasets.bag_index import (
+    AUTO,
+    CLOCKS,
+    HEADER,
+    MAX_KEPT,
+    MAX_LATENCY,
+    RECORDING,
+    BagIndex,
+    Span,
+    TopicIndex,
+    difference_in_words,
+    located,
+)
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
@@ -49,6 +61,8 @@ class BagSource:
     motion : how the clouds are stamped, where their points have no times.
     T_camera_lidar : where about the camera looks, (4, 4), to find when scans sweep its view; by default that of the recording's
         static transforms, else along the LiDAR's +x axis.
+    clock : "header" pairs by the messages' stamps, "recording" by when they were recorded; "auto" by the stamps, whose clocks are
+        set alike where the recording shows that they differ by more than a second, see `remarks`.
     windows : instead of the whole bag, read only so many short windows of time, evenly spread over it; its frames are then those
         of the windows, and `middles` has the position of one in each, between two others. For a bag that has an index.
 
@@ -67,12 +81,15 @@ class BagSource:
         motion: MotionConfig | None = None,
         T_camera_lidar: Transform | None = None,
         windows: int = 0,
+        clock: str = AUTO,
     ) -> None:
         if not 0 <= tolerance_s < 1e6:
             raise BadInputError(f"tolerance_s is {tolerance_s}, but must be 0 or more seconds")
         if windows < 0:
             raise BadInputError(f"windows is {windows}, but must be 0 or more")
-        self.path = Path(path)
+        if clock not in CLOCKS:
+            raise BadInputError(f"clock is '{clock}', but must be one of {', '.join(CLOCKS)}")
+        self.path, self._clock = Path(path), clock
         self.name = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
         self._bag = BagFile(self.path)
         self.image_topic = choose_image(self._bag, image_topic)
@@ -92,21 +109,36 @@ class BagSource:
         self.windows = 0 if found is None else len(found)
         self.camera_frame, self.lidar_frame = self._index.camera_frame, self._index.lidar_frame
         if not len(self):
-            image, moments = self._index.image, self._index.cloud.stamps + self._sweep_offset
-            gaps = np.abs(moments[nearest_index(moments, image.stamps)] - image.stamps)
-            raise BadInputError(
-                f"bag {self.path}: no message of {self.points_topic} within {self._tolerance / NANOSECONDS:g} s of one of "
-                f"{self.image_topic} (the nearest is {gaps.min() / NANOSECONDS:.3f} s away); "
-                "synchronise the sensors' clocks or raise tolerance_s"
-            )
+            raise BadInputError(self._no_pairs())
         self.middles = spread_positions(windows, len(self)) if found is None else found
         first = int(self._pairs[0][0])
         self.vehicle_frames = self._index.vehicle_frames()
         self.camera = self._index.camera_at(int(self._index.image.stamps[first]))
         self.reference = self._index.reference_at(int(self._index.image.recorded[first]))
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What there is to know about the recording, for people."""
+        ahead = self._index.clock_difference
+        return (difference_in_words(ahead),) if ahead else ()
+
+    def _no_pairs(self) -> str:
+        image, moments = self._index.image, self._index.cloud.stamps + self._sweep_offset
+        gap = int(np.abs(moments[nearest_index(moments, image.stamps)] - image.stamps).min())
+        if gap <= MAX_LATENCY:
+            advice = "synchronise the sensors' clocks or raise tolerance_s"
+        elif self._clock == HEADER:
+            advice = "let --clock auto or recording pair them by when they were recorded"
+        else:
+            advice = "they were recorded at different times; record them together"
+        return (
+            f"bag {self.path}: no message of {self.points_topic} within {self._tolerance / NANOSECONDS:g} s of one of "
+            f"{self.image_topic} (the nearest is {gap / NANOSECONDS:.3f} s away); {advice}"
+        )
+
     def _new_index(self) -> BagIndex:
-        return BagIndex(self._bag, self.image_topic, self.points_topic, self.camera_info_topic, self.rectified)
+        topics = self.image_topic, self.points_topic, self.camera_info_topic
+        return BagIndex(self._bag, *topics, self.rectified, self._clock)
 
     def _read_windows(self, count: int) -> list[int] | None:
         """Positions of the middle frames of windows; None if too few windows have one, and the whole bag has to be read."""
@@ -208,13 +240,19 @@ class BagSource:
             ),
             "frames": f"{pairs} pairs; without partner: {images - pairs} of {images} images, {clouds - pairs} of {clouds} clouds"
             + (f"; {self.windows} windows of the recording" if self.windows else ""),
-            "stamps": "of the headers" if self._index.use_headers else "of the recording (headers have none)",
+            "stamps": self._stamps_in_words(),
             "pairing": f"scans sweep the view {self._sweep_offset / 1e6:+.0f} ms from their stamps",
             "camera": describe_camera(self.camera) + (" (rectified images)" if self.rectified else ""),
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,
             "reference": "none" if self.reference is None else "from /tf_static",
         }
+
+    def _stamps_in_words(self) -> str:
+        if not self._index.use_headers:
+            return "of the recording" + ("" if self._clock == RECORDING else " (headers have none)")
+        ahead = self._index.clock_difference / NANOSECONDS
+        return "of the headers" + (f", of clouds {-ahead:+.2f} s" if ahead else "")
 
 
 class Slots:

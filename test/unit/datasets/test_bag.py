@@ -328,6 +328,43 @@ def test_headers_without_stamps_fall_back_to_the_time_of_recording(tmp_path):
     assert "headers have none" in bag.describe()["stamps"]
 
 
+@pytest.mark.parametrize(
+    ("ahead_s", "queue_s", "found_s", "cause"),
+    [
+        (37.02, 0.0, 37.0, "TAI and UTC"),
+        (-18.02, 0.0, -18.0, "GPS time and UTC"),
+        (2.5, 0.0, 2.5, "not synchronised"),
+        (-START / 1e9 + 300, 0.0, -START / 1e9 + 300, "another epoch"),
+        (0.0, 4.0, 0.0, ""),
+        (0.2, 0.0, 0.0, ""),
+    ],
+)
+def test_clocks_that_differ_are_told_from_messages_that_come_late(tmp_path, ahead_s, queue_s, found_s, cause):
+    """By the times of recording; stamps of the future, other epochs and time scales are clocks, a queue is none."""
+    with Recorder(tmp_path / "bag") as record:
+        for i in range(60):
+            at = START + i * 100 * MS
+            record.image(at, value=i, time=at + 20 * MS)
+            record.info(at)
+            record.cloud(at + round(ahead_s * 1e9), value=i, time=at + 20 * MS + round(queue_s * 1e9))
+    bag = BagSource(tmp_path / "bag")
+    assert [remark for remark in bag.remarks if cause not in remark] == []
+    assert len(bag.remarks) == (1 if found_s else 0)
+    assert [int(bag[i].cloud.xyz[0, 0]) - int(bag[i].image[0, 0]) for i in (0, 30, 59 if not ahead_s else -1)] == (
+        [0, 0, 0] if ahead_s != 0.2 else [-2, -2, -2]
+    )
+    as_stamped = {"header": ahead_s, "recording": queue_s}
+    for clock, offset_s in as_stamped.items():
+        if abs(offset_s) > 10:
+            with pytest.raises(BadInputError, match="--clock auto"):
+                BagSource(tmp_path / "bag", clock=clock)
+        else:
+            own = BagSource(tmp_path / "bag", clock=clock)
+            assert int(own[0].cloud.xyz[0, 0]) == max(0, round(-10 * offset_s))
+    with pytest.raises(BadInputError, match="must be one of auto, header, recording"):
+        BagSource(tmp_path / "bag", clock="sensor")
+
+
 def test_several_topics_of_a_type_need_a_choice(tmp_path):
     with Recorder(tmp_path / "bag") as record:
         record.trio(START)
