@@ -23,6 +23,7 @@ def options_of(args: argparse.Namespace) -> CheckOptions:
         args.points_topic,
         args.camera_info_topic,
         args.clock,
+        args.incomplete,
         configuration(args.config),
     )
 

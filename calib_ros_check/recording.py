@@ -40,6 +40,7 @@ class CheckOptions:
     points_topic: str | None = None
     camera_info_topic: str | None = None
     clock: str | None = None
+    incomplete: bool = False
     config: Config = field(default_factory=Config)
 
 
@@ -102,7 +103,7 @@ def extrinsic_of(source: Source, path: str, extrinsic: str) -> Transform:
 
 def _opened(path: str, options: CheckOptions) -> Source:
     """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
-    names = ("image_topic", "points_topic", "camera_info_topic", "clock")
+    names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     given: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name)}
     if is_bag(Path(path).expanduser()):
         given |= {"motion": options.config.motion, "tolerance_s": options.config.online.pair_tolerance_s}

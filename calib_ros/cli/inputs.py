@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,9 +167,9 @@ def open_named_source(args: argparse.Namespace, config: Config | None = None) ->
     return source
 
 
-def topics(args: argparse.Namespace) -> dict[str, str]:
-    """The topics of a bag given on the command line, and its clock."""
-    names = ("image_topic", "points_topic", "camera_info_topic", "clock")
+def topics(args: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says of a bag: its topics, clock, and whether parts may be missing."""
+    names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     return {name: getattr(args, name) for name in names if getattr(args, name)}
 
 

@@ -1,4 +1,4 @@
-"""A ROS 2 bag as a sequence of synchronised frames."""
+"""A bag as a sequence of synchronised frames."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from calib_ros.datasets.bag_index import (
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.sweep import BLIND_CLOUDS, SweepOffset
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image
 from calib_ros.stamps import Stamps, nearest_index, nearest_pairs, pair_tolerance, usual_period
@@ -63,6 +63,7 @@ class BagSource:
         static transforms, else along the LiDAR's +x axis.
     clock : "header" pairs by the messages' stamps, "recording" by when they were recorded; "auto" by the stamps, whose clocks are
         set alike where the recording shows that they differ by more than a second, see `remarks`.
+    incomplete : use what is left of a bag of which parts are missing, empty or damaged.
     windows : instead of the whole bag, read only so many short windows of time, evenly spread over it; its frames are then those
         of the windows, and `middles` has the position of one in each, between two others. For a bag that has an index.
 
@@ -82,6 +83,7 @@ class BagSource:
         T_camera_lidar: Transform | None = None,
         windows: int = 0,
         clock: str = AUTO,
+        incomplete: bool = False,
     ) -> None:
         if not 0 <= tolerance_s < 1e6:
             raise BadInputError(f"tolerance_s is {tolerance_s}, but must be 0 or more seconds")
@@ -91,7 +93,7 @@ class BagSource:
             raise BadInputError(f"clock is '{clock}', but must be one of {', '.join(CLOCKS)}")
         self.path, self._clock = Path(path), clock
         self.name = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
-        self._bag = BagFile(self.path)
+        self._bag = BagFile(self.path, incomplete)
         self.image_topic = choose_image(self._bag, image_topic)
         self.points_topic = choose_points(self._bag, points_topic)
         self.camera_info_topic = choose_camera_info(self._bag, camera_info_topic, self.image_topic)
@@ -120,7 +122,7 @@ class BagSource:
     def remarks(self) -> tuple[str, ...]:
         """What there is to know about the recording, for people."""
         ahead = self._index.clock_difference
-        return (difference_in_words(ahead),) if ahead else ()
+        return (*self._bag.remarks, *([difference_in_words(ahead)] if ahead else []))
 
     def _no_pairs(self) -> str:
         image, moments = self._index.image, self._index.cloud.stamps + self._sweep_offset
@@ -174,7 +176,7 @@ class BagSource:
             if T is None:
                 T = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
             with suppress(BadInputError):  # reported when its frame is asked for
-                sweep.add(decode_cloud(self._fetch(cloud, k)), self._index.camera_at(int(cloud.stamps[k])), T)
+                sweep.add(self._cloud(k), self._index.camera_at(int(cloud.stamps[k])), T)
             if sweep.ns is not None:
                 return sweep.ns
         return sweep.stamped_ns
@@ -200,9 +202,8 @@ class BagSource:
         compressed = self._bag.topics[self.image_topic].type == COMPRESSED
         with located(self.path, f"{self.image_topic} at {name}"):
             image = decode_compressed_image(message) if compressed else decode_image(message)
-        message = self._fetch(self._index.cloud, cloud_at)
         with located(self.path, f"{self.points_topic} at {name}"):
-            cloud = decode_cloud(message)
+            cloud = self._cloud(cloud_at)
         with located(self.path, f"{self.image_topic} and {self.camera_info_topic} at {name}"):
             return Frame(
                 image=image,
@@ -213,6 +214,10 @@ class BagSource:
                 reference=self._index.reference_at(int(self._index.image.recorded[image_at])),
                 name=name,
             )
+
+    def _cloud(self, position: int) -> PointCloud:
+        message = self._fetch(self._index.cloud, position)
+        return message if isinstance(message, PointCloud) else decode_cloud(message)
 
     def _fetch(self, index: TopicIndex, position: int) -> Any:
         recorded = int(index.recorded[position])
@@ -230,7 +235,7 @@ class BagSource:
         pairs, images, clouds = len(self), len(self._index.image), len(self._index.cloud)
         roles = {self.image_topic: " as image", self.points_topic: " as points", self.camera_info_topic: " as camera_info"}
         return {
-            "kind": "ROS 2 bag",
+            "kind": "ROS 1 bag" if self._bag.storage == "ROS 1" else "ROS 2 bag",
             "path": str(self.path),
             "storage": self._bag.storage,
             "duration": f"{self._bag.duration_s:.1f} s",
