@@ -22,6 +22,8 @@ def options_of(args: argparse.Namespace) -> CheckOptions:
         args.image_topic,
         args.points_topic,
         args.camera_info_topic,
+        args.clock,
+        args.incomplete,
         configuration(args.config),
     )
 

@@ -29,7 +29,7 @@ class CheckOptions:
     """How recordings are checked.
 
     extrinsic: ``reference``, what the source says; ``tf``, the static transforms of a bag; or a result file. frames: positions as
-    `frame_positions` has them; "" = FRAMES, evenly spread. camera and topics: as `open_dataset`.
+    `frame_positions` has them; "" = FRAMES, evenly spread. camera, topics and clock: as `open_dataset`.
     """
 
     extrinsic: str = REFERENCE
@@ -39,6 +39,8 @@ class CheckOptions:
     image_topic: str | None = None
     points_topic: str | None = None
     camera_info_topic: str | None = None
+    clock: str | None = None
+    incomplete: bool = False
     config: Config = field(default_factory=Config)
 
 
@@ -74,7 +76,12 @@ def check_source(
     frames, notes = _read(source, positions, options.config, reading, warn)
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
-    found = replace(found, notes=(*notes, *found.notes), camera_frame=source.camera_frame, lidar_frame=source.lidar_frame)
+    found = replace(
+        found,
+        notes=(*getattr(source, "remarks", ()), *notes, *found.notes),
+        camera_frame=source.camera_frame,
+        lidar_frame=source.lidar_frame,
+    )
     return Checked(found, frames, source.name)
 
 
@@ -96,7 +103,7 @@ def extrinsic_of(source: Source, path: str, extrinsic: str) -> Transform:
 
 def _opened(path: str, options: CheckOptions) -> Source:
     """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
-    names = ("image_topic", "points_topic", "camera_info_topic")
+    names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     given: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name)}
     if is_bag(Path(path).expanduser()):
         given |= {"motion": options.config.motion, "tolerance_s": options.config.online.pair_tolerance_s}

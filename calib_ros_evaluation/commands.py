@@ -180,7 +180,7 @@ def _steps_command(args: argparse.Namespace) -> str:
     """The command for the page, without the output folder and defaults: the same input gives the same page."""
     command = ["calib-ros", "steps", args.source, "--frame", str(args.frame)]
     command += ["--camera", args.camera] if args.camera is not None else []
-    for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic"):
+    for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic", "clock"):
         value = getattr(args, option)
         command += [f"--{option.replace('_', '-')}", value] if value else []
     return shlex.join(command + (["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else []))

@@ -23,7 +23,7 @@ OUT = "extrinsic.json"
 TITLE = "calib-ros view"
 OF_SOURCES = (
     *("source", "initial", "yaw_deg", "config", "frames", "out"),
-    *("camera", "image_topic", "points_topic", "camera_info_topic"),
+    *("camera", "image_topic", "points_topic", "camera_info_topic", "clock", "incomplete"),
 )
 
 

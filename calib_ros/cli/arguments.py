@@ -176,6 +176,13 @@ def add_camera_and_topics(command: argparse.ArgumentParser) -> None:
     command.add_argument("--camera", help="KITTI: 0-3 (default 2); nuScenes: channel or number (default CAM_FRONT)")
     for topic in ("image", "points", "camera-info"):
         command.add_argument(f"--{topic}-topic", help="topic of a bag that holds several of the kind")
+    command.add_argument("--incomplete", action="store_true", help="use what is left of a bag of which parts are missing")
+    command.add_argument(
+        "--clock",
+        choices=("auto", "header", "recording"),
+        help="by which images and clouds of a bag pair: the stamps of their headers, the times of recording, or the stamps with "
+        "differences between the clocks that the recording shows taken out (auto, the default)",
+    )
 
 
 def _frames_and_start(command: argparse.ArgumentParser) -> None:

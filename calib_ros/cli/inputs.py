@@ -6,12 +6,14 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import result
 from calib_ros.cli.arguments import AXES, Three
+from calib_ros.cli.output import note
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, preset, update
 from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.datasets import open_dataset
@@ -159,12 +161,15 @@ def open_named_source(args: argparse.Namespace, config: Config | None = None) ->
             options["T_camera_lidar"] = nominal(args.yaw_deg)
         elif initial != "reference":
             options["T_camera_lidar"] = result.load(initial).T_camera_lidar
-    return open_dataset(args.source, camera=args.camera, **options)
+    source = open_dataset(args.source, camera=args.camera, **options)
+    for remark in getattr(source, "remarks", ()):
+        note(f"calib-ros: {remark}")
+    return source
 
 
-def topics(args: argparse.Namespace) -> dict[str, str]:
-    """The topics of a bag given on the command line."""
-    names = ("image_topic", "points_topic", "camera_info_topic")
+def topics(args: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says of a bag: its topics, clock, and whether parts may be missing."""
+    names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     return {name: getattr(args, name) for name in names if getattr(args, name)}
 
 

@@ -19,21 +19,14 @@ OPTIONAL = {"rosbags": "python3 -m pip install rosbags", "rclpy": "source your R
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 converged or done, 1 not converged, 2 bad input."""
-    others = commands()
-    options = parser(others)
-    args = options.parse_args(argv)
-    args.given = list(sys.argv[1:] if argv is None else argv)
-    if args.version or args.command is None:
-        from calib_ros import __version__
-
-        print(f"calib-ros {__version__}")
-        if not args.version:
-            options.print_help()
-        return OK if args.version else BAD_INPUT
+    given = list(sys.argv[1:] if argv is None else argv)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _print_warning
-            return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
+            code = _run(given)
+            if sys.stdout is not None:  # as of a service without one
+                sys.stdout.flush()
+            return code
     except CalibrationError as error:
         print(f"calib-ros: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -42,17 +35,35 @@ def main(argv: Sequence[str] | None = None) -> int:
         advice = "install it from the repository of calib_ros" if library.startswith("calib_ros_") else OPTIONAL.get(library)
         if advice is None:
             raise
-        print(f"calib-ros: '{args.command}' needs {library}: {advice}", file=sys.stderr)
+        print(f"calib-ros: '{given[0]}' needs {library}: {advice}", file=sys.stderr)
         return BAD_INPUT
     except OSError as error:
         if isinstance(error, BrokenPipeError):  # the reader, for instance `head`, has seen enough
-            sys.stderr.close()
+            from calib_ros.cli.output import discard_output
+
+            discard_output()
             return OK
         print(f"calib-ros: {error}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("calib-ros: interrupted", file=sys.stderr)
         return 130
+
+
+def _run(given: Sequence[str]) -> int:
+    """The command that is given, or the version."""
+    others = commands()
+    options = parser(others)
+    args = options.parse_args(given)
+    args.given = given
+    if args.version or args.command is None:
+        from calib_ros import __version__
+
+        print(f"calib-ros {__version__}")
+        if not args.version:
+            options.print_help()
+        return OK if args.version else BAD_INPUT
+    return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
 
 
 def _print_warning(

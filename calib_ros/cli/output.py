@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -183,13 +184,32 @@ def save_camera_info(result: Result, path: str) -> None:
 
 
 def print_or_save(result: Savable, text: str, path: str | None) -> None:
-    """What a command has found: in words on standard output, and as JSON in a file, if one is named; "-": JSON on standard
-    output, and the words on the standard error. The words come first: a full disk takes none of them."""
-    if path == "-":
-        print(result.dumps(), end="")
-    print(text, file=sys.stderr if path == "-" else sys.stdout)
-    if path is not None and path != "-":
-        result.save(path)
+    """What a command has found: as JSON in a file, if one is named, and in words on standard output; "-": JSON on standard
+    output, and the words on the standard error. Neither a full disk nor a closed pipe takes the other one."""
+    try:
+        if path is not None and path != "-":
+            result.save(path)
+    finally:
+        if path == "-":
+            print_text(result.dumps().removesuffix("\n"))
+            note(text)
+        else:
+            print_text(text)
+
+
+def print_text(text: str) -> None:
+    """Print to standard output, unless its reader is gone."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        discard_output()
+
+
+def discard_output() -> None:
+    """Send to nowhere what a reader that is gone would not take, now and when the process ends."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)
 
 
 def note(line: str) -> None:

@@ -1,4 +1,4 @@
-"""A ROS 2 bag as a sequence of synchronised frames."""
+"""A bag as a sequence of synchronised frames."""
 
 from __future__ import annotations
 
@@ -21,11 +21,23 @@ from calib_ros.datasets.bag_file import (
     is_rectified,
     peek_header,
 )  # fmt: skip
-from calib_ros.datasets.bag_index import MAX_KEPT, BagIndex, Span, TopicIndex, located
+from calib_ros.datasets.bag_index import (
+    AUTO,
+    CLOCKS,
+    HEADER,
+    MAX_KEPT,
+    MAX_LATENCY,
+    RECORDING,
+    BagIndex,
+    Span,
+    TopicIndex,
+    difference_in_words,
+    located,
+)
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.sweep import BLIND_CLOUDS, SweepOffset
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image
 from calib_ros.stamps import Stamps, nearest_index, nearest_pairs, pair_tolerance, usual_period
@@ -49,6 +61,9 @@ class BagSource:
     motion : how the clouds are stamped, where their points have no times.
     T_camera_lidar : where about the camera looks, (4, 4), to find when scans sweep its view; by default that of the recording's
         static transforms, else along the LiDAR's +x axis.
+    clock : "header" pairs by the messages' stamps, "recording" by when they were recorded; "auto" by the stamps, whose clocks are
+        set alike where the recording shows that they differ by more than a second, see `remarks`.
+    incomplete : use what is left of a bag of which parts are missing, empty or damaged.
     windows : instead of the whole bag, read only so many short windows of time, evenly spread over it; its frames are then those
         of the windows, and `middles` has the position of one in each, between two others. For a bag that has an index.
 
@@ -67,14 +82,18 @@ class BagSource:
         motion: MotionConfig | None = None,
         T_camera_lidar: Transform | None = None,
         windows: int = 0,
+        clock: str = AUTO,
+        incomplete: bool = False,
     ) -> None:
         if not 0 <= tolerance_s < 1e6:
             raise BadInputError(f"tolerance_s is {tolerance_s}, but must be 0 or more seconds")
         if windows < 0:
             raise BadInputError(f"windows is {windows}, but must be 0 or more")
-        self.path = Path(path)
+        if clock not in CLOCKS:
+            raise BadInputError(f"clock is '{clock}', but must be one of {', '.join(CLOCKS)}")
+        self.path, self._clock = Path(path), clock
         self.name = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
-        self._bag = BagFile(self.path)
+        self._bag = BagFile(self.path, incomplete)
         self.image_topic = choose_image(self._bag, image_topic)
         self.points_topic = choose_points(self._bag, points_topic)
         self.camera_info_topic = choose_camera_info(self._bag, camera_info_topic, self.image_topic)
@@ -92,21 +111,36 @@ class BagSource:
         self.windows = 0 if found is None else len(found)
         self.camera_frame, self.lidar_frame = self._index.camera_frame, self._index.lidar_frame
         if not len(self):
-            image, moments = self._index.image, self._index.cloud.stamps + self._sweep_offset
-            gaps = np.abs(moments[nearest_index(moments, image.stamps)] - image.stamps)
-            raise BadInputError(
-                f"bag {self.path}: no message of {self.points_topic} within {self._tolerance / NANOSECONDS:g} s of one of "
-                f"{self.image_topic} (the nearest is {gaps.min() / NANOSECONDS:.3f} s away); "
-                "synchronise the sensors' clocks or raise tolerance_s"
-            )
+            raise BadInputError(self._no_pairs())
         self.middles = spread_positions(windows, len(self)) if found is None else found
         first = int(self._pairs[0][0])
         self.vehicle_frames = self._index.vehicle_frames()
         self.camera = self._index.camera_at(int(self._index.image.stamps[first]))
         self.reference = self._index.reference_at(int(self._index.image.recorded[first]))
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What there is to know about the recording, for people."""
+        ahead = self._index.clock_difference
+        return (*self._bag.remarks, *([difference_in_words(ahead)] if ahead else []))
+
+    def _no_pairs(self) -> str:
+        image, moments = self._index.image, self._index.cloud.stamps + self._sweep_offset
+        gap = int(np.abs(moments[nearest_index(moments, image.stamps)] - image.stamps).min())
+        if gap <= MAX_LATENCY:
+            advice = "synchronise the sensors' clocks or raise tolerance_s"
+        elif self._clock == HEADER:
+            advice = "let --clock auto or recording pair them by when they were recorded"
+        else:
+            advice = "they were recorded at different times; record them together"
+        return (
+            f"bag {self.path}: no message of {self.points_topic} within {self._tolerance / NANOSECONDS:g} s of one of "
+            f"{self.image_topic} (the nearest is {gap / NANOSECONDS:.3f} s away); {advice}"
+        )
+
     def _new_index(self) -> BagIndex:
-        return BagIndex(self._bag, self.image_topic, self.points_topic, self.camera_info_topic, self.rectified)
+        topics = self.image_topic, self.points_topic, self.camera_info_topic
+        return BagIndex(self._bag, *topics, self.rectified, self._clock)
 
     def _read_windows(self, count: int) -> list[int] | None:
         """Positions of the middle frames of windows; None if too few windows have one, and the whole bag has to be read."""
@@ -142,7 +176,7 @@ class BagSource:
             if T is None:
                 T = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
             with suppress(BadInputError):  # reported when its frame is asked for
-                sweep.add(decode_cloud(self._fetch(cloud, k)), self._index.camera_at(int(cloud.stamps[k])), T)
+                sweep.add(self._cloud(k), self._index.camera_at(int(cloud.stamps[k])), T)
             if sweep.ns is not None:
                 return sweep.ns
         return sweep.stamped_ns
@@ -168,9 +202,8 @@ class BagSource:
         compressed = self._bag.topics[self.image_topic].type == COMPRESSED
         with located(self.path, f"{self.image_topic} at {name}"):
             image = decode_compressed_image(message) if compressed else decode_image(message)
-        message = self._fetch(self._index.cloud, cloud_at)
         with located(self.path, f"{self.points_topic} at {name}"):
-            cloud = decode_cloud(message)
+            cloud = self._cloud(cloud_at)
         with located(self.path, f"{self.image_topic} and {self.camera_info_topic} at {name}"):
             return Frame(
                 image=image,
@@ -181,6 +214,10 @@ class BagSource:
                 reference=self._index.reference_at(int(self._index.image.recorded[image_at])),
                 name=name,
             )
+
+    def _cloud(self, position: int) -> PointCloud:
+        message = self._fetch(self._index.cloud, position)
+        return message if isinstance(message, PointCloud) else decode_cloud(message)
 
     def _fetch(self, index: TopicIndex, position: int) -> Any:
         recorded = int(index.recorded[position])
@@ -198,7 +235,7 @@ class BagSource:
         pairs, images, clouds = len(self), len(self._index.image), len(self._index.cloud)
         roles = {self.image_topic: " as image", self.points_topic: " as points", self.camera_info_topic: " as camera_info"}
         return {
-            "kind": "ROS 2 bag",
+            "kind": "ROS 1 bag" if self._bag.storage == "ROS 1" else "ROS 2 bag",
             "path": str(self.path),
             "storage": self._bag.storage,
             "duration": f"{self._bag.duration_s:.1f} s",
@@ -208,13 +245,19 @@ class BagSource:
             ),
             "frames": f"{pairs} pairs; without partner: {images - pairs} of {images} images, {clouds - pairs} of {clouds} clouds"
             + (f"; {self.windows} windows of the recording" if self.windows else ""),
-            "stamps": "of the headers" if self._index.use_headers else "of the recording (headers have none)",
+            "stamps": self._stamps_in_words(),
             "pairing": f"scans sweep the view {self._sweep_offset / 1e6:+.0f} ms from their stamps",
             "camera": describe_camera(self.camera) + (" (rectified images)" if self.rectified else ""),
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,
             "reference": "none" if self.reference is None else "from /tf_static",
         }
+
+    def _stamps_in_words(self) -> str:
+        if not self._index.use_headers:
+            return "of the recording" + ("" if self._clock == RECORDING else " (headers have none)")
+        ahead = self._index.clock_difference / NANOSECONDS
+        return "of the headers" + (f", of clouds {-ahead:+.2f} s" if ahead else "")
 
 
 class Slots:

@@ -1,4 +1,4 @@
-"""A ROS 2 bag on disk, mcap or sqlite3, read through rosbags: topics, raw messages, static transforms, clear errors."""
+"""A bag on disk, read through rosbags: topics, raw messages, static transforms, clear errors."""
 
 from __future__ import annotations
 
@@ -7,28 +7,32 @@ import struct
 from collections import deque
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 from weakref import finalize
 
 import numpy as np
-from rosbags.rosbag2 import Reader
-from rosbags.rosbag2.storage_mcap import McapReader
-from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.store import Typestore
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
+from calib_ros.datasets.bag_parts import METADATA, BagParts, storage_files, storage_of, typestore
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS
+from calib_ros.messages.livox import LIVOX, decode_livox
 
-STORAGE = {".mcap": "mcap", ".db3": "sqlite3"}
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINTS = "sensor_msgs/msg/PointCloud2"
 TF = "tf2_msgs/msg/TFMessage"
+# Types that hold images or clouds in a form that is not read, and what makes one that is.
+REMEDIES = {
+    "VelodyneScan": "play the bag, run the transform node of velodyne_pointcloud for your model, and record its cloud",
+    "PacketMsg": "play the bag, run the cloud node of ouster_ros, and record its cloud",
+    "LaserScan": "a scan of one plane has no edges to calibrate by; record a 3-D LiDAR",
+    "CompressedVideo": "play the bag, decode it with `ros2 run image_transport republish`, and record the images",
+    "FFMPEGPacket": "play the bag, decode it with `ros2 run image_transport republish ffmpeg raw`, and record the images",
+}
 YAML_MERGE, YAML_ALIAS, MAX_ALIASES = re.compile(rb"<<\s*:"), re.compile(rb"[\s\[{,:]\*\w"), 10  # no recorder writes either
 
 
@@ -47,28 +51,25 @@ class BagFile:
     summary. Raises BadInputError for whatever is wrong with its files, when opening or when reading.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, incomplete: bool = False) -> None:
         self.path = path
-        store = storage_file(path)
-        self.storage = STORAGE[store.suffix]
+        self.storage = storage_of(_some_file(path))
         self._advice = (
             "recover it with `mcap recover`, copy it again or record it again"
             if self.storage == "mcap"
-            else "copy it again or record it again; if only metadata.yaml is damaged, run `ros2 bag reindex`"
+            else "copy it again or record it again"
         )
         self._types = typestore()
         with self._readable():
-            _check_metadata(path / "metadata.yaml")
-            self._reader = Reader(path if (path / "metadata.yaml").exists() else store)
-            self._reader.open()
-        self.close = finalize(self, self._reader.close)
+            _check_metadata(path / METADATA)
+            self._parts = BagParts(path, incomplete)
+        self.close = finalize(self, self._parts.close)
+        self.remarks = tuple(self._parts.remarks)
         with self._readable():
-            self.topics = _topics(self._reader.connections)
-            self.start, self.stop = self._reader.start_time, self._reader.end_time  # recording times, ns
-            self.duration_s = self._reader.duration / NANOSECONDS
-            self.indexed = all(
-                _is_indexed(storage) for storage in getattr(self._reader.storage, "storages", [self._reader.storage])
-            )
+            self.topics = _topics(self._parts.connections)
+            self.start, self.stop = self._parts.start, self._parts.stop  # recording times, ns
+            self.duration_s = (self.stop - self.start) / NANOSECONDS
+            self.indexed = self._parts.indexed
 
     @property
     def size(self) -> int:
@@ -82,17 +83,16 @@ class BagFile:
 
     def raw(self, topics: Collection[str], start: int | None = None, stop: int | None = None) -> Iterator[tuple[str, int, bytes]]:
         """(topic, time of recording in ns, CDR bytes) of messages recorded in [start, stop), in order."""
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        if not connections:  # rosbags reads an empty list as "all"
-            return
         with self._readable():
-            for connection, time, data in self._reader.messages(connections, start, stop):
-                yield connection.topic, time, data
+            yield from self._parts.messages(topics, start, stop)
 
     def decode(self, topic: str, data: bytes) -> Any:
-        """CDR bytes -> message of the topic's type."""
+        """CDR bytes -> message of the topic's type, of Livox's own type its PointCloud."""
+        kind = self.topics[topic].type
+        if kind in LIVOX:
+            return decode_livox(data)
         with self._readable(f"{topic}: "):
-            return self._types.deserialize_cdr(data, self.topics[topic].type)
+            return self._types.deserialize_cdr(data, kind)
 
     @contextmanager
     def _readable(self, where: str = "") -> Iterator[None]:
@@ -106,29 +106,16 @@ class BagFile:
             raise BadInputError(f"{where}bag {self.path} cannot be read ({reason}); {self._advice}") from error
 
 
-@cache
-def typestore() -> Typestore:
-    """The message types of ROS 2, the same in every release: a bag's own definitions, maybe broken, are not needed."""
-    return get_typestore(Stores.ROS2_KILTED)
-
-
-def storage_file(path: Path) -> Path:
-    """The first storage file of a bag, whose suffix is its format; the only one of an interrupted recording."""
+def _some_file(path: Path) -> Path:
+    """A file of a bag, whose ending is its format."""
     if not path.exists():
-        raise BadInputError(f"{path} does not exist; give a bag folder, a .mcap or a .db3 file")
-    if path.is_file():
-        if path.suffix not in STORAGE:
-            raise BadInputError(f"{path} is no ROS 2 bag; give a bag folder, a .mcap or a .db3 file")
-        return path
-    names = [file for file in sorted(path.iterdir()) if file.is_file()]
-    # A compressed bag has names like bag_0.db3.zstd.
-    stores = [file for file in names if (file.with_suffix("") if file.suffix == ".zstd" else file).suffix in STORAGE]
-    if not stores:
-        raise BadInputError(f"bag {path} has no .mcap or .db3 file; copy the whole folder")
-    if not (path / "metadata.yaml").exists() and len(stores) > 1:
-        raise BadInputError(f"bag {path} has {len(stores)} storage files but no metadata.yaml; run `ros2 bag reindex {path}`")
-    first = stores[0]
-    return first if first.suffix in STORAGE else first.with_suffix("")
+        raise BadInputError(f"{path} does not exist; give a bag folder, a .mcap, .db3 or .bag file")
+    files = [path] if path.is_file() else storage_files(path)
+    if not files:
+        raise BadInputError(f"bag {path} has no .mcap, .db3 or .bag file; copy the whole folder")
+    if not storage_of(files[0]):
+        raise BadInputError(f"{path} is no bag; give a bag folder, a .mcap, .db3 or .bag file")
+    return files[0]
 
 
 def peek_header(data: bytes) -> tuple[int, str]:
@@ -215,7 +202,7 @@ def choose_image(bag: BagFile, requested: str | None) -> str:
 
 def choose_points(bag: BagFile, requested: str | None) -> str:
     """The cloud topic: the requested one, or the only one."""
-    return _choose(bag, requested, _with_type(bag, POINTS), "PointCloud2", "points_topic")
+    return _choose(bag, requested, _with_type(bag, POINTS, *LIVOX), "PointCloud2", "points_topic")
 
 
 def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str) -> str:
@@ -246,15 +233,13 @@ def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: st
             f"bag {bag.path} has {len(candidates)} topics of type {kind}: {', '.join(candidates)}; choose one with {option}"
         )
     others = ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics.values()) or "nothing at all"
-    raise BadInputError(f"bag {bag.path} has no {kind} messages, only {others}; record that topic too")
+    names = dict.fromkeys(topic.type.rpartition("/")[2] for topic in bag.topics.values() if topic.messages)
+    advice = "; ".join(f"{name}: {REMEDIES[name]}" for name in names if name in REMEDIES) or "record that topic too"
+    raise BadInputError(f"bag {bag.path} has no {kind} messages, only {others}; {advice}")
 
 
 def _with_type(bag: BagFile, *types: str) -> list[str]:
     return [topic.name for topic in bag.topics.values() if topic.type in types and topic.messages > 0]
-
-
-def _is_indexed(storage: Any) -> bool:
-    return not isinstance(storage, McapReader) or bool(storage.chunks)
 
 
 def _check_metadata(path: Path) -> None:

@@ -19,6 +19,12 @@ from calib_ros.stamps import Stamps, nearest_index
 
 Span = tuple[int, int]  # [start, stop) of recording times, ns
 MAX_KEPT = 256 * 2**20  # bytes of messages held in memory: thirty frames of 2 Mpx in colour with their clouds
+AUTO, HEADER, RECORDING = CLOCKS = "auto", "header", "recording"
+MAX_LATENCY = NANOSECONDS  # usually, from a sensor to the recorder
+LONGEST_QUEUE = 60 * NANOSECONDS  # that messages wait in; what differs by more are clocks
+TIME_SCALES = {37: "TAI and UTC", 18: "GPS time and UTC", 19: "TAI and GPS time"}  # s, since 2017
+SAME_DIFFERENCE = 3 * NANOSECONDS // 10  # by which latencies may blur one of these
+LONG_AGO_S = 1e7
 # Where static transforms are repeated more often than this, those at the bag's beginning and before the windows are enough.
 FEW_TRANSFORMS, BEGINNING = 100, 5 * NANOSECONDS
 
@@ -27,8 +33,10 @@ class BagIndex:
     """What is needed to pair the messages of a bag and to fetch them one by one, with its cameras and static transforms. Nothing
     is read before `read` or `read_spans`; the messages of the latter are kept, up to MAX_KEPT."""
 
-    def __init__(self, bag: BagFile, image_topic: str, points_topic: str, info_topic: str, rectified: bool) -> None:
-        self._bag, self._rectified = bag, rectified
+    def __init__(
+        self, bag: BagFile, image_topic: str, points_topic: str, info_topic: str, rectified: bool, clock: str = "auto"
+    ) -> None:
+        self._bag, self._rectified, self._clock = bag, rectified, clock
         self.image, self.cloud, self.info = (TopicIndex(topic) for topic in (image_topic, points_topic, info_topic))
         self._by_topic = {index.topic: index for index in (self.image, self.cloud, self.info)}
         self._statics = [t.name for t in bag.topics.values() if t.type == TF and t.name.endswith("/tf_static")]
@@ -100,9 +108,11 @@ class BagIndex:
         """Put in order what was read. more_transforms: look for others if those read do not connect camera and LiDAR."""
         self.camera_frame = self.image.frame or self.info.frame
         self.lidar_frame = self.cloud.frame
-        self.use_headers = self.image.has_stamps and self.cloud.has_stamps
+        self.use_headers = self._clock != RECORDING and self.image.has_stamps and self.cloud.has_stamps
         for index in self._by_topic.values():
             index.finish(self.use_headers)
+        self.clock_difference = clock_difference(self.image, self.cloud) if self.use_headers and self._clock == AUTO else 0
+        self.cloud.stamps = self.cloud.stamps - self.clock_difference
         self._cameras = [self._found_cameras[i] for i in self.info.order]
         self._references = _references(self._transforms, self.camera_frame, self.lidar_frame)
         if more_transforms and not self._references:
@@ -172,6 +182,39 @@ class TopicIndex:
         self.stamps: Stamps = stamps[self.order]
         self.headers: Stamps = headers[self.order]
         self.recorded: Stamps = recorded[self.order]
+
+
+def clock_difference(image: TopicIndex, cloud: TopicIndex) -> int:
+    """How far the clock that stamps the clouds is ahead of the images', ns, by when messages were recorded; 0 where messages that
+    took long to be recorded would look alike. Whole seconds where it is a difference of time scales."""
+    if not len(image) or not len(cloud):
+        return 0
+    of_clouds, of_images = (int((index.headers - index.recorded).max()) for index in (cloud, image))
+    ahead = of_clouds - of_images
+    known = next((s for s in TIME_SCALES if abs(abs(ahead) - s * NANOSECONDS) <= SAME_DIFFERENCE), None)
+    if known is not None:
+        return int(np.copysign(known, ahead)) * NANOSECONDS
+    # Only a clock stamps messages before they come.
+    from_the_future = max(of_clouds, of_images) > abs(ahead) / 2 > MAX_LATENCY / 2
+    return ahead if from_the_future or abs(ahead) > LONGEST_QUEUE else 0
+
+
+def difference_in_words(ahead: int) -> str:
+    """What `clock_difference` found, and its likely cause."""
+    seconds = abs(ahead) / NANOSECONDS
+    scale = TIME_SCALES.get(round(seconds)) if seconds.is_integer() else None
+    if scale is not None:
+        cause = f"the difference of {scale}, of which one sensor is synchronised to each"
+    elif seconds > LONG_AGO_S:
+        cause = "one of them counts from another epoch, such as when it was switched on"
+    else:
+        cause = "their clocks are not synchronised"
+    size = f"{seconds:.0f} s" if scale or seconds > 1000 else f"{seconds:.2f} s"
+    exact = "" if scale else "; it is known as well as messages arrive, to some 0.1 s, see motion.max_time_offset_s"
+    return (
+        f"clouds are stamped {size} {'after' if ahead > 0 else 'before'} images recorded at the same time: {cause}; paired as "
+        f"recorded{exact}. --clock header pairs by the stamps as they are"
+    )
 
 
 def _references(transforms: list[tuple[int, Any]], camera_frame: str, lidar_frame: str) -> list[tuple[int, Matrix]]:

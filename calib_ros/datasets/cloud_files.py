@@ -1,4 +1,4 @@
-"""Point clouds in files: PCD, PLY, KITTI's .bin and numpy's .npz -> PointCloud.
+"""Point clouds in files: PCD, PLY, LAS, text, KITTI's .bin and numpy's .npz -> PointCloud.
 
 The names of fields, and the units of times, are those of the drivers: see `calib_ros.messages.point_fields`.
 """
@@ -23,14 +23,31 @@ from calib_ros.messages.point_fields import cloud_of_columns
 Columns = dict[str, NDArray[Any]]
 NEEDS_PCD = "PCD files are read with pypcd4, which is missing: python3 -m pip install pypcd4"
 NEEDS_PLY = "PLY files are read with trimesh, which is missing: python3 -m pip install trimesh"
+NEEDS_LAS = "LAS and LAZ files are read with laspy, which is missing: python3 -m pip install 'laspy[lazrs]'"
 UNNAMED = "#$%&~~"  # what pypcd4 calls PCD's padding fields, "_"
 PCD_DATA = re.compile(rb"^DATA[ \t]+(\w+)[^\n]*\n", re.MULTILINE)
-PCD_FIELDS, PCD_COUNT = (re.compile(rb"^%s[ \t]+([^\n]*)" % name, re.MULTILINE) for name in (b"FIELDS", b"COUNT"))
+PCD_LINES = [re.compile(rb"^%s[ \t]+([^\n]*)" % name, re.MULTILINE) for name in (b"FIELDS", b"SIZE", b"TYPE", b"COUNT")]
+TEXT_NAMES = ("x", "y", "z", "intensity")  # of columns without a header
+COMMENTS = ("#", "//")
+A_NAME = re.compile(r"\b(?!(nan|inf|infinity)\b)[a-z_]", re.IGNORECASE)
+# Formats of clouds that are not read, and with what they become one that is.
+FOREIGN = {
+    ".e57": "E57; convert it: pdal translate FILE.e57 FILE.pcd",
+    ".pcap": "packets of a LiDAR; play them into its ROS driver and record the cloud",
+    ".obj": "a mesh; export its points as PLY",
+    ".stl": "a mesh; export its points as PLY",
+    ".npy": "an array without names; save it with numpy.savez(FILE, xyz=...)",
+    ".pkl": "a Python pickle; save it with numpy.savez(FILE, xyz=...)",
+    ".rcp": "ReCap's; export it as PLY",
+    ".fls": "Faro's; export it as PLY",
+    ".drc": "Draco's; decode it as PLY: draco_decoder -i FILE.drc",
+}
 CLOUD_COMPARE = "scalar_"  # before the names of fields in PLY files that CloudCompare writes
 
 
 def read_cloud(path: Path, stamp: int = 0) -> PointCloud:
-    """The points of a file by its ending: .pcd, .ply, .bin (float32 x, y, z, intensity) or .npz; NaN points are kept.
+    """The points of a file by its ending, one of CLOUD_SUFFIXES; NaN points are kept. A .bin has float32 x, y, z, intensity, and
+    maybe more numbers a point.
 
     stamp: of the cloud, ns, from which absolute times of points count. Raises BadInputError for a damaged file or one without
     x, y, z; MissingDependencyError without the library that reads it.
@@ -72,11 +89,51 @@ def _tidy_pcd(data: bytes) -> bytes:
     if last is None:
         return data
     head, body = data[: last.start()], data[last.end() :]
-    if (fields := PCD_FIELDS.search(head)) and not PCD_COUNT.search(head):
-        head += b"COUNT" + b" 1" * len(fields[1].split()) + b"\n"
+    lines = [line.search(head) for line in PCD_LINES]
+    fields, *_, counts = (line[1].split() if line else [] for line in lines)
+    if fields and not counts:
+        head += b"COUNT" + b" 1" * len(fields) + b"\n"
+    if b"0" in counts:  # padding, which has no bytes
+        for line in reversed(lines):
+            if line and len(words := line[1].split()) == len(counts):
+                kept = b" ".join(word for word, count in zip(words, counts, strict=True) if count != b"0")
+                head = head[: line.start(1)] + kept + head[line.end(1) :]
     if last[1] == b"ascii":
         body = b"\n".join(b" ".join(line.split()) for line in body.splitlines())
     return head + last[0] + body
+
+
+def _read_las(path: Path) -> Columns:
+    """LAS or LAZ: metres from the file's scale and offset, and the dimensions by name."""
+    try:
+        import laspy
+    except ImportError:
+        raise MissingDependencyError(NEEDS_LAS) from None
+    try:
+        file = laspy.read(path)
+    except laspy.errors.LaspyException as error:
+        if "backend" in str(error).lower():
+            raise MissingDependencyError(NEEDS_LAS) from None
+        raise
+    _require_all(path, len(file.points), file.header.point_count)
+    names = {"intensity": "intensity", "gps_time": "time"}
+    columns = {name: np.asarray(file[own]) for own, name in names.items() if own in file.point_format.dimension_names}
+    return {"x": np.asarray(file.x), "y": np.asarray(file.y), "z": np.asarray(file.z), **columns}
+
+
+def _read_text(path: Path) -> Columns:
+    """Text of a point a line, between commas, semicolons or blanks: by the names in its first line, or x, y, z, intensity."""
+    split = re.compile(r"\s*[,;]\s*|\s+").split
+    lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
+    headers = [split(line.lstrip("#/ ")) for line in lines if A_NAME.search(line)]
+    lines = [line for line in lines if line and not line.startswith(COMMENTS) and not A_NAME.search(line)]
+    if lines and lines[0].isdecimal() and int(lines[0]) == len(lines) - 1:
+        del lines[0]  # the number of points
+    columns = len(split(lines[0])) if lines else len(TEXT_NAMES)
+    named = next((header for header in headers if len(header) == columns), TEXT_NAMES[:columns])
+    names = [name.strip("\"'") for name in named]
+    rows = np.array([[float(word or "nan") for word in split(line)[: len(names)]] for line in lines]).reshape(-1, len(names))
+    return dict(zip(names, rows.T, strict=True))
 
 
 def _read_ply(path: Path) -> Columns:
@@ -119,5 +176,9 @@ def _require_all(path: Path, found: int, declared: int) -> None:
         raise BadInputError(f"cloud {path} is truncated: {found} of {declared} points; copy it again")
 
 
-_READERS: dict[str, Callable[[Path], Columns]] = {".pcd": _read_pcd, ".ply": _read_ply, ".npz": _read_npz}
+_READERS: dict[str, Callable[[Path], Columns]] = {
+    **{".pcd": _read_pcd, ".ply": _read_ply, ".npz": _read_npz},
+    **dict.fromkeys((".las", ".laz"), _read_las),
+    **dict.fromkeys((".csv", ".txt", ".xyz", ".asc", ".pts"), _read_text),
+}
 CLOUD_SUFFIXES = (*_READERS, ".bin")

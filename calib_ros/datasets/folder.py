@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib_ros import io, se3
 from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
-from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, read_cloud
+from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, FOREIGN, read_cloud
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
@@ -25,14 +25,14 @@ from calib_ros.messages.wire import shown
 
 IMAGES, CLOUDS, CALIBRATION, TIMES = "images", "clouds", "calibration.yaml", "times.csv"
 EXPECTED_FOLDER = f"{IMAGES}/, {CLOUDS}/ and {CALIBRATION} (plain folder)"
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 PERIOD_NS = NANOSECONDS // 10  # between frames without times.csv: most scanners turn at 10 Hz
 MAX_STAMP = 2**63
 SHOWN_NAMES = 5  # of files without partner
 
 
 class FolderSource:
-    """Frames of a folder: images/NAME.png|jpg|jpeg|bmp with clouds/NAME.pcd|ply|bin|npz, calibration.yaml, and times.csv.
+    """Frames of a folder: images/NAME.png and the like with clouds/NAME.pcd and the like, calibration.yaml, and times.csv.
 
     A frame is a name with an image and a cloud; files are read on access. calibration.yaml is what ROS camera_calibration writes,
     with an optional T_camera_lidar (four rows). times.csv has the columns name, image_ns and, where known, cloud_ns; frames are
@@ -51,6 +51,9 @@ class FolderSource:
         self._clouds = named_files(self.path / CLOUDS, CLOUD_SUFFIXES)
         names = sorted(self._images.keys() & self._clouds.keys(), key=_natural)
         if not names:
+            for part, found, known in ((IMAGES, self._images, IMAGE_SUFFIXES), (CLOUDS, self._clouds, CLOUD_SUFFIXES)):
+                if not found:
+                    raise BadInputError(_nothing_readable(self.path / part, known))
             raise BadInputError(
                 f"{self.path}: no name has both an image ({len(self._images)} in {IMAGES}) and a cloud ({len(self._clouds)} in "
                 f"{CLOUDS}); give the two files of a frame the same name, like {IMAGES}/000000.png and {CLOUDS}/000000.pcd"
@@ -105,7 +108,7 @@ class FolderSource:
         except OSError as error:
             raise BadInputError(f"image {path} cannot be read ({error.strerror}); check the file") from error
         if picture is None:
-            raise BadInputError(f"image {path} is no complete PNG, JPEG or BMP; copy it again")
+            raise BadInputError(f"image {path} is no complete PNG, JPEG, BMP, TIFF or WebP; copy it again")
         height, width = picture.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             raise BadInputError(
@@ -131,6 +134,18 @@ def named_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
             raise BadInputError(f"{folder}: {found[path.stem].name} and {path.name} are of the same frame; keep one of them")
         found[path.stem] = path
     return found
+
+
+def _nothing_readable(folder: Path, known: tuple[str, ...]) -> str:
+    """What to do about a folder without a file that is read."""
+    if not folder.is_dir():
+        return f"{folder} is missing; put the frames' files there: {', '.join(known)}"
+    others = sorted({path.suffix.lower() for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")})
+    if not others:
+        return f"{folder} is empty; put the frames' files there: {', '.join(known)}"
+    why = "; ".join(f"{suffix} is {FOREIGN[suffix]}" for suffix in others if suffix in FOREIGN)
+    has = ", ".join(suffix or "files without an ending" for suffix in others)
+    return f"{folder} has only {has}; {why or 'convert them'}; read are {', '.join(known)}"
 
 
 def _read_calibration(path: Path) -> tuple[Camera, Matrix | None, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,10 @@ from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros.messages.pictures import decode_picture
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # KITTI has PNG; copies are often recompressed
+# Numbers of a point: x, y, z, reflectance, and in other data sets its ring, time, or a radar's values.
+COLUMNS = (4, 5, 6, 7, 8)
+SAMPLED, CLEARLY = 20000, 3.0  # points that are looked at, and how much closer those of another number have to be
+SAME_SCAN = 0.5  # of their distance: neighbours in a scan are closer; 0.004 to 0.2 in scans, 1 to 1.4 where it is read wrongly
 DIGITS = 10  # of a frame number; longer names are not frames
 DATE = re.compile(r"(19|20)\d\d-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 MAX_STAMP_S = 2**31  # that a ROS message can hold
@@ -42,20 +47,33 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 
 def read_scan(path: Path) -> PointCloud:
     """A Velodyne .bin in the order of the file, intensity 0..1, without rings and times. BadInputError if damaged."""
-    points = read_points(path, 4)  # x, y, z, reflectance
+    points = read_points(path, COLUMNS)
     return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
 
 
-def read_points(path: Path, columns: int) -> NDArray[np.float32]:
-    """Points (n, columns) of a file of so many float32 each. BadInputError if damaged."""
+def read_points(path: Path, columns: Sequence[int]) -> NDArray[np.float32]:
+    """Points (n, k) of a file of float32, k one of `columns`: the first, or one whose points follow each other much more closely.
+    BadInputError if damaged."""
     try:
         values = np.fromfile(path, "<f4")
         size = path.stat().st_size
     except OSError as error:
         raise BadInputError(f"scan {path} cannot be read ({error.strerror}); check the file") from error
-    if size == 0 or size % (4 * columns):
-        raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {4 * columns}; copy it again")
-    return values.reshape(-1, columns)
+    gaps = {k: _gap(values[: k * SAMPLED].reshape(-1, k)[:, :3]) for k in columns if size and size % (4 * k) == 0}
+    chosen = min(gaps, key=lambda k: gaps[k] * (1.0 if k == columns[0] else CLEARLY), default=0)
+    if not chosen or (chosen != columns[0] and gaps[chosen] > SAME_SCAN):
+        raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {4 * columns[0]}; copy it again")
+    return values.reshape(-1, chosen)
+
+
+def _gap(xyz: NDArray[np.float32]) -> float:
+    """Median distance of points (n, 3) that follow each other, as a share of their distance: small along the rings of a scan, and
+    large where other numbers are taken for coordinates."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        xyz = xyz.astype(np.float64)
+        gaps = np.linalg.norm(np.diff(xyz, axis=0), axis=1) / np.maximum(np.linalg.norm(xyz[1:], axis=1), 1e-3)
+    known = gaps[np.isfinite(gaps)]
+    return float(np.median(known)) if len(known) else np.inf
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:

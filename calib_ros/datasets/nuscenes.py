@@ -259,7 +259,7 @@ def _numbers(value: Any) -> Matrix:
 
 def read_sweep(path: Path) -> PointCloud:
     """A .pcd.bin of x, y, z, intensity and ring, five float32 a point, in the order of the file. BadInputError if damaged."""
-    points = read_points(path, 5)
+    points = read_points(path, (5,))
     with np.errstate(invalid="ignore"):
         return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy(), points[:, 4].astype(np.int32))
 

@@ -14,11 +14,13 @@ from calib_ros.errors import BadInputError
 from calib_ros.extensions import SOURCES, source_of
 from calib_ros.extensions import names as installed
 
+BAG_FILES = (".mcap", ".db3", ".bag")
+
 __all__ = ["Source", "open_dataset", "open_source"]
 
 
 def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **options: Any) -> Source:
-    """Open a ROS 2 bag, KITTI, nuScenes or a plain folder, distinguished by content, or by its name what another package brings.
+    """Open a bag, KITTI, nuScenes or a plain folder, distinguished by content, or by its name what another package brings.
 
     Parameters
     ----------
@@ -47,7 +49,7 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         return NuScenesSource(path, camera)
     if not path.exists():
         by_name = "".join(f", or '{name}'" for name in installed(SOURCES))
-        raise BadInputError(f"{text} does not exist; give a folder or a ROS 2 bag{by_name}")
+        raise BadInputError(f"{text} does not exist; give a folder or a bag{by_name}")
     # Readers of bags are imported where needed: rosbags alone takes a third of a second.
     if is_bag(path):
         from calib_ros.datasets.bag import BagSource
@@ -64,14 +66,12 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         if isinstance(camera, str):
             raise BadInputError(f"{text} has no camera {camera}; KITTI's are numbers from 0 to 3")
         return KittiSource(folder, 2 if camera is None else camera)
-    if path.suffix == ".bag":
-        raise BadInputError(f"{text} is a ROS 1 bag; run `rosbags-convert --src {text} --dst FOLDER` and open the FOLDER")
     if path.is_file():
-        raise BadInputError(f"{text} is not a dataset; give a .mcap or .db3 file, a bag folder or a KITTI folder")
+        raise BadInputError(f"{text} is not a dataset; give a .mcap, .db3 or .bag file, a bag folder or a KITTI folder")
     names = sorted(child.name for child in path.iterdir())
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "nothing"
     raise BadInputError(
-        f"{text} is not a dataset; looked for metadata.yaml, *.mcap or *.db3 (ROS 2 bag), {EXPECTED_FOLDERS}, "
+        f"{text} is not a dataset; looked for metadata.yaml, *.mcap, *.db3 or *.bag (bag), {EXPECTED_FOLDERS}, "
         f"{EXPECTED_NUSCENES}, {EXPECTED_FOLDER}; found {found}"
     )
 
@@ -80,10 +80,9 @@ open_source = open_dataset  # the former name
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a ROS 2 bag, intact or not."""
-    if path.is_file():
-        return path.suffix in (".mcap", ".db3")
-    return (path / "metadata.yaml").exists() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
+    """Whether a path is a bag of ROS 1 or 2, intact or not."""
+    files = [path] if path.is_file() else list(path.iterdir()) if path.is_dir() else []
+    return any(file.name == "metadata.yaml" or file.name.removesuffix(".zstd").endswith(BAG_FILES) for file in files)
 
 
 def is_single(path: Path) -> bool:

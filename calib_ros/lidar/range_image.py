@@ -15,6 +15,7 @@ from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, hangs_upside_
 
 Ranges = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+FARTHEST_MEDIAN_M = 500.0  # beyond what scanners of vehicles measure at all; a room of 1 m in millimetres is farther away
 MIN_POINTS = 100  # returns a scan needs
 SAME_SURFACE = 0.05  # share of the range by which neighbours on one surface may differ
 JUMP_MIN = 0.3  # m; smallest range jump of an edge: 0.08 to 0.3 lead to the same errors with 32 to 128 rings
@@ -75,6 +76,11 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
             numbered = replace(cloud, ring=ring)
             cloud, own, distance = _beyond(numbered, pose, config.min_range)
             ring = cloud.ring
+    middle = float(np.median(distance[:: 1 + len(distance) // 4096]))
+    if middle > FARTHEST_MEDIAN_M:
+        raise TooFewFeaturesError(
+            f"half of the points are {middle:.0f} m away or more, as if their coordinates were in millimetres; give metres"
+        )
     if hangs_upside_down(own):
         pose, own = pose.turned_over(), own * np.array([1, -1, -1], np.float32)
     azimuth, elevation = angles(own)

@@ -1,4 +1,4 @@
-"""JPEG, PNG and BMP bytes -> pixels, without trusting the size in the header."""
+"""JPEG, PNG, BMP, TIFF and WebP bytes -> pixels, without trusting the size in the header."""
 
 from __future__ import annotations
 
@@ -17,15 +17,22 @@ PIXELS_PER_BYTE = 1100
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8\xff"
 BMP = b"BM"
+TIFF = {b"II*\0": "<", b"MM\0*": ">"}  # with the byte order
+RIFF, WEBP = b"RIFF", b"WEBP"
+# Tags of a TIFF: its size, and where its strips or tiles are, with their lengths. Types of their values by number.
+TIFF_SIZE, TIFF_PARTS = (256, 257), ((273, 279), (324, 325))
+TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
 # Markers of a start of frame: 0xC0 to 0xCF without the tables and the extension among them.
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def decode_picture(data: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """JPEG, PNG or BMP (n,) uint8 -> pixels as stored: (H, W) or (H, W, 3 or 4), uint8 or uint16, BGR; None if incomplete."""
+    """JPEG, PNG, BMP, TIFF or WebP (n,) uint8 -> pixels as stored: (H, W) or (H, W, 3 or 4), uint8 or uint16, BGR; None if
+    incomplete."""
     view = memoryview(data.tobytes())
     # Checked here, since OpenCV fills the rest of a truncated picture with grey: an edge that the camera never saw.
-    formats = ((PNG, _png_header), (JPEG, _jpeg_header), (BMP, _bmp_header))
+    formats = [(PNG, _png_header), (JPEG, _jpeg_header), (BMP, _bmp_header), (RIFF, _webp_header)]
+    formats += [(magic, _tiff_header) for magic in TIFF]
     header = next((read(view) for magic, read in formats if view[: len(magic)] == magic), None)
     if header is None:
         return None
@@ -83,3 +90,38 @@ def _bmp_header(data: memoryview) -> tuple[int, int, int] | None:
         return None
     complete = offset + height * ((width * bits + 31) // 32 * 4) <= len(data)
     return (width, height, max(8 // bits, 1)) if complete else None
+
+
+def _tiff_header(data: memoryview) -> tuple[int, int, int] | None:
+    """Width, height and pixels per byte of a TIFF with all its strips or tiles."""
+    order = TIFF[bytes(data[:4])]
+    try:
+        (at,) = struct.unpack_from(order + "I", data, 4)
+        (count,) = struct.unpack_from(order + "H", data, at)
+        tags: dict[int, tuple[int, ...]] = {}
+        for entry in range(at + 2, at + 2 + 12 * count, 12):
+            tag, kind, number = struct.unpack_from(order + "HHI", data, entry)
+            if kind in TIFF_TYPES and number <= len(data):
+                values = f"{order}{number}{TIFF_TYPES[kind]}"
+                place = entry + 8 if struct.calcsize(values) <= 4 else struct.unpack_from(order + "I", data, entry + 8)[0]
+                tags[tag] = struct.unpack_from(values, data, place)
+        offsets, lengths = next((tags[own], tags[sizes]) for own, sizes in TIFF_PARTS if own in tags)
+        complete = all(offset + length <= len(data) for offset, length in zip(offsets, lengths, strict=True))
+        return (tags[TIFF_SIZE[0]][0], tags[TIFF_SIZE[1]][0], 8) if complete else None
+    except (struct.error, KeyError, ValueError, StopIteration):
+        return None
+
+
+def _webp_header(data: memoryview) -> tuple[int, int, int] | None:
+    """Width, height and a bound of pixels per byte of a complete WebP."""
+    if len(data) < 30 or bytes(data[8:12]) != WEBP or struct.unpack_from("<I", data, 4)[0] + 8 > len(data):
+        return None
+    kind = bytes(data[12:16])
+    if kind == b"VP8X":
+        width, height = (int.from_bytes(data[k : k + 3], "little") + 1 for k in (24, 27))
+    elif kind == b"VP8L":
+        bits = struct.unpack_from("<I", data, 21)[0]
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        width, height = (size & 0x3FFF for size in struct.unpack_from("<HH", data, 26))
+    return width, height, 8

@@ -141,7 +141,7 @@ def _types() -> Any:
     """rosbags' message types, with all that writes a bag imported. MissingDependencyError without rosbags."""
     try:
         importlib.import_module("calib_ros.datasets.bag_writer")
-        from calib_ros.datasets.bag_file import typestore
+        from calib_ros.datasets.bag_parts import typestore
     except ImportError:
         raise MissingDependencyError("nothing captured: ~/capture needs rosbags; pip install rosbags") from None
     return typestore()

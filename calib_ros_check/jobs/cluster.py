@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import pickle
 import re
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -20,6 +21,7 @@ from calib_ros_check.jobs.pool import GOES_ON, Ended, J, Lost, Results, RunJobs,
 ADDRESS = re.compile(r"(inproc://.+)|([a-z]+://)?[^/\s]+:\d{1,5}")
 CONNECT_S = 8.0
 WAIT_FOR_WORKERS_S = 20.0
+WITHOUT_WORKERS, POLL_S = 4.0, 0.02  # times as long as for the first one: one that died is started again meanwhile
 IN_FLIGHT = 2  # groups per Dask worker: the next one is there when one is finished, and a lost worker returns few
 RETRIES = 2  # of a group that raises: its worker may not reach the data, or have no memory left
 SAME_VERSION = f"calib_ros {VERSION} must be installed on the scheduler and all workers"
@@ -31,7 +33,7 @@ class ClusterPool:
     A group of a worker that is lost goes to another. Needs calib_ros of this version on the scheduler and the workers, workers
     with one thread each (CPU times of two threads cannot be told apart), and the data at the same paths there. Raises
     MissingDependencyError without distributed, BadInputError if nobody answers at the address, CalibrationError if there are no
-    workers within WAIT_FOR_WORKERS_S, they do not fit, one group ends several of them, or the scheduler is lost.
+    workers within WAIT_FOR_WORKERS_S or no more, they do not fit, one group ends several of them, or the scheduler is lost.
     """
 
     def __init__(self, address: str, wait_s: float = WAIT_FOR_WORKERS_S):
@@ -97,6 +99,7 @@ class ClusterPool:
                     future = client.submit(answer, work, VERSION, pure=False, retries=RETRIES)
                 running[future] = group
                 finished.add(future)
+            self._wait(client, finished)
             future = next(finished)
             group = running.pop(future)
             try:
@@ -109,6 +112,18 @@ class ClusterPool:
                 raise CalibrationError(f"{SAME_VERSION}, with what it needs: {error}") from None
             else:
                 yield group, answers
+
+    def _wait(self, client: Any, finished: Any) -> None:
+        """Until a group is done. CalibrationError where no worker has been left for a long time."""
+        last_seen = time.monotonic()
+        while not finished.has_ready():
+            time.sleep(POLL_S)
+            if time.monotonic() - last_seen > self.wait_s:
+                with self._connected():
+                    if client.nthreads():
+                        last_seen = time.monotonic()
+            if time.monotonic() - last_seen > WITHOUT_WORKERS * self.wait_s:
+                raise CalibrationError(f"the Dask scheduler at {self.address} has no workers any more; start some; {GOES_ON}")
 
     @contextmanager
     def _connected(self) -> Iterator[None]:

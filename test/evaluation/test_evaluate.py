@@ -40,8 +40,10 @@ from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.results import TWIST_AXES
 from calib_ros_thesis.features import importance
 
-DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
-TINY = replace(QUICK, curve_frames=1, curve_samples=5, single_frames=2, size_frames=1, counts=(1, 2))
+DRIVE = "synthetic:seed=5,frames=3,rings=32,width=400,height=150"
+TINY = replace(
+    QUICK, curve_frames=1, curve_samples=5, single_frames=1, size_frames=1, sizes=((0.5, 0.05),), counts=(2,), cost_frames=1
+)
 TIMES = {"cpu_s", "features_cpu_s"}
 
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
-TYPES = get_typestore(Stores.ROS2_KILTED)
+from calib_ros.datasets.bag_parts import typestore
+
+TYPES = typestore()
 FAMILIES = ("rosbags", "rclpy")
 STAMP = 1_700_000_000_123_456_789
 # numpy type -> PointField.datatype

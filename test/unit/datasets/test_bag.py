@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
@@ -14,15 +13,19 @@ import pytest
 from fuzz_runner import Listed
 from ros_messages import TYPES, Messages
 from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
+from calib_ros.datasets.bag_parts import zstd
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
+from calib_ros.messages.livox import decode_livox
 from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.se3 import exp, inverse, quaternion_from_rotation
@@ -328,6 +331,43 @@ def test_headers_without_stamps_fall_back_to_the_time_of_recording(tmp_path):
     assert "headers have none" in bag.describe()["stamps"]
 
 
+@pytest.mark.parametrize(
+    ("ahead_s", "queue_s", "found_s", "cause"),
+    [
+        (37.02, 0.0, 37.0, "TAI and UTC"),
+        (-18.02, 0.0, -18.0, "GPS time and UTC"),
+        (2.5, 0.0, 2.5, "not synchronised"),
+        (-START / 1e9 + 300, 0.0, -START / 1e9 + 300, "another epoch"),
+        (0.0, 4.0, 0.0, ""),
+        (0.2, 0.0, 0.0, ""),
+    ],
+)
+def test_clocks_that_differ_are_told_from_messages_that_come_late(tmp_path, ahead_s, queue_s, found_s, cause):
+    """By the times of recording; stamps of the future, other epochs and time scales are clocks, a queue is none."""
+    with Recorder(tmp_path / "bag") as record:
+        for i in range(60):
+            at = START + i * 100 * MS
+            record.image(at, value=i, time=at + 20 * MS)
+            record.info(at)
+            record.cloud(at + round(ahead_s * 1e9), value=i, time=at + 20 * MS + round(queue_s * 1e9))
+    bag = BagSource(tmp_path / "bag")
+    assert [remark for remark in bag.remarks if cause not in remark] == []
+    assert len(bag.remarks) == (1 if found_s else 0)
+    assert [int(bag[i].cloud.xyz[0, 0]) - int(bag[i].image[0, 0]) for i in (0, 30, 59 if not ahead_s else -1)] == (
+        [0, 0, 0] if ahead_s != 0.2 else [-2, -2, -2]
+    )
+    as_stamped = {"header": ahead_s, "recording": queue_s}
+    for clock, offset_s in as_stamped.items():
+        if abs(offset_s) > 10:
+            with pytest.raises(BadInputError, match="--clock auto"):
+                BagSource(tmp_path / "bag", clock=clock)
+        else:
+            own = BagSource(tmp_path / "bag", clock=clock)
+            assert int(own[0].cloud.xyz[0, 0]) == max(0, round(-10 * offset_s))
+    with pytest.raises(BadInputError, match="must be one of auto, header, recording"):
+        BagSource(tmp_path / "bag", clock="sensor")
+
+
 def test_several_topics_of_a_type_need_a_choice(tmp_path):
     with Recorder(tmp_path / "bag") as record:
         record.trio(START)
@@ -364,6 +404,18 @@ def test_missing_types_and_pairs_are_named(tmp_path):
         record.cloud(START)
     with pytest.raises(BadInputError, match=r"no CameraInfo messages, only .*/cam/image_raw \(sensor_msgs/msg/Image\)"):
         BagSource(tmp_path / "bag")
+    with Recorder(tmp_path / "planar") as record:
+        record.image(START)
+        fields = dict.fromkeys(
+            ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max"), 0.0
+        )
+        none = np.zeros(0, np.float32)
+        scan = record.ros.make(
+            "sensor_msgs/msg/LaserScan", header=record.ros.header(START, "s"), ranges=none, intensities=none, **fields
+        )
+        record.write("/scan", scan, START)
+    with pytest.raises(BadInputError, match="LaserScan: a scan of one plane"):
+        BagSource(tmp_path / "planar")
     with Recorder(tmp_path / "empty"):
         pass
     with pytest.raises(BadInputError, match="nothing at all"):
@@ -461,10 +513,10 @@ def test_an_unusable_message_is_named_and_the_others_stay_usable(tmp_path):
 # --- damage; at random in the fuzz tests -----------------------------------------------------------------------------------
 
 
-def use(path: Path) -> str:
+def use(path: Path, **options) -> str:
     """Opens and reads everything: "read", or why not."""
     try:
-        with BagSource(path) as bag:
+        with BagSource(path, **options) as bag:
             for i in range(len(bag)):
                 bag[i]
     except BadInputError as error:
@@ -481,12 +533,89 @@ def test_damaged_bags_say_what_helps(tmp_path, storage):
     copy = write_bag(Listed([frame(i) for i in range(4)]), tmp_path / "bag", storage)
     (copy / "metadata.yaml").unlink()
     assert use(copy) == "read"
-    shutil.copy(storage_of(copy), copy / f"second{storage_of(copy).suffix}")
-    assert "ros2 bag reindex" in use(copy)
-    (copy / f"second{storage_of(copy).suffix}").unlink()
     whole = storage_of(copy).read_bytes()
     advice = "mcap recover" if storage_of(copy).suffix == ".mcap" else "record it again"
     storage_of(copy).write_bytes(whole[: len(whole) // 3])
     assert advice in use(copy)
     storage_of(copy).unlink()
-    assert "no .mcap or .db3" in use(copy)
+    assert "no .mcap, .db3 or .bag" in use(copy)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_bag_is_read_without_its_metadata(tmp_path, storage):
+    """Damaged, or of a recorder that left it empty: the files hold all that is needed. Parts that are not there are named."""
+    parts = [frame(i) for i in range(3)], [frame(i) for i in range(3, 6)]
+    first, second = (write_bag(Listed(own), tmp_path / f"part{k}", storage) for k, own in enumerate(parts))
+    for text in ("", "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: ''\n", "[unreadable"):
+        (first / "metadata.yaml").write_text(text)
+        bag = BagSource(first)
+        assert (len(bag), len(bag.remarks)) == (3, 1)
+        assert "metadata.yaml" in bag.remarks[0]
+    (first / "metadata.yaml").unlink()
+    file = storage_of(second)
+    packed = first / f"part_10{file.suffix}.zstd"
+    with zstd.open(packed, "wb") as target:
+        target.write(file.read_bytes())
+    bag = BagSource(first)
+    assert [bag[i].stamp for i in range(6)] == [made.stamp for own in parts for made in own]
+    assert bag.remarks == ()
+    packed.write_bytes(packed.read_bytes()[:100])
+    assert packed.name in use(first)
+    assert "--incomplete" in use(first)
+    with BagSource(first, incomplete=True) as bag:
+        assert len(bag) == 3
+        assert packed.name in bag.remarks[0]
+    listed = (second / "metadata.yaml").read_text().replace(f"- {file.name}", f"- {file.name}\n  - gone_1{file.suffix}", 1)
+    (second / "metadata.yaml").write_text(listed)
+    assert f"gone_1{file.suffix}" in use(second)
+    assert use(second, incomplete=True) == "read"
+
+
+def test_bags_of_ros_1(tmp_path):
+    """With their own byte layout of a header; the same frames as a bag of ROS 2."""
+    path = tmp_path / "drive.bag"
+    with Recorder(tmp_path / "bag") as record:
+        for i in range(3):
+            record.trio(START + i * 100 * MS, value=i)
+        record.static(START, ("cam", "lidar", A))
+    expected, ros1 = BagSource(tmp_path / "bag"), get_typestore(Stores.ROS1_NOETIC)
+    ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    with Reader(tmp_path / "bag") as reader, Ros1Writer(path) as writer:
+        own = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=ros1) for c in reader.connections}
+        for connection, time, data in reader.messages():
+            writer.write(own[connection.topic], time, TYPES.cdr_to_ros1(data, connection.msgtype))
+    bag = open_dataset(path)
+    assert (len(bag), bag.describe()["kind"], bag.camera_frame) == (3, "ROS 1 bag", "cam")
+    assert np.abs(bag.reference - A).max() < 1e-9
+    for i in range(3):
+        assert_same(bag[i], expected[i])
+    path.write_bytes(path.read_bytes()[:-200])
+    assert "record it again" in use(path)
+
+
+def test_livox_clouds(tmp_path):
+    """Its own message, of points with times and lines."""
+    with Recorder(tmp_path / "bag") as record:
+        for i in range(3):
+            stamp = START + i * 100 * MS
+            record.image(stamp)
+            record.info(stamp)
+            fields = {"offset_time": 5 * MS, "y": 2.0, "z": 3.0, "reflectivity": 200, "tag": 16, "line": 3}
+            made = [record.ros.make("livox_ros_driver2/msg/CustomPoint", x=float(k), **fields) for k in range(1 + i)]
+            about = {"timebase": 0, "point_num": len(made), "lidar_id": 0, "rsvd": np.zeros(3, np.uint8)}
+            message = record.ros.make(
+                "livox_ros_driver2/msg/CustomMsg", **about, points=made, header=record.ros.header(stamp, "li")
+            )
+            record.write("/livox/lidar", message, stamp)
+    bag = BagSource(tmp_path / "bag")
+    cloud = bag[2].cloud
+    assert bag.lidar_frame == "li"
+    assert np.array_equal(cloud.xyz, [[k, 2, 3] for k in range(3)])
+    assert np.allclose(cloud.time, 0.005)
+    assert (set(cloud.ring), set(cloud.intensity)) == ({3}, {200})
+    data = b"\0\1\0\0" + bytes(60)
+    for length in (4, 30):
+        with pytest.raises(BadInputError, match="CustomMsg"):
+            decode_livox(data[:length])
+    with pytest.raises(BadInputError, match="truncated"):
+        decode_livox(data[:24] + b"\xff\xff\xff\x0f" * 5 + bytes(20))

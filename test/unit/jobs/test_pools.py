@@ -261,6 +261,24 @@ def test_a_group_that_kills_its_dask_workers_may_be_an_outcome(tmp_path: Path) -
             ran(tmp_path, ClusterPool(address), partial(fall, tmp_path, 99), [[job("other", "edges", "street", [3])]])
 
 
+def test_where_all_dask_workers_have_gone_it_is_said(tmp_path: Path) -> None:
+    """Killed without a nanny that would start them again."""
+    pytest.importorskip("distributed")
+    with scheduler(0) as address:
+        options = (address, "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path))
+        with process_of_dask("worker", tmp_path, *options) as worker:
+            pool = ClusterPool(address)
+
+            def end(done: int, total: int) -> None:
+                if done:
+                    worker.kill()
+                    pool.wait_s = 0.2
+
+            with pytest.raises(CalibrationError, match=r"has no workers any more.*goes on where it stopped"):
+                ran(tmp_path, pool, partial(work, tmp_path, 0.1), groups(40), end)
+    assert 3 <= len(kept(tmp_path)) < 120
+
+
 def test_dask_workers_that_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with scheduler(1, threads=2) as address:
         with pytest.raises(CalibrationError, match=r"has 2 threads.*--nthreads 1"):

@@ -1,0 +1,147 @@
+"""The files of a bag: with their metadata.yaml as rosbags reads them, or each for itself; ROS 1 bags as if they were ROS 2's."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, suppress
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from calib_ros.errors import BadInputError
+from calib_ros.messages.livox import CUSTOM_MSG, CUSTOM_POINT, LIVOX
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:  # what rosbags itself requires
+    from backports import zstd
+
+METADATA, COMPRESSED = "metadata.yaml", ".zstd"
+STORAGE = {".mcap": "mcap", ".db3": "sqlite3", ".bag": "ROS 1"}
+ZSTD = b"\x28\xb5\x2f\xfd"  # begins what is compressed; a message begins with 0 and its byte order
+
+
+@cache
+def typestore() -> Typestore:
+    """The message types of ROS 2, the same in every release: a bag's own definitions, maybe broken, are not needed."""
+    store = get_typestore(Stores.ROS2_KILTED)
+    for name in LIVOX:
+        package = name.partition("/")[0]
+        store.register(get_types_from_msg(CUSTOM_POINT, f"{package}/msg/CustomPoint"))
+        store.register(get_types_from_msg(CUSTOM_MSG, name))
+    return store
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The files of a folder that hold messages, in order, compressed ones among them."""
+    files = [file for file in sorted(folder.iterdir(), key=lambda file: (len(file.name), file.name)) if file.is_file()]
+    return [file for file in files if storage_of(file) and not file.name.startswith(".")]
+
+
+def storage_of(file: Path) -> str:
+    """How a file holds messages: "mcap", "sqlite3", "ROS 1", or "" if it holds none."""
+    return STORAGE.get((file.with_suffix("") if file.suffix == COMPRESSED else file).suffix, "")
+
+
+class BagParts:
+    """Open files of a bag. start, stop: recording times of the first message, and after the last, ns. indexed: whether messages
+    of a topic and time are found without reading the others. remarks: on what is not as a recorder leaves it, for people.
+
+    incomplete: use what is left of a bag of which parts are missing, empty or damaged; else BadInputError names them.
+    """
+
+    def __init__(self, path: Path, incomplete: bool = False) -> None:
+        self.remarks: list[str] = []
+        self._stack = ExitStack()
+        try:
+            if path.is_file():
+                self._readers = [self._opened(path)]
+            else:
+                self._readers = self._of_folder(path, incomplete)
+        except BaseException:
+            self._stack.close()
+            raise
+        self.connections = [connection for reader in self._readers for connection in reader.connections]
+        filled = [reader for reader in self._readers if reader.message_count]
+        self.start = min((reader.start_time for reader in filled), default=0)
+        self.stop = max((reader.end_time for reader in filled), default=0)
+        self.indexed = all(
+            not isinstance(storage, McapReader) or bool(storage.chunks)
+            for reader in self._readers
+            for storage in (getattr(reader.storage, "storages", [reader.storage]) if isinstance(reader, Reader) else ())
+        )
+
+    def close(self) -> None:
+        """Close all files."""
+        self._stack.close()
+
+    def messages(self, topics: Collection[str], start: int | None, stop: int | None) -> Iterator[tuple[str, int, bytes]]:
+        """(topic, time of recording in ns, CDR bytes) of messages recorded in [start, stop), part by part."""
+        for reader in self._readers:
+            connections = [c for c in reader.connections if c.topic in topics]
+            if not connections:  # rosbags reads an empty list as "all"
+                continue
+            is_ros1 = isinstance(reader, Ros1Reader)
+            for connection, time, data in reader.messages(connections, start, stop):
+                if is_ros1:
+                    data = bytes(typestore().ros1_to_cdr(data, connection.msgtype))
+                elif data[:4] == ZSTD:
+                    data = zstd.decompress(data)
+                yield connection.topic, time, data
+
+    def _of_folder(self, path: Path, incomplete: bool) -> list[Any]:
+        parts = storage_files(path)
+        if not parts:
+            raise BadInputError(f"bag {path} has no .mcap, .db3 or .bag file; copy the whole folder")
+        if (path / METADATA).exists():
+            try:
+                return [self._entered(Reader(path))]
+            except (ReaderError, AssertionError) as error:
+                why = " ".join(str(error).split()) or "a part is empty or damaged"
+                self.remarks.append(f"bag {path.name}: {METADATA} does not fit its files ({why}), which are read without it")
+        readers, lost = [], []
+        for part in parts:
+            try:
+                readers.append(self._opened(part))
+            except Exception as error:  # of a damaged file rosbags raises whatever the damaged place leads to
+                lost.append(f"{part.name} ({' '.join(str(error).split()) or type(error).__name__})")
+        if not readers or (lost and len(parts) == 1):
+            raise ReaderError(", ".join(lost))
+        lost += [f"{reader.path.name} (empty)" for reader in readers if not reader.message_count]
+        missing = "Some database files are missing" in "".join(self.remarks)
+        if (lost or missing) and not incomplete:
+            what = ", ".join(lost) or self.remarks[-1].partition("[")[2].partition("]")[0]
+            raise BadInputError(
+                f"bag {path}: {len(readers)} parts are there, but not {what}; copy the whole folder, or use what is left by "
+                "--incomplete"
+            )
+        self.remarks += [f"bag {path.name}: without {part}" for part in lost]
+        return sorted(readers, key=lambda reader: int(reader.start_time))
+
+    def _opened(self, file: Path) -> Any:
+        if file.suffix == COMPRESSED:
+            folder = self._stack.enter_context(TemporaryDirectory())
+            plain = Path(folder) / file.stem
+            with file.open("rb") as packed, zstd.open(packed, "rb") as source, plain.open("wb") as target:
+                shutil.copyfileobj(source, target)
+            file = plain
+        return self._entered(Ros1Reader(file) if file.suffix == ".bag" else Reader(file))
+
+    def _entered(self, reader: Any) -> Any:
+        reader.open()
+        self._stack.callback(_close, reader)
+        return reader
+
+
+def _close(reader: Any) -> None:
+    with suppress(Exception):
+        reader.close()
