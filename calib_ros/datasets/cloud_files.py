@@ -6,6 +6,7 @@ The names of fields, and the units of times, are those of the drivers: see `cali
 from __future__ import annotations
 
 import re
+import struct
 import warnings
 from collections.abc import Callable
 from io import BufferedReader, BytesIO
@@ -42,6 +43,7 @@ FOREIGN = {
     ".fls": "Faro's; export it as PLY",
     ".drc": "Draco's; decode it as PLY: draco_decoder -i FILE.drc",
 }
+LAS_HEADER = 247  # bytes up to the number of extended records, since version 1.4
 CLOUD_COMPARE = "scalar_"  # before the names of fields in PLY files that CloudCompare writes
 
 
@@ -109,6 +111,7 @@ def _read_las(path: Path) -> Columns:
         import laspy
     except ImportError:
         raise MissingDependencyError(NEEDS_LAS) from None
+    _check_las(path)
     try:
         file = laspy.read(path)
     except laspy.errors.LaspyException as error:
@@ -119,6 +122,16 @@ def _read_las(path: Path) -> Columns:
     names = {"intensity": "intensity", "gps_time": "time"}
     columns = {name: np.asarray(file[own]) for own, name in names.items() if own in file.point_format.dimension_names}
     return {"x": np.asarray(file.x), "y": np.asarray(file.y), "z": np.asarray(file.z), **columns}
+
+
+def _check_las(path: Path) -> None:
+    """BadInputError for a header of more records than the file can hold, which laspy would read one by one."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(LAS_HEADER).ljust(LAS_HEADER, b"\0")
+    (records,), (extended,) = struct.unpack_from("<I", head, 100), struct.unpack_from("<I", head, 243)
+    if records * 54 > size or (head[25] >= 4 and extended * 60 > size):
+        raise BadInputError(f"cloud {path} is damaged: its header speaks of {records} records; copy it again")
 
 
 def _read_text(path: Path) -> Columns:

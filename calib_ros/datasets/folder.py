@@ -221,7 +221,7 @@ def _numbers(values: dict[str, Any], name: str, count: int | None = None) -> Mat
     data = value.get("data") if isinstance(value, dict) else None
     try:
         numbers = np.asarray(data, float).ravel() if data is not None else None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = None
     if numbers is None or not np.isfinite(numbers).all() or (count is not None and len(numbers) != count):
         of = f"{count} numbers" if count else "numbers"

@@ -67,7 +67,7 @@ def test_mutated_texts(count):
 @cases(200, 900)
 def test_mutated_bags_and_folders(count):
     report = fuzz("folders", count)
-    kinds = ("bag_mcap", "bag_sqlite3", "raw", "odometry", "object", "plain", "nuscenes")
+    kinds = ("bag_mcap", "bag_sqlite3", "bag_ros1", "raw", "odometry", "object", "plain", "plain_otherwise", "nuscenes")
     assert total(report, *kinds) == count
     assert min(report["outcomes"][f"{kind} {what}"] for kind in kinds for what in ("taken", "refused")) > count // 90
 

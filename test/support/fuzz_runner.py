@@ -29,6 +29,7 @@ from calib_ros import result, se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, SemanticsConfig, load_stages
 from calib_ros.datasets import open_dataset
+from calib_ros.datasets.bag_parts import typestore
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -356,6 +357,41 @@ def plain(folder: Path) -> None:
     (folder / "clouds/1.ply").write_text(header + lines)
 
 
+def plain_otherwise(folder: Path) -> None:
+    """The same in other formats: LAS and CSV, TIFF and WebP."""
+    import cv2
+    import laspy
+
+    plain(folder)
+    for part in ("images", "clouds"):
+        for path in (folder / part).iterdir():
+            path.unlink()
+    first, second = frames()
+    cv2.imwrite(str(folder / "images/0.tif"), first.image)
+    cv2.imwrite(str(folder / "images/1.webp"), second.image)
+    las = laspy.create()
+    las.x, las.y, las.z = first.cloud.xyz.T.astype(float)
+    las.write(folder / "clouds/0.las")
+    np.savetxt(folder / "clouds/1.csv", second.cloud.xyz, "%.3f", ",", header="x,y,z")
+
+
+def ros1(folder: Path) -> None:
+    """A bag of ROS 1 of the same frames."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    path = write_bag(Listed(frames()), folder.parent / "to_convert")
+    folder.mkdir()
+    with Reader(path) as reader, Writer(folder / "drive.bag") as writer:
+        topics = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections}
+        for connection, time, data in reader.messages():
+            writer.write(topics[connection.topic], time, typestore().cdr_to_ros1(data, connection.msgtype))
+    shutil.rmtree(path)
+
+
 def nuscenes(folder: Path) -> None:
     """A scene of two key frames."""
     import cv2
@@ -392,16 +428,18 @@ def nuscenes(folder: Path) -> None:
 
 
 def originals(root: Path) -> list[Path]:
-    """Two bags, three KITTI drives, a plain folder and nuScenes, intact."""
+    """Three bags, three KITTI drives, two plain folders and nuScenes, intact."""
     out = [write_bag(Listed(frames()), root / f"bag_{storage}", storage) for storage in ("mcap", "sqlite3")]
     for layout in ("raw", "odometry", "object"):
         folder = root / layout
         folder.mkdir()
         kitti(folder, layout)
         out.append(folder)
-    plain(root / "plain")
-    nuscenes(root / "nuscenes")
-    return [*out, root / "plain", root / "nuscenes"]
+    for make in (plain, plain_otherwise, nuscenes):
+        make(root / make.__name__)
+        out.append(root / make.__name__)
+    ros1(root / "bag_ros1")
+    return [*out, root / "bag_ros1"]
 
 
 def folders(run: Run, seed: int, count: int) -> None:
@@ -419,7 +457,7 @@ def folders(run: Run, seed: int, count: int) -> None:
             damage_folder(rng, broken)
             target = broken
             if source.name.startswith("bag") and rng.random() < 0.5:
-                stores = [path for path in broken.iterdir() if path.is_file() and path.suffix in (".mcap", ".db3")]
+                stores = [path for path in broken.iterdir() if path.is_file() and path.suffix in (".mcap", ".db3", ".bag")]
                 target = stores[0] if stores else broken
             run.case(source.name, f"{source.name} {k}", lambda p=target: read_through(p))
             shutil.rmtree(broken)
