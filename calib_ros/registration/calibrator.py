@@ -155,7 +155,6 @@ class Calibrator:
             raise BadInputError(f"the initial extrinsic must be a 4x4 matrix or one of {', '.join(GUESSES)}, got {initial!r}")
         if not frames:
             raise BadInputError("no frames given; give at least one")
-        _check_same_reference(frames)
         if T0 is None and initial not in BY_CLASSES:
 
             def register(start: Matrix | str, box: SearchBox | None) -> Result:
@@ -168,6 +167,7 @@ class Calibrator:
         segmentation = self.segmentation if self.segmentation.active and not wait else None
         around = None if T0 is None else (T0, search)
         used, notes = usable_frames(frames, self.extract, segmentation, Progress(progress, "features"), around)
+        notes = [*_changed_reference(frames), *notes]
         features = [features for _, features in used]
         if T0 is None:
             result = self.guess(features, search, progress, notes, str(initial))
@@ -291,12 +291,14 @@ def _seen_by(camera: Camera, frames: Sequence[Frame]) -> list[Frame]:
     return [replace(frame, camera=camera) for frame in frames]
 
 
-def _check_same_reference(frames: Sequence[Frame]) -> None:
-    """Frames that carry references must agree: two vehicles' frames have no common extrinsic."""
-    references = [(f.name, f.reference) for f in frames if f.reference is not None]
-    for name, reference in references[1:]:
-        if not np.allclose(reference, references[0][1], atol=1e-6):
-            raise BadInputError(
-                f"frames {references[0][0]} and {name} carry different calibrations and cannot be estimated together; "
-                "give only frames of one recording"
-            )
+def _changed_reference(frames: Sequence[Frame]) -> list[str]:
+    """A note where the recording itself changes the extrinsic that it states."""
+    known = [(f.name, f.reference) for f in frames if f.reference is not None]
+    for name, reference in known[1:]:
+        if not np.allclose(reference, known[0][1], atol=1e-6):
+            deg, m = se3.rotation_error_deg(known[0][1], reference), se3.translation_error_m(known[0][1], reference)
+            return [
+                f"the recording states another extrinsic for frame {name} than for {known[0][0]}, {deg:.2f} deg and "
+                f"{100 * m:.1f} cm apart; if the sensors were moved in between, estimate from frames before or after"
+            ]
+    return []
