@@ -21,6 +21,15 @@ FIRST_TOLERANCE, WIDEST_TOLERANCE = 50_000_000, 120_000_000
 JITTER = 0.1  # of a period, by which stamps may lie beside their time; cameras and scanners have up to 5 ms
 
 
+TIME_SCALES = {37: "TAI and UTC", 18: "GPS time and UTC", 19: "TAI and GPS time"}  # s, since 2017
+SAME_DIFFERENCE = 0.3  # s, by which latencies may blur one of these
+
+
+def time_scales(seconds: float) -> tuple[int, str] | None:
+    """The two time scales that are so far apart, with their exact difference, s; None if no two are."""
+    return next((own for own in TIME_SCALES.items() if abs(abs(seconds) - own[0]) <= SAME_DIFFERENCE), None)
+
+
 class Rhythm:
     """The newest stamps of a stream: its period, and the share of messages that is missing."""
 

@@ -15,15 +15,13 @@ from calib_ros.datasets.bag_file import TF, BagFile, StaticTransforms, peek_head
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import decode_camera_info
-from calib_ros.stamps import Stamps, nearest_index
+from calib_ros.stamps import Stamps, nearest_index, time_scales
 
 Span = tuple[int, int]  # [start, stop) of recording times, ns
 MAX_KEPT = 256 * 2**20  # bytes of messages held in memory: thirty frames of 2 Mpx in colour with their clouds
 AUTO, HEADER, RECORDING = CLOCKS = "auto", "header", "recording"
 MAX_LATENCY = NANOSECONDS  # usually, from a sensor to the recorder
 LONGEST_QUEUE = 60 * NANOSECONDS  # that messages wait in; what differs by more are clocks
-TIME_SCALES = {37: "TAI and UTC", 18: "GPS time and UTC", 19: "TAI and GPS time"}  # s, since 2017
-SAME_DIFFERENCE = 3 * NANOSECONDS // 10  # by which latencies may blur one of these
 LONG_AGO_S = 1e7
 # Where static transforms are repeated more often than this, those at the bag's beginning and before the windows are enough.
 FEW_TRANSFORMS, BEGINNING = 100, 5 * NANOSECONDS
@@ -191,9 +189,9 @@ def clock_difference(image: TopicIndex, cloud: TopicIndex) -> int:
         return 0
     of_clouds, of_images = (int((index.headers - index.recorded).max()) for index in (cloud, image))
     ahead = of_clouds - of_images
-    known = next((s for s in TIME_SCALES if abs(abs(ahead) - s * NANOSECONDS) <= SAME_DIFFERENCE), None)
+    known = time_scales(ahead / NANOSECONDS)
     if known is not None:
-        return int(np.copysign(known, ahead)) * NANOSECONDS
+        return int(np.copysign(known[0], ahead)) * NANOSECONDS
     # Only a clock stamps messages before they come.
     from_the_future = max(of_clouds, of_images) > abs(ahead) / 2 > MAX_LATENCY / 2
     return ahead if from_the_future or abs(ahead) > LONGEST_QUEUE else 0
@@ -202,9 +200,9 @@ def clock_difference(image: TopicIndex, cloud: TopicIndex) -> int:
 def difference_in_words(ahead: int) -> str:
     """What `clock_difference` found, and its likely cause."""
     seconds = abs(ahead) / NANOSECONDS
-    scale = TIME_SCALES.get(round(seconds)) if seconds.is_integer() else None
+    scale = time_scales(seconds)
     if scale is not None:
-        cause = f"the difference of {scale}, of which one sensor is synchronised to each"
+        cause = f"the difference of {scale[1]}, of which one sensor is synchronised to each"
     elif seconds > LONG_AGO_S:
         cause = "one of them counts from another epoch, such as when it was switched on"
     else:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.pairing.synchronizer import Synchronizer, SynchronizerCounts
+from calib_ros.stamps import time_scales
 
 WINDOW = 11  # checks, at one a second: what happened in 10 s
 # Of the slower stream, from which share without partner on it is a problem: some messages get lost on most vehicles, and two of
@@ -57,9 +58,11 @@ class PairingHealth:
         synchronizer = self._synchronizer
         lead, gap, tolerance = synchronizer.lead_s(), synchronizer.nearest_gap_s(), synchronizer.tolerance / NANOSECONDS
         if lead is not None and abs(lead) >= OTHER_CLOCK_S:
+            scale = time_scales(lead)
+            cause = f"{scale[1]} are so far apart" if scale else "another clock, or that much delay"
             return (
-                f"the newest image is stamped {_time(abs(lead))} {'after' if lead > 0 else 'before'} the newest cloud: another "
-                "clock, or that much delay; synchronise the clocks (PTP, chrony)"
+                f"the newest image is stamped {_time(abs(lead))} {'after' if lead > 0 else 'before'} the newest cloud: {cause}; "
+                "synchronise the clocks (PTP, chrony)"
             )
         missing = synchronizer.missing_shares()
         if max(missing) >= MISSING_SHARE:
