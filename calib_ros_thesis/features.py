@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from calib_ros.config import Config
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, PointCloud
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH, EdgeLevel, blurred_levels
 from calib_ros.image.enhance import prepare
+from calib_ros.lidar.range_image import require_returns
 from calib_ros.registration.classes import OF_CLASSES, OF_MASKS
 from calib_ros_thesis.cloud import PointAttributes, attributes
 from calib_ros_thesis.completion import FrameCompletion
@@ -25,25 +27,64 @@ CLASS_EDGE_SHARE = 0.1  # of borders of classes, less than of masks: they follow
 FEW_FRAMES_SHARE = 0.05  # added to the share of main classes, so that frames without any keep a part of their weight
 
 
+V = TypeVar("V")
+
+
+class Later(Generic[V]):
+    """A value that is made when it is first asked for, by whichever thread needs it; what it is made of is kept until then."""
+
+    def __init__(self, make: Callable[[], V]) -> None:
+        self._make: Callable[[], V] | None = make
+
+    def __call__(self) -> V:
+        make = self._make
+        if make is not None:  # two threads at once make the same value
+            self._value, self._make = make(), None
+        return self._value
+
+
+@dataclass(frozen=True, eq=False)
+class ImageEdges:
+    """E^I (h, w) in 0..1, for every smoothing. levels: these at the resolutions of the edges' own score, (1, h, w)
+    standardised."""
+
+    smoothed: list[Map]
+    levels: list[EdgeLevel]
+
+
 @dataclass(frozen=True, eq=False)
 class ThesisFeatures:
-    """What eq. 3.12 keeps of a frame, as `FrameFeatures.own`.
+    """What eq. 3.12 keeps of a frame, as `FrameFeatures.own`. Points and edges are made when an estimate asks for them: they take
+    longer than all else that is done with a keyframe, and many a keyframe's are replaced by those with semantic edges.
 
-    camera: pinhole of the maps. points: LiDAR frame, far ones first. map_levels: their levels in the maps. image_edges: E^I
-    (h, w) in 0..1, for every smoothing. levels: these at the resolutions of the edges' own score, (1, h, w) standardised.
-    importance: w_j of eq. 3.16; None where classes are not known, or frames are not weighted. blended: what semantic edges in E^I
-    are the boundaries of, see FrameSemantics; "" = there are none. completion: the network that makes the depth map dense; None =
-    eq. 3.11.
+    camera: pinhole of the maps. scan: points in the LiDAR frame, far ones first, and their levels in the maps. edges: of the
+    image. importance: w_j of eq. 3.16; None where classes are not known, or frames are not weighted. blended: what semantic edges
+    in E^I are the boundaries of, see FrameSemantics; "" = there are none. completion: the network that makes the depth map dense;
+    None = eq. 3.11.
     """
 
     camera: Camera
-    points: PointAttributes
-    map_levels: PointLevels
-    image_edges: list[Map]
-    levels: list[EdgeLevel]
+    scan: Later[tuple[PointAttributes, PointLevels]]
+    edges: Later[ImageEdges]
     importance: float | None = None
     blended: str = ""
     completion: FrameCompletion | None = None
+
+    @property
+    def points(self) -> PointAttributes:
+        return self.scan()[0]
+
+    @property
+    def map_levels(self) -> PointLevels:
+        return self.scan()[1]
+
+    @property
+    def image_edges(self) -> list[Map]:
+        return self.edges().smoothed
+
+    @property
+    def levels(self) -> list[EdgeLevel]:
+        return self.edges().levels
 
 
 def thesis_features(
@@ -55,24 +96,33 @@ def thesis_features(
     at_image: Map | None = None,
     edges_of: str = OF_MASKS,
     importance: float | None = None,
+    plain: ThesisFeatures | None = None,
 ) -> ThesisFeatures:
     """Features of a frame. TooFewFeaturesError if the scan is empty.
 
     image: rectified (h, w[, 3]) of camera. semantic: edges (h, w) in 0..1 to blend in. at_image: (n, 3) deskewed points of the
-    cloud, None = as measured. edges_of: see FrameSemantics. importance: w_j.
+    cloud, None = as measured. edges_of: see FrameSemantics. importance: w_j. plain: features of the same frame, whose points are
+    taken over.
     """
+    require_returns(cloud)
     thesis = thesis_of(config)
-    points = attributes(cloud, thesis, at_image)
-    gradient = gradient_edges(prepare(image, config.image), thesis)
-    edges = blend(gradient, semantic, semantic_share(thesis, edges_of))
-    focal_length = float(camera.K[0, 0])
+
+    def scan() -> tuple[PointAttributes, PointLevels]:
+        points = attributes(cloud, thesis, at_image)
+        return points, PointLevels.of(points)
+
+    def image_edges() -> ImageEdges:
+        gradient = gradient_edges(prepare(image, config.image), thesis)
+        edges = blend(gradient, semantic, semantic_share(thesis, edges_of))
+        focal_length = float(camera.K[0, 0])
+        levels = [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in thesis.smoothing]
+        return ImageEdges(levels, blurred_levels([edges], focal_length))
+
     learned = thesis.completion != MORPHOLOGICAL
     return ThesisFeatures(
         camera,
-        points,
-        PointLevels.of(points),
-        [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in thesis.smoothing],
-        blurred_levels([edges], focal_length),
+        Later(scan) if plain is None else plain.scan,
+        Later(image_edges),
         importance,
         "" if semantic is None else edges_of,
         FrameCompletion(thesis.completion, config.semantics, image) if learned else None,

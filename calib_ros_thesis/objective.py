@@ -12,7 +12,7 @@ from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.image.edges import SIGMAS
 from calib_ros.lidar.deskew import deskewed_points
-from calib_ros.registration.classes import OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros.registration.classes import IMAGE, MASKS, OF_CLASSES, OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.objective import AFTER_SEARCH, FIRST_STEP_DEG, FastObjective, optimise_smooth
 from calib_ros.registration.progress import SILENT, Progress
@@ -43,8 +43,8 @@ class ThesisObjective:
     weights: w_j of eq. 3.16; None = by the frames' classes, where these are known.
     """
 
-    pinholes_only = needs_classes = True
-    moves_points = False
+    pinholes_only, moves_points = True, False
+    uses = (MASKS, IMAGE)  # points have objects of their own, algorithm 2
     systematic_error = SYSTEMATIC_ERROR
     # Attached edges of dense maps are not independent, so that the covariance says too little: of two objectives that end far
     # apart one is wrong, and with few rings that is often eq. 3.12.
@@ -73,8 +73,14 @@ class ThesisObjective:
             edges = None if both is None else np.asarray(np.minimum(both.sum(axis=0), 1), np.float32)
             if semantics.classes is not None and config.semantics.frame_weights:
                 importance = share_of_main_classes(extractor.working(semantics.classes, nearest=True))
-        at_image, kind = deskewed_points(frame, config.motion), OF_MASKS if semantics is None else semantics.edges_of
-        return thesis_features(frame.cloud, image, features.camera, config, edges, at_image, kind, importance)
+        plain: ThesisFeatures | None = features.own
+        at_image = deskewed_points(frame, config.motion) if plain is None else None
+        kind = OF_MASKS if semantics is None else semantics.edges_of
+        own = thesis_features(frame.cloud, image, features.camera, config, edges, at_image, kind, importance, plain)
+        if semantics is not None:  # which are found on a thread that nothing waits for
+            own.scan()
+            own.edges()
+        return own
 
     @property
     def remark(self) -> str:

@@ -29,6 +29,7 @@ from calib_ros_thesis.maps import EdgeMaps, FastEdgeMaps, PointLevels, edge_maps
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
 MAX_DISCONTINUITY = 3.0  # m; at which eq. 3.10 saturates: from a car to the wall behind it
+KEPT = 4  # extrinsics whose edges are kept: an estimate asks for those of its start and of its optimum again and again
 
 
 class ThesisScore:
@@ -47,7 +48,7 @@ class ThesisScore:
         self.features, self.thesis, self.camera = features, thesis_of(config), features[0].camera
         self.n_frames, self.n_levels = len(features), len(self.thesis.smoothing)
         self.frame_weights = _frame_weights(weights, len(features))
-        self._frames = [self._kept(f, T_prior) for f in features]
+        self._frames = [self._near(f, T_prior) for f in features]
         found = sum(len(f.xyz) for f in self._frames)
         if found < MIN_POINTS:
             raise TooFewFeaturesError(
@@ -55,8 +56,9 @@ class ThesisScore:
                 "check the initial extrinsic and the thresholds of the stage thesis"
             )
         self._maps = FastEdgeMaps(self.camera.height, self.camera.width, self.thesis)
+        self._kept: dict[bytes, list[Shown]] = {}
 
-    def _kept(self, features: ThesisFeatures, T_prior: Matrix) -> _FramePoints:
+    def _near(self, features: ThesisFeatures, T_prior: Matrix) -> _FramePoints:
         keep = near_image(features.points.xyz, T_prior, self.camera, MARGIN)
         points = features.points.select(keep)
         matched = points.weight(self.thesis.min_depth) * normalized_discontinuity(points.discontinuity)
@@ -72,8 +74,16 @@ class ThesisScore:
         """The score at one smoothing."""
         return ThesisLevelScore(self, level % self.n_levels)
 
-    def shown(self, j: int, T: Matrix) -> tuple[NDArray[np.intp], NDArray[np.intp], Map]:
-        """Frame j at T_camera_lidar (4, 4): flat pixels (m,) with a point, the visible points, their W D + E^L."""
+    def shown(self, T: Matrix) -> list[Shown]:
+        """Every frame at T_camera_lidar (4, 4); of the last KEPT extrinsics the same again costs nothing."""
+        key = T.tobytes()
+        if key not in self._kept:
+            if len(self._kept) == KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = [self._shown(j, T) for j in range(self.n_frames)]
+        return self._kept[key]
+
+    def _shown(self, j: int, T: Matrix) -> Shown:
         frame, camera, completion = self._frames[j], self.camera, self.features[j].completion
         M = (camera.K @ T[:3]).astype(np.float32)
         u, v, points = self._maps.visible(M[:, :3] @ frame.xyz.T + M[:, 3:])
@@ -83,13 +93,12 @@ class ThesisScore:
         else:
             learned, shape = completion(pixels, frame.depth[points]), (camera.height, camera.width)
             edges = edge_maps(pixels, frame.levels.select(points), shape, self.thesis, learned).lidar_edges.ravel()[pixels]
-        return pixels, points, frame.matched[points] + edges
+        return Shown(pixels, points, frame.matched[points] + edges)
 
     def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
         """J_j (n_frames,) at T_camera_lidar (4, 4), normalised if so configured; 0 for a frame without a point in the image."""
         scores = np.zeros(self.n_frames)
-        for j, features in enumerate(self.features):
-            pixels, _, edges = self.shown(j, T)
+        for j, (features, (pixels, _, edges)) in enumerate(zip(self.features, self.shown(T), strict=True)):
             J = float(np.sum(edges * features.image_edges[level].ravel()[pixels], dtype=np.float64))
             mass = float(np.sum(edges, dtype=np.float64)) if self.thesis.normalize else 1.0
             scores[j] = J / max(mass, 1e-12)
@@ -105,8 +114,7 @@ class ThesisScore:
         Points hidden at T stay hidden; edge maps are interpolated, standardised and at all resolutions of image.edges.SIGMAS.
         """
         xyz, weight, frame = [], [], []
-        for j, own in enumerate(self._frames):
-            _, points, edges = self.shown(j, T)
+        for j, (own, (_, points, edges)) in enumerate(zip(self._frames, self.shown(T), strict=True)):
             some = np.flatnonzero(edges > 0)
             if not len(some):
                 continue
@@ -137,6 +145,14 @@ class ThesisLevelScore:
     def value(self, T: Matrix) -> float:
         """Weighted sum of the frames' J, eq. 3.16."""
         return float(self.score.frame_weights @ self.score.frame_scores(T, self.level))
+
+
+class Shown(NamedTuple):
+    """A frame at an extrinsic. pixels: flat (m,), those with a point. points: (m,) visible ones. edges: (m,) their W D + E^L."""
+
+    pixels: NDArray[np.intp]
+    points: NDArray[np.intp]
+    edges: Map
 
 
 class _FramePoints(NamedTuple):

@@ -58,9 +58,12 @@ def fit_ground(
     best, most = None, 2
     few = xyz[:: (n // compared) | 1]  # odd: a power of two would take the same lasers of every firing
     points = np.ascontiguousarray(few.T)
+    memory = np.empty((BATCH, points.shape[1]), np.float32)  # which takes longer to come by than to fill
     for k in range(0, len(normals), BATCH):
-        distance = normals[k : k + BATCH].astype(np.float32) @ points - offsets[k : k + BATCH, None].astype(np.float32)
-        count = np.count_nonzero(np.abs(distance) < threshold, axis=1)
+        own = normals[k : k + BATCH].astype(np.float32)
+        distance = np.matmul(own, points, out=memory[: len(own)])
+        distance -= offsets[k : k + BATCH, None].astype(np.float32)
+        count = np.array([np.count_nonzero(row) for row in np.abs(distance, out=distance) < threshold])
         if count.max() > most:
             most = int(count.max())
             best = Plane(normals[k + int(count.argmax())], float(offsets[k + int(count.argmax())]))
@@ -103,7 +106,7 @@ def connected_parts(pairs: NDArray[np.intp], n: int) -> NDArray[np.intp]:
 def _dbscan(points: Floats, weight: NDArray[np.float64], eps: float, min_points: int) -> NDArray[np.intp]:
     """Cluster (n,) of points (n, 3) that stand for so many each, numbered by their first core points; NOISE."""
     n, pairs = len(points), KDTree(points).query_pairs(eps, output_type="ndarray")
-    first, second = pairs.T
+    first, second = np.ascontiguousarray(pairs.T)
     core = weight + np.bincount(first, weight[second], n) + np.bincount(second, weight[first], n) >= min_points
     found = np.full(n, NOISE, np.intp)
     both = pairs[core[first] & core[second]]

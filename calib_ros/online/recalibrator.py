@@ -238,7 +238,9 @@ class Recalibrator:
         # Where searches begin that come by themselves, and those on request.
         starts = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
         around = [] if guessing else [(T, self._search_box()) for T in starts]
-        segmented = self.segmenter.segment(self.calibrator, cancelled, CLASSES if guessing else ALL, around)
+        left_in_doubt = self._in_doubt and self._estimated_at is not None
+        kinds = CLASSES if guessing else (() if left_in_doubt else self.calibrator.kinds_without_doubt) or ALL
+        segmented = self.segmenter.segment(self.calibrator, cancelled, kinds, around)
         if segmented is None:
             return ()
         plain, features, problems = segmented
@@ -328,7 +330,8 @@ class Recalibrator:
             # A search on request may use all rounds; automatic ones are limited, since the next keyframe tries again.
             box, start = self._search_box(SEARCH_ROUNDS), tracker.search_center
         # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
-        return self.calibrator.estimate(batch.features, start, box, progress, anchor=tracker.initial.T_camera_lidar)
+        anchor = tracker.initial.T_camera_lidar
+        return self.calibrator.estimate(batch.features, start, box, progress, anchor=anchor, near=box is None)
 
     def _update_tracker(self, result: Result, batch: Batch, on_request: bool) -> Extrinsic:
         with self._lock:

@@ -27,7 +27,7 @@ from calib_ros.registration.acceptance.refusal import joined, semantic_note
 from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.camera_rounds import refined_with_camera
-from calib_ros.registration.classes import Segmentation, class_models
+from calib_ros.registration.classes import ALL, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.estimate import Estimate, insufficient, observable_pose, refine_start, reject_outlier_frames
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective, views_of
@@ -210,17 +210,20 @@ class Calibrator:
         progress: Callback | None = None,
         notes: Sequence[str] = (),
         anchor: Transform | None = None,
+        near: bool = False,
     ) -> Result:
         """The same as `calibrate` from features. A failure is a Result whose transform is the initial one.
 
-        notes: for its reason. anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None = initial.
+        notes: for its reason. anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None = initial. near: the
+        initial one is an optimum of frames before, which an objective of its own follows on its finest level alone: its coarser
+        ones may lead away from it.
         """
         started, watch = time.perf_counter(), Progress(progress)
         origin = initial if anchor is None else anchor
         make = partial(self.objectives, T_prior=initial, anchor=origin, box=box)
         try:
             # Optimise: the extrinsic, and the clocks' offset where the frames show it.
-            optimised = JointSearch(make, initial, box, self.config, watch).optimum(features)
+            optimised = JointSearch(make, initial, box, self.config, watch, near).optimum(features)
             objective, start = optimised.objective, optimised.objective.constraints.limits.clip(initial)
             # Reject outlier frames, and refine.
             alignment = reject_outlier_frames(objective, optimised.T, watch)
@@ -282,8 +285,16 @@ class Calibrator:
     @property
     def classes_in_doubt_only(self) -> bool:
         """Whether classes wait until an estimate without them leaves doubt."""
+        return not self.kinds_without_doubt
+
+    @property
+    def kinds_without_doubt(self) -> tuple[str, ...]:
+        """The kinds of models that run on every frame, whether or not estimates leave doubt: those of another objective alone,
+        since its edges search and validate without classes as well."""
         other = other_objective(self.config)
-        return self.config.semantics.in_doubt_only and (other is None or not other.needs_classes)
+        if other is not None and other.uses:
+            return other.uses
+        return () if self.config.semantics.in_doubt_only else ALL
 
 
 def _seen_by(camera: Camera, frames: Sequence[Frame]) -> list[Frame]:

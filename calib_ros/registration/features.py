@@ -90,18 +90,27 @@ class FeatureExtractor:
     def __call__(
         self, frame: Frame, semantics: FrameSemantics | None = None, plain: FrameFeatures | None = None
     ) -> FrameFeatures:
-        """Features of a frame. semantics: of the frame. plain: its features without them, whose edge maps are taken over.
-        BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty."""
+        """Features of a frame. semantics: of the frame. plain: its features without them, of which is taken over what classes do
+        not change. BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty."""
         if frame.camera != self.source_camera:
             raise BadInputError(
                 f"frame {frame.name or frame.stamp} carries another camera calibration than the others; "
                 "frames of different calibrations cannot be estimated together: give only frames of one recording"
             )
-        image = self.working_image(frame.image)
-        if semantics is not None and semantics.labels is not None:
-            frame = replace(frame, cloud=replace(frame.cloud, label=semantics.labels))
-        elif frame.cloud.label is not None:  # what a source knows is used only where it is asked for
-            frame = replace(frame, cloud=replace(frame.cloud, label=None))
+        image, labels = self.working_image(frame.image), None if semantics is None else semantics.labels
+        if labels is not None or frame.cloud.label is not None:  # what a source knows is used only where it is asked for
+            frame = replace(frame, cloud=replace(frame.cloud, label=labels))
+        known = plain if plain is not None and plain.camera == self.camera else None  # else: another image.max_width meanwhile
+        features = known.edges_only if known is not None and labels is None else self._of_edges(frame, image, known)
+        if semantics is not None:
+            features = self._with_semantics(features, frame, image, semantics)
+        if self._other is None:
+            return features
+        features = features if known is None else replace(features, own=known.own)
+        return replace(features, own=self._other.extract(frame, image, features, semantics, self))
+
+    def _of_edges(self, frame: Frame, image: NDArray[np.uint8], plain: FrameFeatures | None) -> FrameFeatures:
+        """Edges of scan and image. plain: whose edge maps are taken over."""
         scan = range_image(frame.cloud, self.config.lidar)
         twist, still = used_twist(frame, self.config.motion), frame
         if scan.layout == "projection" and twist is not None:
@@ -110,7 +119,7 @@ class FeatureExtractor:
             scan = range_image(still.cloud, self.config.lidar)
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
         points = deskewed_edges(edge_points(scan, self.config.lidar), still, self.config.motion)
-        if plain is not None and plain.camera == self.camera:  # else: made with another image.max_width meanwhile
+        if plain is not None:
             levels = plain.levels
         else:
             levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, used=self.used)
@@ -120,11 +129,7 @@ class FeatureExtractor:
         if twist is None and not frame.compensated and self.config.motion.deskew != "off":
             sweep_s = self.config.motion.scan_period_s * self.source_camera.field_deg / 720
             features = replace(features, unknown_motion_s=sweep_s)
-        if semantics is not None:
-            features = self._with_semantics(features, frame, image, semantics)
-        if self._other is None:
-            return features
-        return replace(features, own=self._other.extract(frame, image, features, semantics, self))
+        return features
 
     def seen_anew(self, features: FrameFeatures, image: NDArray[np.uint8]) -> FrameFeatures:
         """Features of the same scan, had this camera taken the image; without semantics."""

@@ -61,13 +61,15 @@ class Optimised:
 
 @dataclass(frozen=True, eq=False)
 class JointSearch:
-    """Looks for the optimum in a search box around the initial extrinsic (4, 4), or from that itself."""
+    """Looks for the optimum in a search box around the initial extrinsic (4, 4), or from that itself. near: see
+    Calibrator.estimate."""
 
     make_objective: MakeObjective
     initial: Transform
     box: SearchBox | None
     config: Config
     progress: Progress
+    near: bool = False
 
     def optimum(self, features: Sequence[FrameFeatures]) -> Optimised:
         """Of the features; with points where the rows of the image see them from it, if its shutter is a rolling one."""
@@ -99,7 +101,10 @@ class JointSearch:
         motion, objective = self.config.motion, self.make_objective(features)
         search = None if self.box is None or self.box.is_empty else objective.edges.search(self.initial, self.box, self.progress)
         begin = self.initial if search is None else search.T
-        T = objective.optimise(begin, searched=search is not None, progress=self.progress)
+        if self.near and objective is not objective.edges:
+            T = objective.refine(begin, self.progress)
+        else:
+            T = objective.optimise(begin, searched=search is not None, progress=self.progress)
         moving = with_known_motion(features, objective.edges.score) if estimates_offset(features, self.config) else None
         if moving is None:
             return Optimised(features, objective, T, search)

@@ -84,11 +84,11 @@ class Objective(Protocol):
 
 class ObjectiveKind(Protocol):
     """Another objective, which joins by the entry point ``calib_ros.objectives``. pinholes_only: it cannot project onto
-    cylinders. moves_points: the points that it keeps follow a time offset. needs_classes: not only where there is doubt."""
+    cylinders. moves_points: the points that it keeps follow a time offset. uses: kinds of models, in doubt or not."""
 
     pinholes_only: bool
     moves_points: bool
-    needs_classes: bool
+    uses: tuple[str, ...]
 
     def extract(
         self,
@@ -98,7 +98,8 @@ class ObjectiveKind(Protocol):
         semantics: FrameSemantics | None,
         extractor: FeatureExtractor,
     ) -> Any:
-        """What it keeps of a frame, as `FrameFeatures.own`. image: rectified, (h, w[, 3]) of features.camera."""
+        """What it keeps of a frame, as `FrameFeatures.own`. image: rectified, (h, w[, 3]) of features.camera. features: `own` is
+        what it has kept of the same frame without semantics, if anything."""
 
     def __call__(self, edges: FastObjective, T_prior: Transform, config: Config) -> Objective:
         """The objective of the frames of `edges`, around T_prior (4, 4). Raises TooFewFeaturesError."""
@@ -291,9 +292,7 @@ class ObjectiveMaker:
         seen = self._seen_by_rows(features, T_prior if T_rows is None else T_rows)
         if other is None:
             return FastObjective(seen, T_prior, config, constraints, atlas, self.observer)
-        # How another objective is optimised must not change how the edges search and validate.
-        of_edges = replace(config, refine=replace(config.refine, optimizer="auto"))
-        return other(FastObjective(seen, T_prior, of_edges, constraints, atlas, self.observer), T_prior, config)
+        return other(FastObjective(seen, T_prior, self._of_edges, constraints, atlas, self.observer), T_prior, config)
 
     def of_edges(self, features: Sequence[FrameFeatures], T_prior: Transform, anchor: Transform | None = None) -> FastObjective:
         """The edges' own objective around T_prior (4, 4), whatever the configured one. Raises TooFewFeaturesError.
@@ -307,7 +306,13 @@ class ObjectiveMaker:
         constraints = constraints.within_trust_region(T_prior, *trust_region())
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
         plain = [(f.plain or f).edges_only for f in features]
-        return FastObjective(self._seen_by_rows(plain, T_prior), T_prior, config, constraints)
+        return FastObjective(self._seen_by_rows(plain, T_prior), T_prior, self._of_edges, constraints)
+
+    @property
+    def _of_edges(self) -> Config:
+        """How another objective is optimised must not change how the edges search and validate."""
+        config, other = self.config, other_objective(self.config)
+        return config if other is None else replace(config, refine=replace(config.refine, optimizer="auto"))
 
     def _seen_by_rows(self, features: Sequence[FrameFeatures], T: Transform) -> list[FrameFeatures]:
         return [seen_by_rows(f, T, self._camera, self.config.motion.readout_s) for f in features]

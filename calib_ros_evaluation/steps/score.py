@@ -47,7 +47,7 @@ class Both:
 
     def value(self, T: Matrix) -> float:
         """J at T (4, 4), at the last smoothing."""
-        pixels, _, edges = self.score.shown(0, T)
+        pixels, _, edges = self.score.shown(T)[0]
         J = float(np.sum(edges * self.score.features[0].image_edges[-1].ravel()[pixels], dtype=np.float64))
         self.normalized.append(J / max(float(np.sum(edges, dtype=np.float64)), 1e-12))
         return J

@@ -30,7 +30,7 @@ from calib_ros.online.keyframes import KeyframeBuffer
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import FrameSemantics
+from calib_ros.registration.classes import OF_CLASSES, FrameSemantics
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
@@ -413,6 +413,18 @@ def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
     assert found.frames_used == FRAMES
     assert se3.rotation_error_deg(source.reference, found.T_camera_lidar) < 0.2
     assert se3.translation_error_m(source.reference, found.T_camera_lidar) < 0.04
+
+
+def test_points_have_classes_for_another_objective_once_an_estimate_has_left_doubt(drive, start):
+    config = with_models(update(QUICK, {"refine": {"objective": "thesis"}}), **SOURCE)
+    recalibrator = recalibrator_of(drive, start, config)
+    for frame, in_doubt, estimated_at in zip(drive, (True, False, True), (None, 1, 1), strict=False):
+        recalibrator._in_doubt, recalibrator._estimated_at = in_doubt, estimated_at
+        assert recalibrator.ingest(frame)
+        assert recalibrator.segments_keyframes
+        assert recalibrator.segment_keyframe() == ()
+    assert [f.own.blended for f in recalibrator.buffer] == 3 * [OF_CLASSES]
+    assert [f.view is None for f in recalibrator.buffer] == [True, True, False]
 
 
 def test_frames_weigh_by_their_share_of_main_classes(drive, source):

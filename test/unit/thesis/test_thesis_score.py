@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+import weakref
 
 import numpy as np
 import pytest
@@ -14,15 +16,16 @@ from calib_ros.config import Config, update
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.image.edges import EdgeLevel
+from calib_ros.registration.classes import ALL, IMAGE, MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.score.point_score import near_image, nearest_per_pixel, project
 from calib_ros.result import RefusalCode
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.cloud import PointAttributes
 from calib_ros_thesis.config import ThesisConfig, thesis_of
-from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.features import ImageEdges, Later, ThesisFeatures
 from calib_ros_thesis.maps import PointLevels
-from calib_ros_thesis.score import ThesisScore, registration_maps
+from calib_ros_thesis.score import KEPT, ThesisScore, registration_maps
 
 IDENTITY = np.eye(4)  # the points are given in the camera's frame
 WIDTH, HEIGHT = 40, 24
@@ -40,7 +43,8 @@ def wall(u: np.ndarray, v: np.ndarray, z: np.ndarray | float) -> np.ndarray:
 
 def features(points: PointAttributes, image_edges: np.ndarray) -> ThesisFeatures:
     level = EdgeLevel.of(image_edges[None].astype(np.float32), 1, 1.0)
-    return ThesisFeatures(CAMERA, points, PointLevels.of(points), [image_edges.astype(np.float32)], [level] * 4)
+    edges = ImageEdges([image_edges.astype(np.float32)], [level] * 4)
+    return ThesisFeatures(CAMERA, Later(lambda: (points, PointLevels.of(points))), Later(lambda: edges))
 
 
 def every_pixel(label: np.ndarray, xi: np.ndarray, reflectivity: float = 0.4, depth: float = 10.0) -> PointAttributes:
@@ -184,11 +188,42 @@ def test_camera_facing_away_is_insufficient(scene):
 def test_attached_edges_score_as_they_do_where_they_are(scene):
     """The same W D + E^L under the same pixels; the maps differ by standardisation and by sampling between pixels."""
     score = ThesisScore(scene.thesis[:1], scene.truth, THESIS)
-    pixels, _, edges = score.shown(0, scene.truth)
+    pixels, _, edges = score.shown(scene.truth)[0]
     fine = scene.thesis[0].levels[-1].maps[0]
     by_hand = float(np.sum(edges * fine.ravel()[pixels], dtype=float) / np.sum(edges, dtype=float))
     assert score.attached(scene.truth).at(-1).value(scene.truth) == pytest.approx(by_hand, abs=0.02)
     assert by_hand > 0.2
+
+
+def test_edges_at_the_last_extrinsics_are_kept_and_no_others(scene):
+    score, (first, *others) = ThesisScore(scene.thesis, scene.truth, THESIS), [off(scene.truth, k) for k in range(KEPT + 1)]
+    kept, before = score.shown(first), score.attached(first).at(-1).value(first)
+    assert score.shown(first.copy()) is kept
+    score.leave_out(np.array([0]))
+    assert score.attached(first).at(-1).value(first) != before  # by the weights, which are not kept
+    for T in others:
+        score.shown(T)
+    anew = score.shown(first)
+    assert anew is not kept
+    assert all(np.array_equal(a.edges, b.edges) and np.array_equal(a.pixels, b.pixels) for a, b in zip(anew, kept, strict=True))
+
+
+def test_points_are_found_when_they_are_asked_for_and_once_for_all_features_of_a_frame(drive):
+    extract, frame = (
+        FeatureExtractor(drive.camera, THESIS),
+        dataclasses.replace(drive[0], cloud=dataclasses.replace(drive[0].cloud)),
+    )
+    cloud, plain = weakref.ref(frame.cloud), extract(frame)
+    again = extract(frame, FrameSemantics(classes=np.zeros(frame.image.shape[:2], np.uint8)), plain)
+    assert again.points is plain.points
+    assert again.own.scan is plain.own.scan
+    assert again.own.edges is not plain.own.edges  # with semantic edges, where there are some
+    del frame
+    points = extract(drive[0]).own.points
+    assert np.array_equal(plain.own.points.xyz, points.xyz)
+    assert np.array_equal(plain.own.points.label, points.label)
+    gc.collect()
+    assert cloud() is None  # nobody keeps the scan
 
 
 ONCE = {"dense_edges": "once_per_level"}
@@ -216,6 +251,44 @@ def test_refinement_reduces_the_error_and_repeats_to_the_bit(scene, method):
     assert se3.translation_error_m(scene.truth, result.T_camera_lidar) < 0.15
     assert result.covariance is not None
     assert np.array_equal(result.T_camera_lidar, again.T_camera_lidar)
+
+
+def test_a_known_optimum_is_followed_on_the_finest_level_alone(scene):
+    """On the coarser ones eq. 3.12 may lead degrees away from it; the edges' own score does not."""
+    calibrator, start = calibrator_of(scene.camera, "attached"), off(scene.truth, 1, 0.3, 0.02)
+    near = calibrator.estimate(scene.features, start, near=True)
+    assert near.converged, near.reason
+    refined = calibrator.objectives(scene.features, start, start).refine(start)
+    assert np.array_equal(near.T_camera_lidar, refined)
+    assert not np.array_equal(near.T_camera_lidar, calibrator.estimate(scene.features, start).T_camera_lidar)
+    of_edges = Calibrator(scene.camera, Config())
+    own = [f.edges_only for f in scene.features]
+    ends = [of_edges.estimate(own, start, near=known).T_camera_lidar for known in (True, False)]
+    assert np.array_equal(*ends)
+
+
+def test_the_edges_validate_an_optimum_and_keyframes_by_their_own_optimiser(scene):
+    calibrator = calibrator_of(scene.camera, "attached nelder_mead")
+    objective = calibrator.objectives(scene.features, scene.truth, scene.truth)
+    of_keyframes = calibrator.objectives.of_edges(scene.features, scene.truth)
+    assert {o.config.refine.optimizer for o in (objective.edges, of_keyframes)} == {"auto"}
+    by_default = calibrator_of(scene.camera, "attached").objectives.of_edges(scene.features, scene.truth)
+    start = off(scene.truth, 1, 0.3, 0.02)
+    assert np.array_equal(of_keyframes.optimise(start), by_default.optimise(start))
+
+
+@pytest.mark.parametrize(
+    ("stages", "kinds"),
+    [
+        ({}, ()),
+        ({"semantics": {"use": "always"}}, ALL),
+        ({"refine": {"objective": "thesis"}, "semantics": {"use": "always"}}, (MASKS, IMAGE)),
+    ],
+)
+def test_the_models_that_run_without_doubt_are_those_that_the_objective_uses(scene, stages, kinds):
+    calibrator = Calibrator(scene.camera, Config.from_dict(stages))
+    assert calibrator.kinds_without_doubt == kinds
+    assert calibrator.classes_in_doubt_only == (not kinds)
 
 
 @pytest.mark.parametrize(
@@ -299,8 +372,8 @@ def test_an_image_of_another_scene_is_refused(scene):
         return dataclasses.replace(level, packed=level.packed[..., ::-1].copy())
 
     a, b, _ = scene.features
-    edges = [e[:, ::-1].copy() for e in b.own.image_edges]
-    own = dataclasses.replace(a.own, image_edges=edges, levels=[mirrored(m) for m in b.own.levels])
+    edges = ImageEdges([e[:, ::-1].copy() for e in b.own.image_edges], [mirrored(m) for m in b.own.levels])
+    own = dataclasses.replace(a.own, edges=Later(lambda: edges))
     levels = [dataclasses.replace(m, packed=m.packed[:, ::-1, ::-1].copy()) for m in b.levels]
     other = dataclasses.replace(a, levels=levels, own=own)
     start = off(scene.truth, 0)
