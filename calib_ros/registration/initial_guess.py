@@ -50,7 +50,7 @@ def allowed(transforms: Matrix, config: GuessConfig) -> NDArray[np.bool_]:
 
 def near_lidar(T: Transform, config: GuessConfig) -> Limits:
     """Limits for an optimisation from T (4, 4) that keep the camera at the LiDAR: free to turn, not to go away."""
-    half = np.array([np.inf] * 3 + [config.distance_m / np.sqrt(3)] * 3)
+    half = np.array([np.inf] * 3 + [config.distance_m] * 3)
     return Limits(se3.from_parts(T[:3, :3], np.zeros(3)), half)
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from calib_ros.config import GuessConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import MAIN_CLASSES
+from calib_ros.frame import SemanticClass as C
 from calib_ros.lidar.segmentation import cluster
 from calib_ros.registration.initial_guess import allowed, near_lidar, poses
 from calib_ros.registration.search.constraints import Prior
@@ -29,6 +30,10 @@ Matrix = NDArray[np.float64]
 
 # Objects: what is connected as seen from the sensor, whatever its distance; cars in a row are one to image and cloud alike.
 LINK_DEG = (3 * CELL_DEG, 2.1)  # sideways and upward; scanners of 16 rings have gaps of 2 deg
+SURFACE_LINK_DEG = (3.0, 4.2)  # of surfaces, of which views keep fewer points
+LINKS = {**dict.fromkeys(MAIN_CLASSES, LINK_DEG), **dict.fromkeys((C.BUILDING, C.VEGETATION), SURFACE_LINK_DEG)}
+WHOLE, LEFT, RIGHT = 0, len(C), 2 * len(C)  # kinds, added to classes: an object, or that end of it
+END_DEG = 3.0  # of an object's width; wider than links, so that gaps of the scan do not hide it
 MIN_POINTS = 4  # a person at 30 m has about 10
 MIN_AREA_DEG2 = 0.2  # of the image; smaller ones are too far away to be objects of the cloud
 MIN_INLIERS = 3  # objects, as in the thesis
@@ -42,82 +47,97 @@ BASELINE_M = 0.6  # what the parallax of pairs is taken for while the translatio
 DRAWS = 40_000  # of two pairs of a frame, of which few can be right
 NEAREST_DEG = 5.0  # between two objects; nearer ones hardly fix a rotation
 EVALUATED, BATCH = 4_000_000, 100_000  # pairs at hypotheses, altogether and at a time
-STARTS = 20
+STARTS, FURTHER = 10, 200  # hypotheses of which the PnP problem is solved, and those that only maps of classes judge
 SAME_DEG = (3.0, 2.0)  # nearer hypotheses are one, before and after the PnP problem
 PARALLAX_LEVELS = (1.0, 0.4, 0.0)  # of BASELINE_M, as the translation is found
 ROUND_DEG2 = 360 * 10.0  # of all directions, where objects may be: near the horizon
+OBJECT_WEIGHT = 0.3  # of an object beside a point: frames show the same one again, so that what repeats itself agrees by chance
 HIT_RATES = np.array([0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # tried for every class; what networks find differs much
 
 
 @dataclass(frozen=True, eq=False)
 class Objects:
-    """Objects of frames. frame, cls: (n,). position: (n, 3), unit vector to an object of an image in the camera frame, or the
-    middle of one of a cloud, m. extent: (n, 2) deg, sideways and upward."""
+    """Objects of frames and their ends. frame: (n,). cls: (n,), class plus kind. position: (n, 3), unit vector to one of an image
+    in the camera frame, or the middle of one of a cloud, m. extent: (n, 2) deg, sideways and upward. width: (n,) deg, of the
+    whole object, as far as it is seen."""
 
     frame: NDArray[np.intp]
     cls: NDArray[np.intp]
     position: Matrix
     extent: Matrix
+    width: Matrix
 
     @staticmethod
-    def of(found: Sequence[tuple[int, int, Matrix, Matrix]]) -> Objects:
-        """From the frame, class, position and extent of each."""
-        frame, cls, position, extent = zip(*found, strict=True) if found else ((), (), (), ())
+    def of(found: Sequence[tuple[int, int, Matrix, Matrix, float]]) -> Objects:
+        """From the frame, class, position, extent and width of each."""
+        frame, cls, position, extent, width = zip(*found, strict=True) if found else ((), (), (), (), ())
         return Objects(
-            np.array(frame, np.intp), np.array(cls, np.intp), np.reshape(position, (-1, 3)), np.reshape(extent, (-1, 2))
-        )
+            np.array(frame, np.intp), np.array(cls, np.intp), np.reshape(position, (-1, 3)), np.reshape(extent, (-1, 2)),
+            np.array(width),
+        )  # fmt: skip
 
 
 def image_objects(views: Sequence[ClassView]) -> Objects:
-    """Regions of the main classes whose parts are nearer than LINK_DEG, without small ones and those that the image's left or
-    right border cuts."""
+    """Regions of a class whose parts are nearer than its link, without small ones; of those that the image's left or right border
+    cuts, the end that is in view."""
     found = []
     for number, view in enumerate(views):
         K, width = view.camera.K, view.classes.shape[1]
         per_pixel = float(np.rad2deg(view.scale / K[0, 0]))
-        size = [max(round(link / per_pixel), 1) | 1 for link in LINK_DEG]
-        link = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size)
-        for c in MAIN_CLASSES:
+        for c, link in LINKS.items():
             mask = (view.classes == c).astype(np.uint8)
             if not mask.any():
                 continue
-            _, region = cv2.connectedComponents(cv2.dilate(mask, link), connectivity=8)
+            size = [max(round(own / per_pixel), 1) | 1 for own in link]
+            kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size)
+            _, region = cv2.connectedComponents(cv2.dilate(mask, kernel), connectivity=8)
             rows, columns = np.nonzero(mask)
             order, edges = _groups(region[rows, columns])
             for own in np.split(order, edges):
                 u, v = columns[own], rows[own]
-                if len(own) * per_pixel**2 < MIN_AREA_DEG2 or u.min() == 0 or u.max() == width - 1:
+                low, high = int(u.min()), int(u.max())
+                cut = low == 0, high == width - 1
+                if len(own) * per_pixel**2 < MIN_AREA_DEG2 or all(cut):
                     continue
+                kind, wide = (RIGHT if cut[0] else LEFT if cut[1] else WHOLE), per_pixel * (high - low + 1)
+                if kind != WHOLE:
+                    end = (u > high - END_DEG / per_pixel) if kind == RIGHT else (u < low + END_DEG / per_pixel)
+                    u, v = u[end], v[end]
                 pixel = (np.array([u.mean(), v.mean()]) + 0.5) * view.scale - 0.5
                 ray = np.append((pixel - K[:2, 2]) / (K[0, 0], K[1, 1]), 1.0)
                 extent = per_pixel * np.array([np.ptp(u) + 1.0, np.ptp(v) + 1.0])
-                found.append((number, int(c), ray / np.linalg.norm(ray), extent))
+                found.append((number, kind + int(c), ray / np.linalg.norm(ray), extent, wide))
     return Objects.of(found)
 
 
 def cloud_objects(views: Sequence[ClassView]) -> Objects:
-    """Points of the main classes whose directions are nearer than LINK_DEG; all points of a direction count the same, as pixels
-    do."""
+    """Points of a class whose directions are nearer than its link, and both their ends; all points of a direction count the same,
+    as pixels do."""
     found = []
     for number, view in enumerate(views):
         distance = np.maximum(np.linalg.norm(view.xyz, axis=1), 1e-3)
-        azimuth = np.arctan2(view.xyz[:, 1], view.xyz[:, 0])
+        azimuth = np.rad2deg(np.arctan2(view.xyz[:, 1], view.xyz[:, 0]))
         elevation = np.rad2deg(np.arcsin(view.xyz[:, 2] / distance))
-        around = np.rad2deg(np.c_[np.cos(azimuth), np.sin(azimuth)]) / LINK_DEG[0]
-        linked = np.c_[around, elevation / LINK_DEG[1]].astype(np.float32)
-        for c in MAIN_CLASSES:
+        for c, link in LINKS.items():
             own = np.flatnonzero(view.label == c)
-            member = cluster(linked[own], 1.0, 2)
+            around = np.exp(1j * np.deg2rad(azimuth[own])) * np.rad2deg(1) / link[0]
+            member = cluster(np.c_[around.real, around.imag, elevation[own] / link[1]].astype(np.float32), 1.0, 2)
             own, member = own[member >= 0], member[member >= 0]
             order, edges = _groups(member)
             for part in np.split(own[order], edges) if len(own) else []:
                 if len(part) < MIN_POINTS:
                     continue
-                direction = (view.xyz[part] / distance[part, None]).mean(axis=0, dtype=np.float64)
-                middle = direction / np.linalg.norm(direction) / (1 / distance[part]).mean()
-                off = azimuth[part] - np.arctan2(middle[1], middle[0])
-                wide = np.ptp((off + np.pi) % (2 * np.pi))
-                found.append((number, int(c), middle, np.array([np.rad2deg(wide), np.ptp(elevation[part])])))
+                turned = np.sort(azimuth[part])
+                gaps = np.diff(turned, append=turned[0] + 360)
+                first = turned[(gaps.argmax() + 1) % len(turned)]  # the right end; what is all around ends at its widest gap
+                left = (azimuth[part] - first) % 360
+                wide = float(left.max())
+                for kind, end in (WHOLE, left >= 0), (LEFT, left > wide - END_DEG), (RIGHT, left < END_DEG):
+                    few = part[end]
+                    direction = (view.xyz[few] / distance[few, None]).mean(axis=0, dtype=np.float64)
+                    middle = direction / np.linalg.norm(direction) / (1 / distance[few]).mean()
+                    extent = np.array([np.ptp(left[end]), np.ptp(elevation[few])])
+                    found.append((number, kind + int(c), middle, extent, wide))
     return Objects.of(found)
 
 
@@ -154,9 +174,12 @@ class Consensus:
     def values(self, transforms: Matrix) -> Matrix:
         """The evidence (k,) at each of (k, 4, 4)."""
         step = max(BATCH // max(len(self), 1), 1)
-        return np.concatenate(
-            [self._evidence(self._ratio(transforms[k : k + step])[0])[0] for k in range(0, len(transforms), step)]
-        )
+        parts = [transforms[k : k + step] for k in range(0, len(transforms), step)] if len(self) else []
+        return np.concatenate([self._evidence(self._ratio(part)[0])[0] for part in parts] or [np.zeros(len(transforms))])
+
+    def per_object(self, transforms: Matrix) -> Matrix:
+        """What the evidence at each of (k, 4, 4) counts beside scores of maps (k,), which are means of such ratios as well."""
+        return OBJECT_WEIGHT / max(int(self.counts.sum()), 1) * replace(self, parallax=PARALLAX_LEVELS[1]).values(transforms)
 
     def value(self, T: Matrix) -> float:
         """The evidence at T (4, 4)."""
@@ -249,9 +272,9 @@ def find_pairs(views: Sequence[ClassView], config: GuessConfig) -> Consensus:
     rise = np.abs(np.arcsin(point[:, 2] / distance) + np.arcsin(ray[:, 1]))
     core = np.sqrt(RESOLUTION_DEG**2 + (PART[0] * np.minimum(of_image, of_cloud)) ** 2 + (PART[1] * (of_image - of_cloud)) ** 2)
     keep = rise <= np.deg2rad(config.tilt_deg + 2) + np.arcsin(np.minimum(config.distance_m / distance, 1.0))
-    keep &= of_image[:, 0] <= SIZE_RATIO * of_cloud[:, 0] + LINK_DEG[0]
-    keep &= of_cloud[:, 0] <= SIZE_RATIO * of_image[:, 0] + LINK_DEG[0]
-    similar = np.zeros((len(views), max(MAIN_CLASSES) + 1))
+    keep &= a.width[i] <= SIZE_RATIO * b.width[j] + LINK_DEG[0]
+    keep &= (b.width[j] <= SIZE_RATIO * a.width[i] + LINK_DEG[0]) | (a.cls[i] >= LEFT)
+    similar = np.zeros((len(views), 3 * len(C)))
     np.add.at(similar, (b.frame, b.cls), 1 / ROUND_DEG2)
     i, j = i[keep], j[keep]
     return Consensus(
@@ -262,7 +285,8 @@ def find_pairs(views: Sequence[ClassView], config: GuessConfig) -> Consensus:
 
 
 def agreed_poses(pairs: Consensus, config: GuessConfig, seed: int) -> Matrix:
-    """Allowed extrinsics (k, 4, 4) on which pairs of all frames agree, best first. TooFewFeaturesError where there are none."""
+    """Allowed extrinsics (k, 4, 4) on which pairs of all frames agree, best first, after those of which the PnP problem is solved
+    the rotations that fewer agree on. TooFewFeaturesError where there are none."""
     coarse = replace(pairs, parallax=PARALLAX_LEVELS[0])
     met = len(np.unique(pairs.of_image))
     if met >= MIN_INLIERS:
@@ -272,14 +296,16 @@ def agreed_poses(pairs: Consensus, config: GuessConfig, seed: int) -> Matrix:
         T = T if len(T) <= most else T[np.sort(rng.choice(len(T), most, replace=False))]
     if met < MIN_INLIERS or not len(T):
         raise TooFewFeaturesError(
-            f"a first guess from centroids needs {MIN_INLIERS} whole objects (vehicles, persons, cyclists, poles, signs) that "
-            f"image and cloud both show; of {int(pairs.counts.sum())} in the images {met} may be in the clouds; give more "
-            "frames, scenes with more objects, or another first guess (semantic, motion)"
+            f"a first guess from centroids needs {MIN_INLIERS} objects (vehicles, persons, cyclists, poles, signs, buildings, "
+            f"trees) that image and cloud both show; of {int(pairs.counts.sum())} in the images {met} may be in the clouds; "
+            "give more frames, scenes with more objects, or another first guess (semantic, motion)"
         )
-    T = T[distinct(T, coarse.values(T), SAME_DEG[0])[:STARTS]]
-    T = np.array([_solved(pairs, own, config) for own in T])
-    T = T[allowed(T, config)]
-    return T[distinct(T, pairs.values(T), SAME_DEG[1])] if len(T) else T
+    T = T[distinct(T, coarse.values(T), SAME_DEG[0])]
+    solved = np.array([_solved(pairs, own, config) for own in T[:STARTS]])
+    solved = solved[allowed(solved, config)]
+    if len(solved):
+        solved = solved[distinct(solved, pairs.values(solved), SAME_DEG[1])]
+    return np.concatenate([solved, T[STARTS : STARTS + FURTHER]])
 
 
 def _upright(pairs: Consensus) -> Matrix:

@@ -65,7 +65,9 @@ def first_guess(
     kinds = np.array([CENTROIDS] * len(agreed) + [SWEEP] * len(swept))
     T, kinds = _optimised(score, starts, kinds, config, seed)
     T, values, source = refine_positions(score, T, config, seed) if len(T) else (T, np.zeros(0), np.zeros(0, np.intp))
-    kinds = kinds[source]
+    values = values + pairs.per_object(T)
+    order = np.argsort(-values, kind="stable")
+    T, values, kinds = T[order], values[order], kinds[source][order]
     if not len(T):
         raise TooFewFeaturesError(
             f"no extrinsic within {config.tilt_deg:g} deg of level and {config.distance_m:g} m of the LiDAR brings the classes "

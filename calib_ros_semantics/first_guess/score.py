@@ -125,7 +125,7 @@ def refine_positions(
     ends, source = np.array(found), np.array(origin)
     inside = allowed(ends, config)
     ends, source = ends[inside], source[inside]
-    values = _ranked_scores(InViewScore(all_points, fine, least), ends, source) if len(ends) else np.zeros(0)
+    values = _ranked_scores(InViewScore(all_points, fine, least), ends) if len(ends) else np.zeros(0)
     kept = distinct(ends, values, SAME_DEG, SAME_M)
     kept = kept[values[kept] > 0]  # the others see nothing of the scene
     return ends[kept], values[kept], source[kept]
@@ -181,13 +181,16 @@ class InViewScore:
         return self._last[1]
 
 
-def _ranked_scores(view: InViewScore, ends: Matrix, source: NDArray[np.intp]) -> Matrix:
-    """The scores (k,) of ends (k, 4, 4), those of one source compared by their means."""
+def _ranked_scores(view: InViewScore, ends: Matrix) -> Matrix:
+    """The scores (k,) of ends (k, 4, 4), those of one direction, from wherever they started, compared by their means."""
     values, share = view.values(ends), view.share(ends)
-    for j in np.unique(source):
-        own = np.flatnonzero(source == j)
-        values[own] *= np.sqrt(share[own[np.argmax(values[own])]])
-    return values
+    left = np.argsort(-values, kind="stable")
+    ranked: Matrix = values.copy()
+    while len(left):
+        near = rotation_distance_deg(ends[left], ends[left[0]]) <= AROUND_DEG
+        ranked[left[near]] *= np.sqrt(share[left[0]])
+        left = left[~near]
+    return ranked
 
 
 def around(T: Matrix, config: GuessConfig, seed: int) -> Matrix:

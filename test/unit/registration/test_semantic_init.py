@@ -16,11 +16,11 @@ from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.classes import Hypothesis
-from calib_ros.registration.initial_guess import allowed, poses
+from calib_ros.registration.initial_guess import allowed, near_lidar, poses, rotation_distance_deg
 from calib_ros.registration.motion_guess.registration import best_registration, search_boxes
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
-from calib_ros_semantics.first_guess.centroids import agreed_poses, find_pairs
+from calib_ros_semantics.first_guess.centroids import LEFT, RIGHT, SAME_DEG, STARTS, agreed_poses, find_pairs
 from calib_ros_semantics.first_guess.guess import CANDIDATES, CENTROIDS, OTHER_WAY_DEG, first_guess
 from calib_ros_semantics.first_guess.score import class_score, label_score, refine_positions
 from calib_ros_semantics.first_guess.view import ClassView, class_view
@@ -142,10 +142,40 @@ def test_centroids_need_no_sweep_and_say_what_they_miss(street_views) -> None:
     found = first_guess([turned(v, 120)[0] for v in views], sweep=False)
     assert_near(T @ turned(views[0], 120)[1], found[0].T, 2.0, 0.5)
     assert {h.kind for h in found} == {CENTROIDS}
-    surfaces = [replace(v, label=np.where(v.label < C.BUILDING, UNLABELLED, v.label).astype(np.uint8)) for v in views]
-    with pytest.raises(TooFewFeaturesError, match=r"3 whole objects .* of \d+ in the images 0 may be in the clouds"):
-        first_guess(surfaces, sweep=False)
-    assert first_guess(surfaces[:1])[0].kind == "sweep"  # which needs none
+    nothing = [replace(v, label=np.where(v.label < C.GROUND, UNLABELLED, v.label)) for v in views]
+    with pytest.raises(TooFewFeaturesError, match=r"3 objects .* of \d+ in the images 0 may be in the clouds"):
+        agreed_poses(find_pairs(nothing, GuessConfig()), GuessConfig(), 0)
+    assert not find_pairs(nothing, GuessConfig()).per_object(T[None]).any()
+
+
+@pytest.mark.parametrize(("yaw", "columns", "kind"), [(75.0, (0, 200), RIGHT), (-75.0, (440, 640), LEFT), (75.0, (0, 640), None)])
+def test_of_a_row_that_the_border_cuts_the_end_in_view_counts(yaw: float, columns: tuple[int, int], kind: int | None) -> None:
+    """A row of 110 deg in the cloud, of which the image shows one end, or the middle."""
+    azimuth, z = (a.ravel() for a in np.meshgrid(np.deg2rad(np.arange(yaw - 55, yaw + 55, 0.4)), np.arange(-1, 1, 0.2)))
+    cloud = PointCloud(
+        np.c_[10 * np.cos(azimuth), 10 * np.sin(azimuth), z].astype(np.float32), label=np.full(len(z), C.VEHICLE, np.uint8)
+    )
+    classes = np.full((CAMERA.height, CAMERA.width), C.SKY, np.uint8)
+    classes[90:150, columns[0] : columns[1]] = C.VEHICLE
+    pairs = find_pairs([class_view(cloud, classes, CAMERA)], GuessConfig())
+    assert pairs.cls.tolist() == ([] if kind is None else [C.VEHICLE + kind])
+    if kind is not None:
+        end = poses(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros((1, 3)))[0, :3, :3] @ pairs.point[0]
+        assert np.rad2deg(np.arccos(end @ pairs.ray[0] / np.linalg.norm(end))) < 2.0
+
+
+def test_optimisations_reach_every_allowed_place() -> None:
+    T = poses(np.full(6, 0.3), np.zeros(6), np.zeros(6), 1.9 * np.r_[np.eye(3), -np.eye(3)])
+    assert allowed(T, GuessConfig()).all()
+    assert np.array([near_lidar(own, GuessConfig()).clip(own) for own in T]) == pytest.approx(T)
+
+
+def test_rotations_that_fewer_pairs_agree_on_follow_for_the_maps_to_judge(street_views) -> None:
+    pairs = find_pairs(street_views[0], GuessConfig())
+    found = agreed_poses(pairs, GuessConfig(), 0)
+    assert len(found) > 5 * STARTS
+    assert pairs.per_object(found[:1]) > 2 * pairs.per_object(found[STARTS:]).max()
+    assert rotation_distance_deg(found[STARTS:-1], found[-1]).min() > SAME_DEG[0]
 
 
 @pytest.mark.parametrize(("yaw", "wrong"), [pytest.param(180.0, 0, marks=pytest.mark.slow), (25.0, 40)])
