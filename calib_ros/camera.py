@@ -26,6 +26,7 @@ ALIASES = {
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
 }
+MAX_SKEW_PX = 0.5  # of a pixel at the image's border, which no edge shows; OpenCV has none in its models
 MAX_SIDE = 32766  # px; OpenCV cannot rectify larger images
 MIN_DEPTH = 0.1  # m; nearer points are out of focus, and 1/z diverges
 CYLINDER = "cylinder"  # model of images on a cylinder about the camera's y axis; not a lens, but what wide ones are shown on
@@ -60,6 +61,13 @@ class Camera:
                 f"CameraInfo: focal lengths fx={K[0, 0]:g}, fy={K[1, 1]:g} must be positive; "
                 "calibrate the camera's intrinsics first"
             )
+        skew = abs(K[0, 1]) * self.height / K[1, 1]
+        if skew > MAX_SKEW_PX or K[1, 0] or K[2, 0] or K[2, 1]:
+            why = (
+                f"its skew moves pixels by {skew:.1f} px; rectify the images" if skew > MAX_SKEW_PX else "its lower left is not 0"
+            )
+            raise BadInputError(f"CameraInfo: K must be [fx 0 cx; 0 fy cy; 0 0 1], but {why}")
+        K[0, 1] = 0.0
         if self.width <= 0 or self.height <= 0:
             raise BadInputError(f"CameraInfo: image size {self.width}x{self.height} must be positive")
         if max(self.width, self.height) > MAX_SIDE:

@@ -175,6 +175,8 @@ def test_unusable_intrinsics_are_refused():
         ({"K": np.diag([-400.0, 400, 1])}, "fx=-400"),
         ({"K": K.ravel()}, "3x3"),
         ({"K": np.where(K == 1, np.nan, K)}, "finite"),
+        ({"K": K + np.eye(3, k=1) * [[0, 5, 0]]}, r"skew moves pixels by \d"),
+        ({"K": K.T}, "lower left is not 0"),
         ({"width": 0}, "0x480"),
         ({"model": "mei"}, "'mei' is not supported.*plumb_bob"),
         ({"D": np.ones(8)}, "4 or 5 distortion coefficients, got 8"),
@@ -185,6 +187,12 @@ def test_unusable_intrinsics_are_refused():
         with pytest.raises(BadInputError, match=says) as caught:
             Camera(**{"K": K, "width": 640, "height": 480, "model": "plumb_bob", **change})
         assert "\n" not in str(caught.value)
+
+
+def test_a_skew_that_no_edge_shows_is_left_out():
+    K_skewed = K + np.eye(3, k=1) * [[0, 1e-4, 0]]
+    for D in (np.zeros(0), np.full(4, 0.01)):
+        assert np.array_equal(Camera(K_skewed, 640, 480, D=D).K, K)
 
 
 def test_names_that_drivers_use_zero_coefficients_and_equality():
