@@ -44,7 +44,7 @@ class ThesisScore:
         self, features: Sequence[ThesisFeatures], T_prior: Matrix, config: Config, weights: Sequence[float] | None = None
     ):
         if not features:
-            raise TooFewFeaturesError("no frame to score; give at least one")
+            raise TooFewFeaturesError("no frame can be used; give others")
         self.features, self.thesis, self.camera = features, thesis_of(config), features[0].camera
         self.n_frames, self.n_levels = len(features), len(self.thesis.smoothing)
         self.frame_weights = _frame_weights(weights, len(features))

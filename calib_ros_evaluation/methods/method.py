@@ -162,7 +162,7 @@ def near(features: Sequence[Points], T: Matrix, margin: float, least: int, what:
     TooFewFeaturesError without a frame, or for fewer than `least` points per frame. what: for people.
     """
     if not features:
-        raise TooFewFeaturesError("no frame to score; give at least one")
+        raise TooFewFeaturesError("no frame can be used; give others")
     kept = [near_image(f.xyz, T, f.camera, margin) for f in features]
     require(sum(map(len, kept)), least * len(features), what, "check the initial extrinsic")
     return kept

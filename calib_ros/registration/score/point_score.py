@@ -251,7 +251,7 @@ class FastScore(PointScore):
         observer: Observer | None = None,
     ) -> None:
         if not features:
-            raise TooFewFeaturesError("no frame to score; give at least one")
+            raise TooFewFeaturesError("no frame can be used; give others")
         camera, margin = features[0].camera, MARGIN if margin is None else margin
         kept = [f.points.select(near_image(f.points.xyz, T_prior, camera, margin)) for f in features]
         frame = np.concatenate([np.full(len(p), j, np.int32) for j, p in enumerate(kept)])
