@@ -7,7 +7,7 @@ import sys
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -17,6 +17,7 @@ from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from calib_ros import io
 from calib_ros.errors import BadInputError
 from calib_ros.messages.livox import CUSTOM_MSG, CUSTOM_POINT, LIVOX
 
@@ -116,13 +117,12 @@ class BagParts:
                 lost.append(f"{part.name} ({' '.join(str(error).split()) or type(error).__name__})")
         if not readers or (lost and len(parts) == 1):
             raise ReaderError(", ".join(lost))
-        lost += [f"{reader.path.name} (empty)" for reader in readers if not reader.message_count]
-        missing = "Some database files are missing" in "".join(self.remarks)
-        if (lost or missing) and not incomplete:
-            what = ", ".join(lost) or self.remarks[-1].partition("[")[2].partition("]")[0]
+        lost += [f"{reader.path.name} (empty)" for reader in readers if len(parts) > 1 and not reader.message_count]
+        lost += [f"{name} (missing)" for name in _listed(path / METADATA) if not (path / name).exists()]
+        if lost and not incomplete:
             raise BadInputError(
-                f"bag {path}: {len(readers)} parts are there, but not {what}; copy the whole folder, or use what is left by "
-                "--incomplete"
+                f"bag {path}: {len(readers)} parts are there, but not {', '.join(lost)}; copy the whole folder, or use what is "
+                "left by --incomplete"
             )
         self.remarks += [f"bag {path.name}: without {part}" for part in lost]
         return sorted(readers, key=lambda reader: int(reader.start_time))
@@ -140,6 +140,14 @@ class BagParts:
         reader.open()
         self._stack.callback(_close, reader)
         return reader
+
+
+def _listed(metadata: Path) -> list[str]:
+    """Names of the files that a bag should have; none where its metadata.yaml does not tell."""
+    with suppress(Exception):
+        paths = io.load(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [PurePath(path).name for path in paths]
+    return []
 
 
 def _close(reader: Any) -> None:
