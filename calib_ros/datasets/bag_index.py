@@ -21,6 +21,7 @@ Span = tuple[int, int]  # [start, stop) of recording times, ns
 MAX_KEPT = 256 * 2**20  # bytes of messages held in memory: thirty frames of 2 Mpx in colour with their clouds
 AUTO, HEADER, RECORDING = CLOCKS = "auto", "header", "recording"
 MAX_LATENCY = NANOSECONDS  # usually, from a sensor to the recorder
+QUICKEST = 0.9
 LONGEST_QUEUE = 60 * NANOSECONDS  # that messages wait in; what differs by more are clocks
 LONG_AGO_S = 1e7
 # Where static transforms are repeated more often than this, those at the bag's beginning and before the windows are enough.
@@ -187,7 +188,9 @@ def clock_difference(image: TopicIndex, cloud: TopicIndex) -> int:
     took long to be recorded would look alike. Whole seconds where it is a difference of time scales."""
     if not len(image) or not len(cloud):
         return 0
-    of_clouds, of_images = (int((index.headers - index.recorded).max()) for index in (cloud, image))
+    # Of the quickest messages, but for a few with wrong stamps.
+    early = (np.quantile(index.headers - index.recorded, QUICKEST, method="lower") for index in (cloud, image))
+    of_clouds, of_images = map(int, early)
     ahead = of_clouds - of_images
     known = time_scales(ahead / NANOSECONDS)
     if known is not None:

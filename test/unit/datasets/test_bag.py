@@ -350,6 +350,7 @@ def test_clocks_that_differ_are_told_from_messages_that_come_late(tmp_path, ahea
             record.image(at, value=i, time=at + 20 * MS)
             record.info(at)
             record.cloud(at + round(ahead_s * 1e9), value=i, time=at + 20 * MS + round(queue_s * 1e9))
+        record.cloud(2 * 10**18, value=60, time=START + 6000 * MS)  # one wrong stamp
     bag = BagSource(tmp_path / "bag")
     assert [remark for remark in bag.remarks if cause not in remark] == []
     assert len(bag.remarks) == (1 if found_s else 0)
