@@ -47,7 +47,7 @@ def test_bad_recordings_are_rows(bad: Path) -> None:
     messages = {row.recording: row.message for row in fleet.rows}
     assert "found nothing" in messages["empty"]
     assert "cannot be read" in messages["garbage.mcap"]
-    assert "rosbags-convert" in messages["old.bag"]
+    assert "cannot be read" in messages["old.bag"]
     assert told[-1] == (3, 3)
     assert {path.name for path in fleet.files} >= {"fleet.html", "fleet.csv", "changes.csv"}
     assert all(path.stat().st_size for path in fleet.files)
