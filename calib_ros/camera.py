@@ -26,6 +26,7 @@ ALIASES = {
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
 }
+NOISE = 1e-9  # of the largest element of K, that may be left where 0 should be
 MAX_SKEW_PX = 0.5  # of a pixel at the image's border, which no edge shows; OpenCV has none in its models
 MAX_SIDE = 32766  # px; OpenCV cannot rectify larger images
 MIN_DEPTH = 0.1  # m; nearer points are out of focus, and 1/z diverges
@@ -62,11 +63,13 @@ class Camera:
                 "calibrate the camera's intrinsics first"
             )
         skew = abs(K[0, 1]) * self.height / K[1, 1]
-        if skew > MAX_SKEW_PX or K[1, 0] or K[2, 0] or K[2, 1]:
+        lower = np.tril(K, -1)
+        if skew > MAX_SKEW_PX or np.abs(lower).max() > NOISE * np.abs(K).max():
             why = (
                 f"its skew moves pixels by {skew:.1f} px; rectify the images" if skew > MAX_SKEW_PX else "its lower left is not 0"
             )
             raise BadInputError(f"CameraInfo: K must be [fx 0 cx; 0 fy cy; 0 0 1], but {why}")
+        K -= lower
         K[0, 1] = 0.0
         if self.width <= 0 or self.height <= 0:
             raise BadInputError(f"CameraInfo: image size {self.width}x{self.height} must be positive")

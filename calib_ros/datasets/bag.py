@@ -24,7 +24,6 @@ from calib_ros.datasets.bag_file import (
 from calib_ros.datasets.bag_index import (
     AUTO,
     CLOCKS,
-    HEADER,
     MAX_KEPT,
     MAX_LATENCY,
     RECORDING,
@@ -129,10 +128,12 @@ class BagSource:
         gap = int(np.abs(moments[nearest_index(moments, image.stamps)] - image.stamps).min())
         if gap <= MAX_LATENCY:
             advice = "synchronise the sensors' clocks or raise tolerance_s"
-        elif self._clock == HEADER:
-            advice = "let --clock auto or recording pair them by when they were recorded"
-        else:
+        elif image.recorded.min() > self._index.cloud.recorded.max() or self._index.cloud.recorded.min() > image.recorded.max():
             advice = "they were recorded at different times; record them together"
+        elif self._index.clock_difference:
+            advice = "--clock header pairs them by their stamps as they are"
+        else:
+            advice = "synchronise the sensors' clocks, or pair by the times of recording: --clock recording"
         return (
             f"bag {self.path}: no message of {self.points_topic} within {self._tolerance / NANOSECONDS:g} s of one of "
             f"{self.image_topic} (the nearest is {gap / NANOSECONDS:.3f} s away); {advice}"

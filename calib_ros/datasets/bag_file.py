@@ -202,7 +202,10 @@ def choose_image(bag: BagFile, requested: str | None) -> str:
 
 def choose_points(bag: BagFile, requested: str | None) -> str:
     """The cloud topic: the requested one, or the only one."""
-    return _choose(bag, requested, _with_type(bag, POINTS, *LIVOX), "PointCloud2", "points_topic")
+    candidates = _with_type(bag, POINTS)
+    if requested is not None or not candidates:
+        candidates += _with_type(bag, *LIVOX)
+    return _choose(bag, requested, candidates, "PointCloud2", "points_topic")
 
 
 def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str) -> str:
@@ -222,8 +225,9 @@ def is_rectified(image_topic: str) -> bool:
 def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: str, option: str) -> str:
     if requested is not None:
         name = "/" + requested.strip("/")
-        if name in candidates:
-            return name
+        for own in (name, name[1:]):  # topics of ROS 1 may have no slash
+            if own in candidates:
+                return own
         has = f"it has {', '.join(candidates)}" if candidates else "it has none"
         raise BadInputError(f"bag {bag.path} has no {kind} messages on topic {name}; {has}; set {option} accordingly")
     if len(candidates) == 1:

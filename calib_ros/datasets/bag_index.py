@@ -186,11 +186,14 @@ class TopicIndex:
 def clock_difference(image: TopicIndex, cloud: TopicIndex) -> int:
     """How far the clock that stamps the clouds is ahead of the images', ns, by when messages were recorded; 0 where messages that
     took long to be recorded would look alike. Whole seconds where it is a difference of time scales."""
-    if not len(image) or not len(cloud):
+    both = [index for index in (cloud, image) if len(index)]
+    start, stop = max(index.recorded.min() for index in both), min(index.recorded.max() for index in both)
+    # Recorded at the same time, since not every recorder keeps to real time.
+    ahead_of = [(i.headers - i.recorded)[(start <= i.recorded) & (i.recorded <= stop)] for i in both]
+    if len(both) < 2 or not all(map(len, ahead_of)):
         return 0
     # Of the quickest messages, but for a few with wrong stamps.
-    early = (np.quantile(index.headers - index.recorded, QUICKEST, method="lower") for index in (cloud, image))
-    of_clouds, of_images = map(int, early)
+    of_clouds, of_images = (int(np.quantile(own, QUICKEST, method="lower")) for own in ahead_of)
     ahead = of_clouds - of_images
     known = time_scales(ahead / NANOSECONDS)
     if known is not None:

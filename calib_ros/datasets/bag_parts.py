@@ -45,7 +45,11 @@ def typestore() -> Typestore:
 def storage_files(folder: Path) -> list[Path]:
     """The files of a folder that hold messages, in order, compressed ones among them."""
     files = [file for file in sorted(folder.iterdir(), key=lambda file: (len(file.name), file.name)) if file.is_file()]
-    return [file for file in files if storage_of(file) and not file.name.startswith(".")]
+    names = {file.name for file in files}
+    # Neither what `rosbag compress` and `reindex` keep of a bag, nor what was decompressed already.
+    again = (".orig.bag", ".orig.active")
+    kept = [file for file in files if not file.name.startswith(".") and not file.name.endswith(again)]
+    return [file for file in kept if storage_of(file) and not (file.suffix == COMPRESSED and file.stem in names)]
 
 
 def storage_of(file: Path) -> str:

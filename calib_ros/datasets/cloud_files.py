@@ -29,8 +29,8 @@ UNNAMED = "#$%&~~"  # what pypcd4 calls PCD's padding fields, "_"
 PCD_DATA = re.compile(rb"^DATA[ \t]+(\w+)[^\n]*\n", re.MULTILINE)
 PCD_LINES = [re.compile(rb"^%s[ \t]+([^\n]*)" % name, re.MULTILINE) for name in (b"FIELDS", b"SIZE", b"TYPE", b"COUNT")]
 TEXT_NAMES = ("x", "y", "z", "intensity")  # of columns without a header
+TEXT_SUFFIXES = (".csv", ".txt", ".xyz", ".asc", ".pts")
 COMMENTS = ("#", "//")
-A_NAME = re.compile(r"\b(?!(nan|inf|infinity)\b)[a-z_]", re.IGNORECASE)
 # Formats of clouds that are not read, and with what they become one that is.
 FOREIGN = {
     ".e57": "E57; convert it: pdal translate FILE.e57 FILE.pcd",
@@ -135,18 +135,30 @@ def _check_las(path: Path) -> None:
 
 
 def _read_text(path: Path) -> Columns:
-    """Text of a point a line, between commas, semicolons or blanks: by the names in its first line, or x, y, z, intensity."""
-    split = re.compile(r"\s*[,;]\s*|\s+").split
+    """Text of a point a line, between commas, semicolons or blanks: by the first line that names x, y and z, or x, y, z,
+    intensity. A word that is no number is NaN."""
     lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
-    headers = [split(line.lstrip("#/ ")) for line in lines if A_NAME.search(line)]
-    lines = [line for line in lines if line and not line.startswith(COMMENTS) and not A_NAME.search(line)]
-    if lines and lines[0].isdecimal() and int(lines[0]) == len(lines) - 1:
-        del lines[0]  # the number of points
-    columns = len(split(lines[0])) if lines else len(TEXT_NAMES)
-    named = next((header for header in headers if len(header) == columns), TEXT_NAMES[:columns])
-    names = [name.strip("\"'") for name in named]
-    rows = np.array([[float(word or "nan") for word in split(line)[: len(names)]] for line in lines]).reshape(-1, len(names))
+    if any(";" in line for line in lines):  # where commas are decimal
+        lines = [line.replace(",", ".") for line in lines]
+    split = re.compile(r"\s*;\s*|\s+" if any(";" in line for line in lines) else r"\s*,\s*|\s+").split
+    headers = [[name.strip("\"'").lower() for name in split(line.lstrip("#/ "))] for line in lines]
+    at = next((k for k, header in enumerate(headers) if {*"xyz"} <= {*header}), None)
+    points = [line for k, line in enumerate(lines) if line and k != at and not line.startswith(COMMENTS)]
+    if points and points[0].isdecimal() and int(points[0]) == len(points) - 1:
+        del points[0]  # the number of points
+    columns = len(split(points[0])) if points else len(TEXT_NAMES)
+    names = list(TEXT_NAMES[:columns]) if at is None else headers[at]
+    rows = np.array([[_number(word) for word in split(line)[: len(names)]] for line in points]).reshape(-1, len(names))
+    if len(rows) and not np.isfinite(rows).any():
+        raise BadInputError(f"cloud {path} has no numbers; give a point a line, x y z intensity, or a first line with names")
     return dict(zip(names, rows.T, strict=True))
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return np.nan
 
 
 def _read_ply(path: Path) -> Columns:
@@ -192,6 +204,6 @@ def _require_all(path: Path, found: int, declared: int) -> None:
 _READERS: dict[str, Callable[[Path], Columns]] = {
     **{".pcd": _read_pcd, ".ply": _read_ply, ".npz": _read_npz},
     **dict.fromkeys((".las", ".laz"), _read_las),
-    **dict.fromkeys((".csv", ".txt", ".xyz", ".asc", ".pts"), _read_text),
+    **dict.fromkeys(TEXT_SUFFIXES, _read_text),
 }
 CLOUD_SUFFIXES = (*_READERS, ".bin")

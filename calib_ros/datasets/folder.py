@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib_ros import io, se3
 from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
-from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, FOREIGN, read_cloud
+from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, FOREIGN, TEXT_SUFFIXES, read_cloud
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
@@ -26,6 +26,7 @@ from calib_ros.messages.wire import shown
 IMAGES, CLOUDS, CALIBRATION, TIMES = "images", "clouds", "calibration.yaml", "times.csv"
 EXPECTED_FOLDER = f"{IMAGES}/, {CLOUDS}/ and {CALIBRATION} (plain folder)"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+BESIDE = (*TEXT_SUFFIXES, ".tif", ".tiff", ".webp")  # beside a file of another format, they are of something else
 PERIOD_NS = NANOSECONDS // 10  # between frames without times.csv: most scanners turn at 10 Hz
 MAX_STAMP = 2**63
 SHOWN_NAMES = 5  # of files without partner
@@ -130,7 +131,11 @@ def named_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
             continue
-        if path.stem in found:
+        first = found.get(path.stem)
+        if first is not None and (path.suffix in BESIDE) != (first.suffix in BESIDE):
+            found[path.stem] = first if path.suffix in BESIDE else path
+            continue
+        if first is not None:
             raise BadInputError(f"{folder}: {found[path.stem].name} and {path.name} are of the same frame; keep one of them")
         found[path.stem] = path
     return found

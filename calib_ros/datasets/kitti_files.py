@@ -60,9 +60,12 @@ def read_points(path: Path, columns: Sequence[int]) -> NDArray[np.float32]:
     except OSError as error:
         raise BadInputError(f"scan {path} cannot be read ({error.strerror}); check the file") from error
     gaps = {k: _gap(values[: k * SAMPLED].reshape(-1, k)[:, :3]) for k in columns if size and size % (4 * k) == 0}
-    chosen = min(gaps, key=lambda k: gaps[k] * (1.0 if k == columns[0] else CLEARLY), default=0)
-    if not chosen or (chosen != columns[0] and gaps[chosen] > SAME_SCAN):
-        raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {4 * columns[0]}; copy it again")
+    usual = columns[0]
+    chosen = usual if gaps.get(usual, np.inf) <= SAME_SCAN else min(gaps, key=lambda k: gaps[k], default=0)
+    if usual in gaps and gaps[chosen] * CLEARLY > gaps[usual]:
+        chosen = usual
+    if not chosen or (chosen != usual and gaps[chosen] > SAME_SCAN):
+        raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {4 * usual}; copy it again")
     return values.reshape(-1, chosen)
 
 

@@ -81,8 +81,13 @@ open_source = open_dataset  # the former name
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a bag of ROS 1 or 2, intact or not."""
-    files = [path] if path.is_file() else list(path.iterdir()) if path.is_dir() else []
-    return any(file.name == "metadata.yaml" or file.name.removesuffix(".zstd").endswith(BAG_FILES) for file in files)
+    if path.is_file():
+        return path.name.removesuffix(".zstd").endswith(BAG_FILES)
+    names = {file.name.removesuffix(".zstd") for file in path.iterdir() if file.is_file()} if path.is_dir() else set()
+    if "metadata.yaml" in names or any(name.endswith((".mcap", ".db3")) for name in names):
+        return True
+    # Beside ROS 1 bags lie the data sets that were made from them, or the other way round.
+    return any(name.endswith(".bag") for name in names) and not is_folder_dataset(path) and find_drive(path) is None
 
 
 def is_single(path: Path) -> bool:

@@ -79,7 +79,8 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
     middle = float(np.median(distance[:: 1 + len(distance) // 4096]))
     if middle > FARTHEST_MEDIAN_M:
         raise TooFewFeaturesError(
-            f"half of the points are {middle:.0f} m away or more, as if their coordinates were in millimetres; give metres"
+            f"half of the points are {middle:.0f} m away or more, as if their coordinates were in millimetres, "
+            "or of a map; give metres in the LiDAR's frame"
         )
     if hangs_upside_down(own):
         pose, own = pose.turned_over(), own * np.array([1, -1, -1], np.float32)

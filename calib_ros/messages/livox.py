@@ -20,15 +20,15 @@ OFFSETS, SIZE, STRIDE = (0, 4, 8, 12, 16, 17, 18), 19, 20
 
 def decode_livox(data: bytes) -> PointCloud:
     """CDR bytes of a CustomMsg -> PointCloud with times, lines and reflectivity. Raises BadInputError for a truncated message."""
-    order = "<" if data[1] & 1 else ">"
     try:
+        order = "<" if data[1] & 1 else ">"
         seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
         at = -(-(12 + length) // 8) * 8  # the time base is aligned; offsets count from behind the first four bytes
         (count,) = struct.unpack_from(order + "I", data, 4 + at + 16)
         begin = 4 + at + 20
         if begin + max(count * STRIDE - (STRIDE - SIZE), 0) > len(data):
             raise BadInputError(f"CustomMsg: {len(data)} bytes are too few for {count} points; the message is truncated")
-    except struct.error:
+    except (struct.error, IndexError):
         raise BadInputError(f"CustomMsg: {len(data)} bytes are no whole message; record the bag again") from None
     kinds = [order + kind for kind in FIELDS.values()]
     layout = np.dtype({"names": list(FIELDS), "formats": kinds, "offsets": OFFSETS, "itemsize": STRIDE})

@@ -21,6 +21,7 @@ TIFF = {b"II*\0": "<", b"MM\0*": ">"}  # with the byte order
 RIFF, WEBP = b"RIFF", b"WEBP"
 # Tags of a TIFF: its size, and where its strips or tiles are, with their lengths. Types of their values by number.
 TIFF_SIZE, TIFF_PARTS = (256, 257), ((273, 279), (324, 325))
+TIFF_TAGS = (*TIFF_SIZE, *TIFF_PARTS[0], *TIFF_PARTS[1])
 TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
 # Markers of a start of frame: 0xC0 to 0xCF without the tables and the extension among them.
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -101,14 +102,14 @@ def _tiff_header(data: memoryview) -> tuple[int, int, int] | None:
         tags: dict[int, tuple[int, ...]] = {}
         for entry in range(at + 2, at + 2 + 12 * count, 12):
             tag, kind, number = struct.unpack_from(order + "HHI", data, entry)
-            if kind in TIFF_TYPES and number <= len(data):
+            if tag in TIFF_TAGS and kind in TIFF_TYPES and number <= len(data):
                 values = f"{order}{number}{TIFF_TYPES[kind]}"
                 place = entry + 8 if struct.calcsize(values) <= 4 else struct.unpack_from(order + "I", data, entry + 8)[0]
                 tags[tag] = struct.unpack_from(values, data, place)
         offsets, lengths = next((tags[own], tags[sizes]) for own, sizes in TIFF_PARTS if own in tags)
         complete = all(offset + length <= len(data) for offset, length in zip(offsets, lengths, strict=True))
         return (tags[TIFF_SIZE[0]][0], tags[TIFF_SIZE[1]][0], 8) if complete else None
-    except (struct.error, KeyError, ValueError, StopIteration):
+    except (struct.error, KeyError, IndexError, ValueError, StopIteration):
         return None
 
 

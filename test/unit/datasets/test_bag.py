@@ -360,13 +360,32 @@ def test_clocks_that_differ_are_told_from_messages_that_come_late(tmp_path, ahea
     as_stamped = {"header": ahead_s, "recording": queue_s}
     for clock, offset_s in as_stamped.items():
         if abs(offset_s) > 10:
-            with pytest.raises(BadInputError, match="--clock auto"):
+            with pytest.raises(BadInputError, match="--clock recording"):
                 BagSource(tmp_path / "bag", clock=clock)
         else:
             own = BagSource(tmp_path / "bag", clock=clock)
             assert int(own[0].cloud.xyz[0, 0]) == max(0, round(-10 * offset_s))
     with pytest.raises(BadInputError, match="must be one of auto, header, recording"):
         BagSource(tmp_path / "bag", clock="sensor")
+
+
+def test_recorders_that_do_not_keep_to_real_time_move_no_clock(tmp_path):
+    """Messages that were written again later, one topic after the other or at another rate, with their stamps as they were."""
+    for name, image_at, cloud_at in (
+        ("again", lambda s: s, lambda s: s + 10**16),
+        ("in turn", lambda s: 5 * s, lambda s: 5 * s + 200 * 10**9),
+        ("twice as fast", lambda s: s // 2, lambda s: s // 2),
+    ):
+        with Recorder(tmp_path / name) as record:
+            for i in range(60):
+                at = i * 10**9
+                record.image(START + at, time=START + image_at(at), value=i)
+                record.info(START + at, time=START + image_at(at))
+                if i < 30 or name != "twice as fast":
+                    record.cloud(START + at, time=START + cloud_at(at), value=i)
+        bag = BagSource(tmp_path / name)
+        assert bag.remarks == ()
+        assert int(bag[7].cloud.xyz[0, 0]) == int(bag[7].image[0, 0]) == 7
 
 
 def test_several_topics_of_a_type_need_a_choice(tmp_path):

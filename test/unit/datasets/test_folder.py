@@ -185,6 +185,41 @@ def test_formats_of_surveyors(tmp_path, name):
     assert np.corrcoef(found.intensity, columns["intensity"])[0, 1] > 0.999
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x,y,z,label\n1,2,3,car\n4,5,6,7\n", [[1, 2, 3], [4, 5, 6]]),
+        ("x;y;z;intensity\n1,5;2,25;3,5;7\n", [[1.5, 2.25, 3.5]]),
+        ("# frame 12 of it\n# x y z i\n1 2 3 4\n", [[1, 2, 3]]),
+        ("1.e+00 2.e+00 3.E0 4\n", [[1, 2, 3]]),
+        ("// from a tool\n1\t2\t3\n\n4\t5\tnan\n", [[1, 2, 3], [4, 5, np.nan]]),
+    ],
+)
+def test_text_clouds_as_tools_write_them(tmp_path, text, expected):
+    (tmp_path / "a.txt").write_text(text)
+    assert np.array_equal(read_cloud(tmp_path / "a.txt").xyz, np.array(expected, np.float32), equal_nan=True)
+    (tmp_path / "a.txt").write_text("what\nis this\n")
+    with pytest.raises(BadInputError, match=r"cloud .*txt"):
+        read_cloud(tmp_path / "a.txt")
+
+
+def test_text_and_pictures_beside_frames_are_of_something_else(folder):
+    for name in ("clouds/2.txt", "clouds/10.csv", "images/2.tif"):
+        (folder / name).write_text("labels")
+    assert len(open_dataset(folder)) == 2
+    (folder / "2011.bag").write_bytes(b"#ROSBAG V2.0")  # what it was made from
+    assert isinstance(open_dataset(folder), FolderSource)
+
+
+def test_a_scan_in_firing_order_keeps_all_its_points(tmp_path):
+    """Of lasers that alternate between up and down: every second point is nearer than the next one."""
+    azimuth, elevation = np.linspace(0, 2 * np.pi, 1000).repeat(16), np.tile(np.arange(-15, 16, 2).reshape(2, 8).T.ravel(), 1000)
+    e = np.deg2rad(elevation)
+    xyz = 8 * np.stack([np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)], axis=1)
+    np.hstack([xyz, np.ones((len(xyz), 1))]).astype("<f4").tofile(tmp_path / "a.bin")
+    assert len(read_cloud(tmp_path / "a.bin")) == len(xyz)
+
+
 @pytest.mark.parametrize("more", [0, 1, 2, 3, 4])
 def test_scans_of_more_numbers_than_four_are_recognised(tmp_path, more):
     """Along a ring, neighbours are near each other; other numbers taken for coordinates are not."""
