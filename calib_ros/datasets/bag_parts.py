@@ -7,6 +7,7 @@ import sys
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
 from functools import cache
+from itertools import pairwise
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,6 +20,7 @@ from rosbags.typesys.store import Typestore
 
 from calib_ros import io
 from calib_ros.errors import BadInputError
+from calib_ros.frame import NANOSECONDS
 from calib_ros.messages.livox import CUSTOM_MSG, CUSTOM_POINT, LIVOX
 
 if sys.version_info >= (3, 14):
@@ -28,6 +30,8 @@ else:  # what rosbags itself requires
 
 METADATA, COMPRESSED = "metadata.yaml", ".zstd"
 STORAGE = {".mcap": "mcap", ".db3": "sqlite3", ".bag": "ROS 1"}
+# ns, between parts of one recording: a recorder opens the next file where it closes the last one.
+MAX_OVERLAP, MAX_PAUSE = NANOSECONDS, 60 * NANOSECONDS
 ZSTD = b"\x28\xb5\x2f\xfd"  # begins what is compressed; a message begins with 0 and its byte order
 
 
@@ -129,7 +133,16 @@ class BagParts:
                 "left by --incomplete"
             )
         self.remarks += [f"bag {path.name}: without {part}" for part in lost]
-        return sorted(readers, key=lambda reader: int(reader.start_time))
+        readers.sort(key=lambda reader: int(reader.start_time))
+        filled = [reader for reader in readers if reader.message_count]
+        for one, other in pairwise(filled):
+            pause, shorter = other.start_time - one.end_time, min(one.duration, other.duration)
+            if pause < -min(MAX_OVERLAP, shorter // 2) or (pause > MAX_PAUSE and not incomplete):
+                raise BadInputError(
+                    f"bag {path}: {one.path.name} and {other.path.name} are not parts of one recording by their times, and no "
+                    f"{METADATA} says so; open one of the files"
+                )
+        return readers
 
     def _opened(self, file: Path) -> Any:
         if file.suffix == COMPRESSED:

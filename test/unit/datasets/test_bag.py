@@ -579,6 +579,10 @@ def test_a_bag_is_read_without_its_metadata(tmp_path, storage):
     bag = BagSource(first)
     assert [bag[i].stamp for i in range(6)] == [made.stamp for own in parts for made in own]
     assert bag.remarks == ()
+    copy = first / f"copy{file.suffix}"
+    copy.write_bytes(storage_of(first).read_bytes())
+    assert "open one of the files" in use(first)
+    copy.unlink()
     packed.write_bytes(packed.read_bytes()[:100])
     assert packed.name in use(first)
     assert "--incomplete" in use(first)
