@@ -17,7 +17,7 @@ import scipy
 import yaml
 
 from calib_ros import __version__, result
-from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_source, topics
+from calib_ros.cli.inputs import bag_options, configuration, initial_extrinsic, open_named_source
 from calib_ros.cli.output import note, pose, progress_bar
 from calib_ros.datasets.kitti import drives_in
 from calib_ros.datasets.open import is_single
@@ -105,7 +105,7 @@ def setup_of(args: argparse.Namespace) -> Setup:
     reference: tuple[tuple[float, ...], ...] = ()
     if args.reference is not None:
         reference = tuple(map(tuple, result.load(args.reference).T_camera_lidar.tolist()))
-    chosen = tuple(topics(args).items())
+    chosen = tuple(bag_options(args).items())
     scenes = (SourceSpec(label, path, args.camera, chosen, reference) for label, path in zip(labels(paths), paths, strict=True))
     return Setup(tuple(scenes), configuration(args.config, preset_name=args.preset))
 

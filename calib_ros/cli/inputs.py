@@ -153,7 +153,7 @@ def _within(half: Axes, limit: tuple[float, ...]) -> Three:
 
 def open_named_source(args: argparse.Namespace, config: Config | None = None) -> Source:
     """The source given on the command line. config: by which the images and clouds of a bag are paired, as the node does it."""
-    options: dict[str, object] = {**topics(args)}
+    options: dict[str, object] = {**bag_options(args)}
     if config is not None and is_bag(Path(args.source).expanduser()):
         options |= {"motion": config.motion, "tolerance_s": config.online.pair_tolerance_s}
         initial = getattr(args, "initial", "reference")
@@ -167,7 +167,7 @@ def open_named_source(args: argparse.Namespace, config: Config | None = None) ->
     return source
 
 
-def topics(args: argparse.Namespace) -> dict[str, Any]:
+def bag_options(args: argparse.Namespace) -> dict[str, Any]:
     """What the command line says of a bag: its topics, clock, and whether parts may be missing."""
     names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     return {name: getattr(args, name) for name in names if getattr(args, name)}

@@ -120,8 +120,9 @@ class BagSource:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What there is to know about the recording, for people."""
-        ahead = self._index.clock_difference
-        return (*self._bag.remarks, *([difference_in_words(ahead)] if ahead else []))
+        ahead = self._index.clouds_ahead
+        clocks = [difference_in_words(ahead, self._index.clock_difference != 0)] if ahead else []
+        return (*self._bag.remarks, *clocks)
 
     def _no_pairs(self) -> str:
         image, moments = self._index.image, self._index.cloud.stamps + self._sweep_offset

@@ -18,7 +18,7 @@ from calib_ros.arrays import Matrix
 from calib_ros.datasets.bag_parts import METADATA, BagParts, storage_files, storage_of, typestore
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS
-from calib_ros.messages.livox import LIVOX, decode_livox
+from calib_ros.messages.point_fields import LIVOX, decode_livox
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -54,11 +54,8 @@ class BagFile:
     def __init__(self, path: Path, incomplete: bool = False) -> None:
         self.path = path
         self.storage = storage_of(_some_file(path))
-        self._advice = (
-            "recover it with `mcap recover`, copy it again or record it again"
-            if self.storage == "mcap"
-            else "copy it again or record it again"
-        )
+        tool = {"mcap": "recover it with `mcap recover`, ", "ROS 1": "mend it with `rosbag reindex`, "}.get(self.storage, "")
+        self._advice = f"{tool}copy it again or record it again"
         self._types = typestore()
         with self._readable():
             _check_metadata(path / METADATA)

@@ -110,7 +110,9 @@ class BagIndex:
         self.use_headers = self._clock != RECORDING and self.image.has_stamps and self.cloud.has_stamps
         for index in self._by_topic.values():
             index.finish(self.use_headers)
-        self.clock_difference = clock_difference(self.image, self.cloud) if self.use_headers and self._clock == AUTO else 0
+        asked = self.use_headers and self._clock == AUTO
+        self.clouds_ahead, of_clocks = clock_difference(self.image, self.cloud) if asked else (0, False)
+        self.clock_difference = self.clouds_ahead if of_clocks else 0  # that is taken out
         self.cloud.stamps = self.cloud.stamps - self.clock_difference
         self._cameras = [self._found_cameras[i] for i in self.info.order]
         self._references = _references(self._transforms, self.camera_frame, self.lidar_frame)
@@ -183,42 +185,46 @@ class TopicIndex:
         self.recorded: Stamps = recorded[self.order]
 
 
-def clock_difference(image: TopicIndex, cloud: TopicIndex) -> int:
-    """How far the clock that stamps the clouds is ahead of the images', ns, by when messages were recorded; 0 where messages that
-    took long to be recorded would look alike. Whole seconds where it is a difference of time scales."""
-    both = [index for index in (cloud, image) if len(index)]
-    start, stop = max(index.recorded.min() for index in both), min(index.recorded.max() for index in both)
+def clock_difference(image: TopicIndex, cloud: TopicIndex) -> tuple[int, bool]:
+    """How far clouds are stamped ahead of images that were recorded at the same time, ns, 0 up to MAX_LATENCY; and whether that
+    is a difference of the clocks, or may as well be messages that waited. Whole seconds where it is one of time scales."""
+    if not len(image) or not len(cloud):
+        return 0, False
+    start, stop = max(image.recorded.min(), cloud.recorded.min()), min(image.recorded.max(), cloud.recorded.max())
     # Recorded at the same time, since not every recorder keeps to real time.
-    ahead_of = [(i.headers - i.recorded)[(start <= i.recorded) & (i.recorded <= stop)] for i in both]
-    if len(both) < 2 or not all(map(len, ahead_of)):
-        return 0
+    ahead_of = [(i.headers - i.recorded)[(start <= i.recorded) & (i.recorded <= stop)] for i in (cloud, image)]
+    if not all(map(len, ahead_of)):
+        return 0, False
     # Of the quickest messages, but for a few with wrong stamps.
     of_clouds, of_images = (int(np.quantile(own, QUICKEST, method="lower")) for own in ahead_of)
     ahead = of_clouds - of_images
     known = time_scales(ahead / NANOSECONDS)
     if known is not None:
-        return int(np.copysign(known[0], ahead)) * NANOSECONDS
-    # Only a clock stamps messages before they come.
-    from_the_future = max(of_clouds, of_images) > abs(ahead) / 2 > MAX_LATENCY / 2
-    return ahead if from_the_future or abs(ahead) > LONGEST_QUEUE else 0
+        return int(np.copysign(known[0], ahead)) * NANOSECONDS, True
+    if abs(ahead) <= MAX_LATENCY:
+        return 0, False
+    # Only a clock stamps messages before they come, and no queue is that long.
+    return ahead, max(of_clouds, of_images) > abs(ahead) / 2 or abs(ahead) > LONGEST_QUEUE
 
 
-def difference_in_words(ahead: int) -> str:
-    """What `clock_difference` found, and its likely cause."""
+def difference_in_words(ahead: int, of_clocks: bool) -> str:
+    """What `clock_difference` found, its likely cause, and what else can be done."""
     seconds = abs(ahead) / NANOSECONDS
     scale = time_scales(seconds)
+    size = f"{seconds:.0f} s" if scale or seconds > 1000 else f"{seconds:.2f} s"
+    found = f"clouds are stamped {size} {'after' if ahead > 0 else 'before'} images recorded at the same time"
+    if not of_clocks:
+        return (
+            f"{found}: messages waited that long, or clocks differ; paired by the stamps. Pair as recorded by --clock recording"
+        )
     if scale is not None:
         cause = f"the difference of {scale[1]}, of which one sensor is synchronised to each"
     elif seconds > LONG_AGO_S:
         cause = "one of them counts from another epoch, such as when it was switched on"
     else:
         cause = "their clocks are not synchronised"
-    size = f"{seconds:.0f} s" if scale or seconds > 1000 else f"{seconds:.2f} s"
     exact = "" if scale else "; it is known as well as messages arrive, to some 0.1 s, see motion.max_time_offset_s"
-    return (
-        f"clouds are stamped {size} {'after' if ahead > 0 else 'before'} images recorded at the same time: {cause}; paired as "
-        f"recorded{exact}. --clock header pairs by the stamps as they are"
-    )
+    return f"{found}: {cause}; paired as recorded{exact}. --clock header pairs by the stamps as they are"
 
 
 def _references(transforms: list[tuple[int, Any]], camera_frame: str, lidar_frame: str) -> list[tuple[int, Matrix]]:

@@ -21,7 +21,7 @@ from rosbags.typesys.store import Typestore
 from calib_ros import io
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
-from calib_ros.messages.livox import CUSTOM_MSG, CUSTOM_POINT, LIVOX
+from calib_ros.messages.point_fields import CUSTOM_MSG, CUSTOM_POINT, LIVOX
 
 if sys.version_info >= (3, 14):
     from compression import zstd

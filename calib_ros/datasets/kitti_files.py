@@ -19,7 +19,7 @@ from calib_ros.messages.pictures import decode_picture
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # KITTI has PNG; copies are often recompressed
 # Numbers of a point: x, y, z, reflectance, and in other data sets its ring, time, or a radar's values.
 COLUMNS = (4, 5, 6, 7, 8)
-SAMPLED, CLEARLY = 20000, 3.0  # points that are looked at, and how much closer those of another number have to be
+SAMPLED = 20000  # points that are looked at
 SAME_SCAN = 0.5  # of their distance: neighbours in a scan are closer; 0.004 to 0.2 in scans, 1 to 1.4 where it is read wrongly
 DIGITS = 10  # of a frame number; longer names are not frames
 DATE = re.compile(r"(19|20)\d\d-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
@@ -52,28 +52,29 @@ def read_scan(path: Path) -> PointCloud:
 
 
 def read_points(path: Path, columns: Sequence[int]) -> NDArray[np.float32]:
-    """Points (n, k) of a file of float32, k one of `columns`: the first, or one whose points follow each other much more closely.
+    """Points (n, k) of a file of float32, k one of `columns`: the first, unless only by another one its points follow each other.
     BadInputError if damaged."""
     try:
         values = np.fromfile(path, "<f4")
         size = path.stat().st_size
     except OSError as error:
         raise BadInputError(f"scan {path} cannot be read ({error.strerror}); check the file") from error
-    gaps = {k: _gap(values[: k * SAMPLED].reshape(-1, k)[:, :3]) for k in columns if size and size % (4 * k) == 0}
-    usual = columns[0]
-    chosen = usual if gaps.get(usual, np.inf) <= SAME_SCAN else min(gaps, key=lambda k: gaps[k], default=0)
-    if usual in gaps and gaps[chosen] * CLEARLY > gaps[usual]:
-        chosen = usual
-    if not chosen or (chosen != usual and gaps[chosen] > SAME_SCAN):
+    usual, *others = columns
+    fits = size > 0 and size % (4 * usual) == 0
+    if fits and (not others or _gap(values, usual) <= SAME_SCAN):
+        return values.reshape(-1, usual)
+    gaps = [(_gap(values, k), k) for k in others if size and size % (4 * k) == 0]
+    closest, chosen = min(gaps, default=(np.inf, usual))
+    if closest > SAME_SCAN and not fits:
         raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {4 * usual}; copy it again")
-    return values.reshape(-1, chosen)
+    return values.reshape(-1, chosen if closest <= SAME_SCAN else usual)
 
 
-def _gap(xyz: NDArray[np.float32]) -> float:
-    """Median distance of points (n, 3) that follow each other, as a share of their distance: small along the rings of a scan, and
-    large where other numbers are taken for coordinates."""
+def _gap(values: NDArray[np.float32], columns: int) -> float:
+    """Median distance of points that follow each other, as a share of their distance, if numbers (n,) are of so many a point:
+    small along the rings of a scan, and large where other numbers are taken for coordinates."""
     with np.errstate(over="ignore", invalid="ignore"):
-        xyz = xyz.astype(np.float64)
+        xyz = values[: columns * SAMPLED].reshape(-1, columns)[:, :3].astype(np.float64)
         gaps = np.linalg.norm(np.diff(xyz, axis=0), axis=1) / np.maximum(np.linalg.norm(xyz[1:], axis=1), 1e-3)
     known = gaps[np.isfinite(gaps)]
     return float(np.median(known)) if len(known) else np.inf

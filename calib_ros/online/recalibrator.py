@@ -238,8 +238,13 @@ class Recalibrator:
         # Where searches begin that come by themselves, and those on request.
         starts = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
         around = [] if guessing else [(T, self._search_box()) for T in starts]
-        left_in_doubt = self._in_doubt and self._estimated_at is not None
-        kinds = CLASSES if guessing else (() if left_in_doubt else self.calibrator.kinds_without_doubt) or ALL
+        kinds: tuple[str, ...]
+        if guessing:
+            kinds = CLASSES
+        elif self._in_doubt and self._estimated_at is not None:
+            kinds = ALL
+        else:
+            kinds = self.calibrator.kinds_without_doubt or ALL
         segmented = self.segmenter.segment(self.calibrator, cancelled, kinds, around)
         if segmented is None:
             return ()
