@@ -14,9 +14,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fuzz_runner import Listed, frames, originals
 from fuzzing import LAUGHS, MERGES, WIDTH, MessageFuzzer, png_header
 from ros_messages import Messages
+from sample_sources import Listed, frames, originals
 
 from calib_ros import result
 from calib_ros.camera import Camera, Rectifier

@@ -1,75 +1,29 @@
-"""Bags: round trips through both storages, topics, synchronisation, static transforms, damaged files."""
+"""Bags: round trips through both storages, topics, synchronisation, static transforms."""
 
 from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from fuzz_runner import Listed
-from ros_messages import TYPES, Messages
+from bag_recorder import DISTORTED, MS, PINHOLE, START, STORAGES, T_CAMERA_LIDAR, A, B, C, K, Recorder, assert_same, frame
+from ros_messages import TYPES
 from rosbags.interfaces import QosDurability, QosReliability
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.rosbag2 import Reader
+from sample_sources import Listed
 
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
-from calib_ros.datasets.bag_parts import zstd
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.messages.point_fields import decode_livox
 from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.se3 import exp, inverse, quaternion_from_rotation
-
-STORAGES = ["mcap", "sqlite3"]
-START = 1_700_000_000_000_000_000
-K = np.array([[30.0, 0, 20], [0, 31, 12], [0, 0, 1]])
-PINHOLE = Camera(K, 40, 24)
-DISTORTED = Camera(K, 40, 24, "plumb_bob", np.array([-0.2, 0.05, 0.001, -0.001, 0.0]))
-T_CAMERA_LIDAR = exp([0.3, -1.2, 0.7, 0.1, -0.2, 0.3])
-
-
-def frame(i: int, grey: bool = False, camera: Camera = PINHOLE, points: int = 60, **changes) -> Frame:
-    rng = np.random.default_rng(i)
-    xyz = rng.normal(size=(points, 3)).astype(np.float32)
-    xyz[:1] = np.nan
-    cloud = PointCloud(
-        xyz,
-        rng.random(points).astype(np.float32),
-        rng.integers(0, 128, points).astype(np.int32),
-        np.linspace(-0.05, 0.05, points).astype(np.float32),
-    )
-    made = Frame(
-        image=rng.integers(0, 256, (24, 40) if grey else (24, 40, 3), np.uint8),
-        cloud=cloud,
-        camera=camera,
-        stamp=START + i * 100_000_003,
-        cloud_stamp=START + i * 100_000_003 - 10_000_000,
-        reference=T_CAMERA_LIDAR,
-    )
-    return replace(made, **changes)
-
-
-def assert_same(a: Frame, b: Frame) -> None:
-    assert np.array_equal(a.image, b.image)
-    for name in ("xyz", "intensity", "ring", "time"):
-        one, other = getattr(a.cloud, name), getattr(b.cloud, name)
-        assert (one is None) == (other is None), name
-        assert one is None or (np.array_equal(one, other, equal_nan=True) and one.dtype == other.dtype), name
-    assert a.camera == b.camera
-    assert (a.stamp, a.cloud_stamp) == (b.stamp, b.cloud_stamp)
-    assert (a.reference is None) == (b.reference is None)
-    assert a.reference is None or np.abs(a.reference - b.reference).max() < 1e-12
-
+from calib_ros.se3 import exp, inverse
 
 # --- round trip -----------------------------------------------------------------------------------------------------------
 
@@ -194,71 +148,6 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path, storage):
 
 
 # --- bags of other people -------------------------------------------------------------------------------------------------
-
-
-class Recorder:
-    """Writes any messages as a recorder would: with times of recording, compression, several publishers."""
-
-    def __init__(self, path: Path, storage: str = "mcap", compression: CompressionMode = CompressionMode.NONE) -> None:
-        self.writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
-        if compression != CompressionMode.NONE:
-            self.writer.set_compression(compression, CompressionFormat.ZSTD)
-        self.ros = Messages("rosbags")
-        self.connections = {}
-
-    def __enter__(self) -> Recorder:
-        self.writer.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.writer.close()
-
-    def write(self, topic: str, message, time: int) -> None:
-        kind = message.__msgtype__
-        if topic not in self.connections:
-            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=TYPES)
-        self.writer.write(self.connections[topic], time, TYPES.serialize_cdr(message, kind))
-
-    def image(self, stamp: int, topic: str = "/cam/image_raw", time: int | None = None, value: int = 0, frame="cam") -> None:
-        message = self.ros.image("mono8", 8, 6, np.full(48, value, np.uint8), 8)
-        message.header = self.ros.header(stamp, frame)
-        self.write(topic, message, stamp if time is None else time)
-
-    def compressed(self, stamp: int, topic: str, layout: str = "mono8; png compressed") -> None:
-        message = self.ros.compressed(layout, cv2.imencode(".png", np.full((6, 8), 9, np.uint8))[1].tobytes())
-        message.header = self.ros.header(stamp, "cam")
-        self.write(topic, message, stamp)
-
-    def info(self, stamp: int, topic: str = "/cam/camera_info", fx: float = 5.0, time: int | None = None) -> None:
-        matrix = np.array([[fx, 0, 4], [0, fx, 3], [0, 0, 1]])
-        message = self.ros.camera_info(8, 6, matrix, [0.1, 0, 0, 0, 0], np.c_[matrix * [[2], [2], [1]], np.zeros(3)])
-        message.header = self.ros.header(stamp, "cam")
-        self.write(topic, message, stamp if time is None else time)
-
-    def cloud(self, stamp: int, topic: str = "/points", time: int | None = None, value: float = 1, frame: str = "lidar") -> None:
-        points = np.full(3, value, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-        message = self.ros.cloud(points)
-        message.header = self.ros.header(stamp, frame)
-        self.write(topic, message, stamp if time is None else time)
-
-    def static(self, time: int, *edges: tuple[str, str, np.ndarray], topic: str = "/tf_static", scale: float = 1.0) -> None:
-        make, transforms = self.ros.make, []
-        for parent, child, T in edges:
-            q = dict(zip("xyzw", (float(v) * scale for v in quaternion_from_rotation(T[:3, :3])), strict=True))
-            t = dict(zip("xyz", T[:3, 3].tolist(), strict=True))
-            translation, rotation = make("geometry_msgs/msg/Vector3", **t), make("geometry_msgs/msg/Quaternion", **q)
-            transform = make("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
-            names = {"header": self.ros.header(time, parent), "child_frame_id": child}
-            transforms.append(make("geometry_msgs/msg/TransformStamped", **names, transform=transform))
-        self.write(topic, make("tf2_msgs/msg/TFMessage", transforms=transforms), time)
-
-    def trio(self, stamp: int, **options) -> None:
-        self.image(stamp, **options)
-        self.info(stamp)
-        self.cloud(stamp)
-
-
-MS = 1_000_000
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -479,9 +368,6 @@ def test_rectified_images_use_the_projection_matrix(tmp_path):
     assert not BagSource(tmp_path / "bag", rectified=False).camera.is_pinhole
 
 
-A, B, C = exp([0.1, 0, 0, 1, 0, 0]), exp([0, 0.5, 0, 0, 2, 0]), exp([0, 0, -2, 0, 0, 3])
-
-
 @pytest.mark.parametrize("separate", [False, True])
 def test_reference_is_chained_through_the_tree(tmp_path, separate):
     edges = [("base", "mount", A), ("mount", "cam", B), ("/base", "/lidar", C), ("base", "imu", A)]
@@ -510,146 +396,3 @@ def test_trees_that_do_not_connect_and_frames_with_a_slash(tmp_path):
         record.cloud(START, frame="/lidar")
         record.static(START, ("lidar", "cam", A), topic="/robot/tf_static")
     assert np.abs(BagSource(tmp_path / "bag").reference - inverse(A)).max() < 1e-9
-
-
-COMPRESSED = [("mcap", CompressionMode.STORAGE), ("mcap", CompressionMode.MESSAGE), ("sqlite3", CompressionMode.FILE)]
-
-
-@pytest.mark.parametrize(("storage", "compression"), [*COMPRESSED, ("sqlite3", CompressionMode.MESSAGE)])
-def test_compressed_bags(tmp_path, storage, compression):
-    with Recorder(tmp_path / "bag", storage, compression) as record:
-        for i in range(3):
-            record.trio(START + i * 100 * MS, value=i)
-    bag = open_dataset(tmp_path / "bag")
-    assert [int(bag[i].image[0, 0]) for i in range(3)] == [0, 1, 2]
-    assert bag.describe()["storage"] == storage
-
-
-def test_an_unusable_message_is_named_and_the_others_stay_usable(tmp_path):
-    with Recorder(tmp_path / "bag") as record:
-        record.trio(START)
-        stamp = START + 100 * MS
-        record.info(stamp)
-        record.cloud(stamp)
-        message = record.ros.image("32FC1", 8, 6, bytes(192), 32)
-        message.header = record.ros.header(stamp, "cam")
-        record.write("/cam/image_raw", message, stamp)
-    bag = BagSource(tmp_path / "bag")
-    assert (bag[0].image == 0).all()
-    with pytest.raises(BadInputError, match=r"bag, /cam/image_raw at 1700000000.100000000: Image: encoding '32FC1'"):
-        bag[1]
-
-
-# --- damage; at random in the fuzz tests -----------------------------------------------------------------------------------
-
-
-def use(path: Path, **options) -> str:
-    """Opens and reads everything: "read", or why not."""
-    try:
-        with BagSource(path, **options) as bag:
-            for i in range(len(bag)):
-                bag[i]
-    except BadInputError as error:
-        return str(error)
-    return "read"
-
-
-def storage_of(path: Path) -> Path:
-    return next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
-
-
-@pytest.mark.parametrize("storage", STORAGES)
-def test_damaged_bags_say_what_helps(tmp_path, storage):
-    copy = write_bag(Listed([frame(i) for i in range(4)]), tmp_path / "bag", storage)
-    (copy / "metadata.yaml").unlink()
-    assert use(copy) == "read"
-    whole = storage_of(copy).read_bytes()
-    advice = "mcap recover" if storage_of(copy).suffix == ".mcap" else "record it again"
-    storage_of(copy).write_bytes(whole[: len(whole) // 3])
-    assert advice in use(copy)
-    storage_of(copy).unlink()
-    assert "no .mcap, .db3 or .bag" in use(copy)
-
-
-@pytest.mark.parametrize("storage", STORAGES)
-def test_a_bag_is_read_without_its_metadata(tmp_path, storage):
-    """Damaged, or of a recorder that left it empty: the files hold all that is needed. Parts that are not there are named."""
-    parts = [frame(i) for i in range(3)], [frame(i) for i in range(3, 6)]
-    first, second = (write_bag(Listed(own), tmp_path / f"part{k}", storage) for k, own in enumerate(parts))
-    for text in ("", "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: ''\n", "[unreadable"):
-        (first / "metadata.yaml").write_text(text)
-        bag = BagSource(first)
-        assert (len(bag), len(bag.remarks)) == (3, 1)
-        assert "metadata.yaml" in bag.remarks[0]
-    (first / "metadata.yaml").unlink()
-    file = storage_of(second)
-    packed = first / f"part_10{file.suffix}.zstd"
-    with zstd.open(packed, "wb") as target:
-        target.write(file.read_bytes())
-    bag = BagSource(first)
-    assert [bag[i].stamp for i in range(6)] == [made.stamp for own in parts for made in own]
-    assert bag.remarks == ()
-    copy = first / f"copy{file.suffix}"
-    copy.write_bytes(storage_of(first).read_bytes())
-    assert "open one of the files" in use(first)
-    copy.unlink()
-    packed.write_bytes(packed.read_bytes()[:100])
-    assert packed.name in use(first)
-    assert "--incomplete" in use(first)
-    with BagSource(first, incomplete=True) as bag:
-        assert len(bag) == 3
-        assert packed.name in bag.remarks[0]
-    listed = (second / "metadata.yaml").read_text().replace(f"- {file.name}", f"- {file.name}\n  - gone_1{file.suffix}", 1)
-    (second / "metadata.yaml").write_text(listed)
-    assert f"gone_1{file.suffix}" in use(second)
-    assert use(second, incomplete=True) == "read"
-
-
-def test_bags_of_ros_1(tmp_path):
-    """With their own byte layout of a header; the same frames as a bag of ROS 2."""
-    path = tmp_path / "drive.bag"
-    with Recorder(tmp_path / "bag") as record:
-        for i in range(3):
-            record.trio(START + i * 100 * MS, value=i)
-        record.static(START, ("cam", "lidar", A))
-    expected, ros1 = BagSource(tmp_path / "bag"), get_typestore(Stores.ROS1_NOETIC)
-    ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    with Reader(tmp_path / "bag") as reader, Ros1Writer(path) as writer:
-        own = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=ros1) for c in reader.connections}
-        for connection, time, data in reader.messages():
-            writer.write(own[connection.topic], time, TYPES.cdr_to_ros1(data, connection.msgtype))
-    bag = open_dataset(path)
-    assert (len(bag), bag.describe()["kind"], bag.camera_frame) == (3, "ROS 1 bag", "cam")
-    assert np.abs(bag.reference - A).max() < 1e-9
-    for i in range(3):
-        assert_same(bag[i], expected[i])
-    path.write_bytes(path.read_bytes()[:-200])
-    assert "record it again" in use(path)
-
-
-def test_livox_clouds(tmp_path):
-    """Its own message, of points with times and lines."""
-    with Recorder(tmp_path / "bag") as record:
-        for i in range(3):
-            stamp = START + i * 100 * MS
-            record.image(stamp)
-            record.info(stamp)
-            fields = {"offset_time": 5 * MS, "y": 2.0, "z": 3.0, "reflectivity": 200, "tag": 16, "line": 3}
-            made = [record.ros.make("livox_ros_driver2/msg/CustomPoint", x=float(k), **fields) for k in range(1 + i)]
-            about = {"timebase": 0, "point_num": len(made), "lidar_id": 0, "rsvd": np.zeros(3, np.uint8)}
-            message = record.ros.make(
-                "livox_ros_driver2/msg/CustomMsg", **about, points=made, header=record.ros.header(stamp, "li")
-            )
-            record.write("/livox/lidar", message, stamp)
-    bag = BagSource(tmp_path / "bag")
-    cloud = bag[2].cloud
-    assert bag.lidar_frame == "li"
-    assert np.array_equal(cloud.xyz, [[k, 2, 3] for k in range(3)])
-    assert np.allclose(cloud.time, 0.005)
-    assert (set(cloud.ring), set(cloud.intensity)) == ({3}, {200})
-    data = b"\0\1\0\0" + bytes(60)
-    for length in (4, 30):
-        with pytest.raises(BadInputError, match="CustomMsg"):
-            decode_livox(data[:length])
-    with pytest.raises(BadInputError, match="truncated"):
-        decode_livox(data[:24] + b"\xff\xff\xff\x0f" * 5 + bytes(20))

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from fuzz_runner import Listed
+from bag_recorder import MS, PINHOLE, START, STORAGES, A, B, Recorder, assert_same, frame
 from rosbags.rosbag2 import CompressionMode
-from test_bag import COMPRESSED, MS, PINHOLE, START, STORAGES, A, B, Recorder, assert_same, frame, storage_of
+from sample_sources import Listed
+from test_bag_files import COMPRESSED, storage_of
 
 from calib_ros.camera import Camera
 from calib_ros.datasets import open_dataset

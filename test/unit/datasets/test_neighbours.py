@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from fuzz_runner import Listed
+from sample_sources import Listed
 
 from calib_ros.camera import Camera
 from calib_ros.datasets.source import neighbours

@@ -1,0 +1,189 @@
+"""Small sources of every kind, intact: bags, KITTI drives, plain folders, nuScenes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzzing import STAMP, K
+
+from calib_ros.camera import Camera
+from calib_ros.datasets.bag_parts import typestore
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.registration.initial_guess import nominal
+
+
+def frames(count: int = 2) -> list[Frame]:
+    """Tiny frames, of too few points for features."""
+    rng = np.random.default_rng(1)
+    out = []
+    for k in range(count):
+        cloud = PointCloud(rng.normal(size=(30, 3)).astype(np.float32), rng.random(30).astype(np.float32))
+        image = rng.integers(0, 256, (24, 40, 3), np.uint8)
+        out.append(Frame(image, cloud, Camera(K, 40, 24), STAMP + k * NANOSECONDS // 10, None, nominal(0.0), f"{k}"))
+    return out
+
+
+class Listed:
+    """A source made of frames."""
+
+    def __init__(self, listed: list[Frame]) -> None:
+        self.frames, self.name, self.camera_frame, self.lidar_frame = listed, "listed", "camera", "lidar"
+        self.camera, self.reference = listed[0].camera, listed[0].reference
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self.frames[index]
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+def kitti(folder: Path, layout: str) -> None:
+    """A drive of two frames."""
+    import cv2
+
+    def text(values: Any) -> str:
+        return " ".join(f"{v:e}" for v in np.ravel(values))
+
+    T, P = nominal(0.0)[:3], f"P2: {text(np.c_[K, [1.0, 0, 0]])}\n"
+    files: dict[str, str] = {}
+    if layout == "raw":
+        rectified = f"R_rect_00: {text(np.eye(3))}\n{P.replace('2', '_rect_02', 1)}"
+        files["calib_cam_to_cam.txt"] = f"calib_time: 09-Jan-2012 13:57:47\n{rectified}"
+        files["calib_velo_to_cam.txt"] = f"R: {text(T[:, :3])}\nT: 0.1 0.2 0.3\ndelta_f: 0 0\n"
+        files["calib_imu_to_velo.txt"] = f"R: {text(np.eye(3))}\nT: -0.8 0.3 -0.8\n"
+        for name in ("image_02/timestamps.txt", *(f"velodyne_points/timestamps{s}.txt" for s in ("", "_start", "_end"))):
+            files[name] = "".join(f"2011-09-26 13:02:25.{k}64000000\n" for k in (1, 2))
+        files |= {f"oxts/data/{k:010d}.txt": " ".join(str(0.1 * v) for v in range(30)) + "\n" for k in range(2)}
+    elif layout == "odometry":
+        files |= {"calib.txt": f"{P}Tr: {text(T)}\n", "times.txt": "0.0\n1.03e-1\n"}
+    else:
+        files |= {f"calib/{k:06d}.txt": f"{P}R0_rect: {text(np.eye(3))}\nTr_velo_to_cam: {text(T)}\n" for k in range(2)}
+    raw = layout == "raw"
+    images, clouds = ("image_02/data", "velodyne_points/data") if raw else ("image_2", "velodyne")
+    for k, frame in enumerate(frames()):
+        name = f"{k:0{10 if raw else 6}d}"
+        for place in (images, clouds):
+            (folder / place).mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / images / f"{name}{'.jpg' if layout == 'odometry' and k else '.png'}"), frame.image)
+        np.c_[frame.cloud.xyz, frame.cloud.intensity].astype("<f4").tofile(folder / clouds / f"{name}.bin")
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content)
+
+
+def plain(folder: Path) -> None:
+    """A plain folder of two frames, a cloud in PCD and one in PLY."""
+    import cv2
+    from pypcd4 import Encoding
+    from pypcd4 import PointCloud as PcdFile
+
+    (folder / "images").mkdir(parents=True)
+    (folder / "clouds").mkdir()
+    K_text = ", ".join(f"{v:g}" for v in K.ravel())
+    rows = "".join(f"- {row}\n" for row in nominal(0.0).tolist())
+    (folder / "calibration.yaml").write_text(
+        f"image_width: 40\nimage_height: 24\ncamera_matrix: {{rows: 3, cols: 3, data: [{K_text}]}}\ndistortion_model: plumb_bob\n"
+        f"distortion_coefficients: {{rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}}\nT_camera_lidar:\n{rows}"
+    )
+    (folder / "times.csv").write_text(f"name,image_ns,cloud_ns\n0,{STAMP},{STAMP}\n1,{STAMP + 10**8},\n")
+    first, second = frames()
+    for frame in (first, second):
+        cv2.imwrite(str(folder / "images" / f"{frame.name}.{'bmp' if frame is first else 'png'}"), frame.image)
+    points = np.c_[first.cloud.xyz, first.cloud.intensity]
+    PcdFile.from_xyzi_points(points).save(folder / "clouds/0.pcd", Encoding.BINARY_COMPRESSED)
+    header = "ply\nformat ascii 1.0\nelement vertex 30\n" + "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    lines = "".join(f"{x} {y} {z}\n" for x, y, z in second.cloud.xyz.tolist())
+    (folder / "clouds/1.ply").write_text(header + lines)
+
+
+def plain_otherwise(folder: Path) -> None:
+    """The same in other formats: LAS and CSV, TIFF and WebP."""
+    import cv2
+    import laspy
+
+    plain(folder)
+    for part in ("images", "clouds"):
+        for path in (folder / part).iterdir():
+            path.unlink()
+    first, second = frames()
+    cv2.imwrite(str(folder / "images/0.tif"), first.image)
+    cv2.imwrite(str(folder / "images/1.webp"), second.image)
+    las = laspy.create()
+    las.x, las.y, las.z = first.cloud.xyz.T.astype(float)
+    las.write(folder / "clouds/0.las")
+    np.savetxt(folder / "clouds/1.csv", second.cloud.xyz, "%.3f", ",", header="x,y,z")
+
+
+def ros1(folder: Path) -> None:
+    """A bag of ROS 1 of the same frames."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    path = write_bag(Listed(frames()), folder.parent / "to_convert")
+    folder.mkdir()
+    with Reader(path) as reader, Writer(folder / "drive.bag") as writer:
+        topics = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections}
+        for connection, time, data in reader.messages():
+            writer.write(topics[connection.topic], time, typestore().cdr_to_ros1(data, connection.msgtype))
+    shutil.rmtree(path)
+
+
+def nuscenes(folder: Path) -> None:
+    """A scene of two key frames."""
+    import cv2
+
+    pose = {"translation": [0.1, 0.2, 0.3], "rotation": [1.0, 0.0, 0.0, 0.0]}
+    channels = {"CAM_FRONT": "camera", "LIDAR_TOP": "lidar"}
+    tables: dict[str, list[dict[str, Any]]] = {
+        "scene": [{"token": "s", "name": "scene-0061"}],
+        "sample": [{"token": f"f{k}", "scene_token": "s", "timestamp": k} for k in range(2)],
+        "sensor": [{"token": name, "channel": name, "modality": kind} for name, kind in channels.items()],
+        "calibrated_sensor": [
+            {"token": f"c{name}", "sensor_token": name, **pose, "camera_intrinsic": K.tolist() if kind == "camera" else []}
+            for name, kind in channels.items()
+        ],
+        "sample_data": [],
+        "ego_pose": [],
+    }
+    for k, frame in enumerate(frames()):
+        for name, kind in channels.items():
+            file = folder / "samples" / name / f"{k}{'.png' if kind == 'camera' else '.pcd.bin'}"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if kind == "camera":
+                cv2.imwrite(str(file), frame.image)
+            else:
+                np.c_[frame.cloud.xyz, frame.cloud.intensity, np.zeros(30)].astype("<f4").tofile(file)
+            token, stamp = f"{name}{k}", frame.stamp // 1000
+            row = {"sample_token": f"f{k}", "ego_pose_token": token, "calibrated_sensor_token": f"c{name}", "timestamp": stamp}
+            row |= {"filename": str(file.relative_to(folder)), "is_key_frame": True, "width": 40, "height": 24}
+            tables["sample_data"].append({"token": token, **row})
+            tables["ego_pose"].append({"token": token, "timestamp": stamp, **pose})
+    (folder / "v1.0-mini").mkdir()
+    for name, rows in tables.items():
+        (folder / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows, indent=0))
+
+
+def originals(root: Path) -> list[Path]:
+    """Three bags, three KITTI drives, two plain folders and nuScenes, intact."""
+    out = [write_bag(Listed(frames()), root / f"bag_{storage}", storage) for storage in ("mcap", "sqlite3")]
+    for layout in ("raw", "odometry", "object"):
+        folder = root / layout
+        folder.mkdir()
+        kitti(folder, layout)
+        out.append(folder)
+    for make in (plain, plain_otherwise, nuscenes):
+        make(root / make.__name__)
+        out.append(root / make.__name__)
+    ros1(root / "bag_ros1")
+    return [*out, root / "bag_ros1"]
