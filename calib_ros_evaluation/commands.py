@@ -183,4 +183,5 @@ def _steps_command(args: argparse.Namespace) -> str:
     for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic", "clock"):
         value = getattr(args, option)
         command += [f"--{option.replace('_', '-')}", value] if value else []
+    command += ["--incomplete"] if args.incomplete else []
     return shlex.join(command + (["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else []))
