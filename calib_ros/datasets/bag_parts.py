@@ -21,7 +21,9 @@ from rosbags.typesys.store import Typestore
 from calib_ros import io
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
+from calib_ros.messages.compressed_points import CLOUD_DEFINITION, COMPRESSED_POINTS
 from calib_ros.messages.point_fields import CUSTOM_MSG, CUSTOM_POINT, LIVOX
+from calib_ros.messages.video import VIDEO
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -43,6 +45,8 @@ def typestore() -> Typestore:
         package = name.partition("/")[0]
         store.register(get_types_from_msg(CUSTOM_POINT, f"{package}/msg/CustomPoint"))
         store.register(get_types_from_msg(CUSTOM_MSG, name))
+    for name, definition in {**VIDEO, COMPRESSED_POINTS: CLOUD_DEFINITION}.items():
+        store.register(get_types_from_msg(definition, name))
     return store
 
 

@@ -349,6 +349,14 @@ def test_compressed_images(tmp_path):
         record.cloud(START)
     bag = BagSource(tmp_path / "bag")
     assert (bag[0].image == 9).all()
+    with pytest.raises(BadInputError, match="this is a depth image"):
+        BagSource(tmp_path / "bag", "/cam/image_raw/compressedDepth")[0]
+    with Recorder(tmp_path / "depth") as record:
+        record.compressed(START, "/cam/depth/compressedDepth", "16UC1; compressedDepth png")
+        record.info(START)
+        record.cloud(START)
+    with pytest.raises(BadInputError, match=r"; /cam/depth/compressedDepth is a depth image, no camera picture"):
+        BagSource(tmp_path / "depth")
     with Recorder(tmp_path / "both") as record:
         record.trio(START, value=3)
         record.compressed(START, "/cam/image_raw/compressed")
