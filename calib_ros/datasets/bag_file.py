@@ -84,6 +84,11 @@ class BagFile:
         with self._readable():
             yield from self._parts.messages(topics, start, stop)
 
+    def heads(self, topics: Collection[str], whole: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """As `raw` of all, about in order, and of topics that are not in `whole` maybe no more than the header."""
+        with self._readable():
+            yield from self._parts.heads(topics, whole)
+
     def decode(self, topic: str, data: bytes) -> Any:
         """CDR bytes -> message of the topic's type, of Livox's own type its PointCloud."""
         kind = self.topics[topic].type

@@ -52,18 +52,28 @@ class BagIndex:
         """Read the whole bag once. keep: hold messages in memory, as `read_spans` does."""
         if keep:
             self._kept = {}
-        waits = self._bag.topics[self.image.topic].type in VIDEO
-        for topic, recorded, data in self._bag.raw([*self._by_topic, *self._statics]):
-            if waits and topic == self.image.topic:
-                with located(self._bag.path, topic):
-                    waits = not packet_of(self._bag.decode(topic, data)).is_key
+        topics, begin = [*self._by_topic, *self._statics], self._first_key()
+        for topic, recorded, data in (
+            self._bag.raw(topics) if keep else self._bag.heads(topics, [self.info.topic, *self._statics])
+        ):
             if topic in self._statics:
                 self._transforms.append((recorded, self._bag.decode(topic, data)))
-            elif waits and topic == self.image.topic:
+            elif topic == self.image.topic and recorded < begin:
                 self.without_key += 1
             else:
                 self._add(topic, recorded, data)
+        self._transforms.sort(key=lambda one: one[0])
         self._finish()
+
+    def _first_key(self) -> int:
+        """Recording time of the first picture that can be decoded, ns."""
+        if self._bag.topics[self.image.topic].type not in VIDEO:
+            return self._bag.start
+        for topic, recorded, data in self._bag.raw([self.image.topic]):
+            with located(self._bag.path, topic):
+                if packet_of(self._bag.decode(topic, data)).is_key:
+                    return recorded
+        return self._bag.stop
 
     def read_spans(self, spans: list[Span]) -> None:
         """Read only what was recorded in these spans, which neither overlap nor have been read; CameraInfo and static transforms
