@@ -1,4 +1,4 @@
-"""`calib-ros calibrate` of bags whose pictures are video."""
+"""`calib-ros calibrate` of bags of video and compressed clouds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from bag_recorder import FFMPEG, FOXGLOVE, as_video
+from compressed_bags import FFMPEG, FOXGLOVE, compressed_bag
 
 from calib_ros.cli.main import main
 
@@ -25,7 +25,7 @@ KINDS = [(FOXGLOVE, "h264"), (FFMPEG, "hevc_nvenc;yuv420p;bgr8;bgr8"), (FOXGLOVE
 def test_calibration_from_video_converges(kind: str, layout: str, search: list[str], street_bag: Path, tmp_path: Path) -> None:
     pytest.importorskip("av", reason="PyAV is not installed")
     codec = "h265" if "hevc" in layout else layout.rpartition("-")[2]
-    bag, result = as_video(street_bag, tmp_path / "bag", kind, layout, codec=codec), tmp_path / "result.json"
+    bag, result = compressed_bag(street_bag, tmp_path / "bag", kind, layout, codec), tmp_path / "result.json"
     frames = ["--frames", "0:6"] if search else []
     assert main(["calibrate", str(bag), *frames, *search, "--initial", "reference", "--json", str(result)]) == 0
     found = json.loads(result.read_text())

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -13,10 +11,7 @@ from ros_messages import TYPES, Messages
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from calib_ros.camera import Camera
-from calib_ros.datasets.bag_file import IMAGE, BagFile
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.messages import decode_image
-from calib_ros.messages.video import VIDEO
 from calib_ros.se3 import exp, quaternion_from_rotation
 
 MS = 1_000_000
@@ -129,61 +124,3 @@ class Recorder:
         self.image(stamp, **options)
         self.info(stamp)
         self.cloud(stamp)
-
-    def video(self, packets: list[bytes], topic: str, kind: str, layout: str, period: int = 100 * MS) -> None:
-        """A packet a message, from START on, of foxglove_msgs/CompressedVideo or FFMPEGPacket."""
-        for k, packet in enumerate(packets):
-            stamp = START + k * period
-            self.packet(packet, topic, kind, layout, self.ros.header(stamp, "cam"), stamp + 20 * MS)
-
-    def packet(self, packet: bytes, topic: str, kind: str, layout: str, header, time: int) -> None:
-        data = self.ros.data(packet)
-        if kind == FOXGLOVE:
-            message = self.ros.make(kind, timestamp=header.stamp, frame_id=header.frame_id, data=data, format=layout)
-        else:
-            size = {"width": 8, "height": 6, "pts": 0, "flags": 0, "is_bigendian": False}
-            message = self.ros.make(kind, header=header, encoding=layout, data=data, **size)
-        self.write(topic, message, time)
-
-
-FOXGLOVE, FFMPEG = VIDEO
-# Of each codec, encoder and options by which pictures come out as they go in, and the format in messages of both types.
-ENCODERS = {
-    "h264": ("libx264", {"tune": "zerolatency", "crf": "10"}),
-    "h265": ("libx265", {"tune": "zerolatency", "preset": "ultrafast", "x265-params": "log-level=none:crf=10"}),
-    "av1": ("libsvtav1", {"preset": "8", "crf": "10", "svtav1-params": "pred-struct=1:lookahead=0"}),
-    "vp9": ("libvpx-vp9", {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0", "crf": "10", "b": "0"}),
-}
-
-
-def encoded(pictures: list[np.ndarray], codec: str = "h264", keys: int = 10, **options: str) -> list[bytes]:
-    """(H, W, 3) BGR pictures of even sides -> packets, a key frame each `keys` pictures."""
-    import av
-
-    os.environ["SVT_LOG"] = "0"
-    name, usual = ENCODERS[codec]
-    context = av.CodecContext.create(name, "w")
-    context.height, context.width = pictures[0].shape[:2]
-    context.pix_fmt, context.time_base, context.framerate, context.gop_size = "yuv420p", Fraction(1, 10), Fraction(10), keys
-    context.max_b_frames, context.options = 0, {**usual, **options}
-    packets = []
-    for number, picture in enumerate(pictures):
-        frame = av.VideoFrame.from_ndarray(picture, format="bgr24").reformat(format="yuv420p")
-        frame.pts = number
-        packets += context.encode(frame)
-    return [bytes(packet) for packet in (*packets, *context.encode(None))]
-
-
-def as_video(bag: Path, path: Path, kind: str, layout: str, **options: str) -> Path:
-    """A bag of images -> the same bag of a video topic."""
-    source = BagFile(bag)
-    images = next(topic for topic, kept in source.topics.items() if kept.type == IMAGE)
-    messages = [(topic, time, source.decode(topic, data)) for topic, time, data in source.raw(source.topics)]
-    packets = iter(encoded([decode_image(message) for topic, _, message in messages if topic == images], **options))
-    with Recorder(path) as record:
-        for topic, time, message in messages:
-            if topic != images:
-                record.write(topic, message, time)
-            else:
-                record.packet(next(packets), f"{images}/ffmpeg", kind, layout, message.header, time)
-    return path

@@ -22,8 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from compressed_bags import ENCODERS, FOXGLOVE, video_message
 from fuzzing import HEIGHT, STAMP, WIDTH, K, MessageFuzzer, damage_folder, scan, text_file
 from paths import ROOT
+from ros_messages import Messages
 from sample_sources import originals
 
 from calib_ros import result, se3
@@ -32,7 +34,15 @@ from calib_ros.config import Config, SemanticsConfig, load_stages
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image, stamp_ns
+from calib_ros.messages import (
+    decode_camera_info,
+    decode_cloud,
+    decode_compressed_cloud,
+    decode_compressed_image,
+    decode_image,
+    stamp_ns,
+)
+from calib_ros.messages.video import VideoDecoder, packet_of, picture_of
 from calib_ros.online.events import ExtrinsicUpdated, Inputs, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
@@ -137,10 +147,20 @@ def messages(run: Run, seed: int, count: int) -> None:
 
     for _ in range(3):
         ingest(good)
+    for codec in ENCODERS:  # their libraries, before memory is limited
+        watch(
+            [
+                video_message(fuzzers[0].make, FOXGLOVE, codec, fuzzers[0].make.header(), one)
+                for one in fuzzers[0].packets_of(codec)
+            ]
+        )
+    decode_compressed_cloud(Messages("rosbags").compressed_cloud(np.zeros(3, [(name, "<f4") for name in "xyz"]), "draco"))
     run.start()
     for k in range(count):
         fuzzer = fuzzers[k % len(fuzzers)]
-        kind = ("cloud", "cloud", "image", "compressed", "camera_info")[k // 2 % 5]
+        kind = ("cloud", "cloud", "image", "compressed", "camera_info", "video", "compressed_cloud")[k // 2 % 7]
+        if kind in ("video", "compressed_cloud"):  # rclpy has no such messages
+            fuzzer = fuzzers[0]
         message = getattr(fuzzer, kind)()
         label = f"{kind} {k} of {fuzzer.make.family}"
         if kind == "camera_info":
@@ -148,6 +168,10 @@ def messages(run: Run, seed: int, count: int) -> None:
             camera = run.case(kind, label, lambda m=message, r=rectified: decode_camera_info(m, r))
             if camera is not None and k % 2 == 0:
                 run.case("camera in use", label, lambda c=camera: in_use(c, good))
+        elif kind == "video":
+            run.case(kind, label, lambda m=message: watch(m))
+        elif kind == "compressed_cloud":
+            run.case(kind, label, lambda m=message: decode_compressed_cloud(m))
         elif kind == "cloud":
             cloud = run.case(kind, label, lambda m=message: decode_cloud(m))
             if cloud is not None and k % 3 == 0:
@@ -158,6 +182,14 @@ def messages(run: Run, seed: int, count: int) -> None:
             image = run.case(kind, label, lambda m=message, d=decoder: d(m))
             if image is not None and k % 3 == 0:
                 run.case("picture in use", label, lambda i=image: ingest(Frame(i, good.cloud, CAMERA, STAMP, STAMP)))
+
+
+def watch(messages: list[Any]) -> None:
+    """What a bag does with a video topic from a key frame on."""
+    decoder = VideoDecoder(packet_of(messages[0]).codec)
+    for number, message in enumerate(messages):
+        for _, picture in decoder.decode(packet_of(message).data, number):
+            picture_of(picture)
 
 
 def in_use(camera: Camera, good: Frame) -> None:

@@ -66,11 +66,15 @@ class Messages:
     def compressed_cloud(self, points: np.ndarray, layout: str, data: bytes | None = None) -> Any:
         """A CompressedPointCloud2 as point_cloud_transport's plugins write it, by default zlib, zstd or draco."""
         raw = self.cloud(points)
-        names = ("header", "height", "width", "fields", "is_bigendian", "point_step", "row_step", "is_dense")
         if data is None:
             pack = {"zlib": gzip.compress, "zstd": zstd.compress}.get(layout)
             data = draco(points) if pack is None else pack(raw.data.tobytes())
-        fields = {name: getattr(raw, name) for name in names}
+        return self.compressed_of(raw, layout, data)
+
+    def compressed_of(self, cloud: Any, layout: str, data: bytes) -> Any:
+        """A PointCloud2 -> the CompressedPointCloud2 with these data."""
+        names = ("header", "height", "width", "fields", "is_bigendian", "point_step", "row_step", "is_dense")
+        fields = {name: getattr(cloud, name) for name in names}
         return self.make(
             "point_cloud_interfaces/msg/CompressedPointCloud2", **fields, compressed_data=self.data(data), format=layout
         )

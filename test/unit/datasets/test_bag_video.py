@@ -8,7 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from bag_recorder import ENCODERS, FFMPEG, FOXGLOVE, MS, START, Recorder, encoded
+from bag_recorder import MS, START, Recorder
+from compressed_bags import ENCODERS, FFMPEG, FOXGLOVE, encoded, record_video
 
 from calib_ros.datasets.bag import BagSource
 from calib_ros.datasets.bag_file import BagFile
@@ -29,7 +30,7 @@ def pictures() -> list[np.ndarray]:
 
 def record(path: Path, packets: list[bytes], kind: str = FOXGLOVE, layout: str = "h264") -> Path:
     with Recorder(path) as recorder:
-        recorder.video(packets, "/cam/image_raw/ffmpeg", kind, layout)
+        record_video(recorder, packets, "/cam/image_raw/ffmpeg", kind, layout)
         for k in range(len(packets)):
             recorder.info(START + 100 * MS * k, time=START + (100 * k + 20) * MS, size=(192, 128))
             recorder.cloud(START + 100 * MS * k, time=START + (100 * k + 50) * MS, value=k)
@@ -135,6 +136,6 @@ def test_other_codecs_and_a_missing_library_say_what_helps(tmp_path, pictures, m
 def test_images_win_over_video(tmp_path, pictures):
     with Recorder(tmp_path / "bag") as recorder:
         recorder.trio(START, value=3)
-        recorder.video(encoded(pictures)[:1], "/other/video", FOXGLOVE, "h264")
+        record_video(recorder, encoded(pictures)[:1], "/other/video")
     assert (BagSource(tmp_path / "bag")[0].image == 3).all()
     assert BagSource(tmp_path / "bag", "/other/video").image_topic == "/other/video"
