@@ -12,6 +12,7 @@ from bag_recorder import DISTORTED, MS, PINHOLE, START, STORAGES, T_CAMERA_LIDAR
 from ros_messages import TYPES
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
+from rosbags.typesys import get_types_from_msg
 from sample_sources import Listed
 
 from calib_ros.camera import Camera
@@ -339,6 +340,20 @@ def test_missing_types_and_pairs_are_named(tmp_path):
         pass
     with pytest.raises(BadInputError, match="nothing at all"):
         BagSource(tmp_path / "empty")
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [("velodyne_msgs/msg/VelodyneScan", "velodyne_pointcloud"), ("ouster_sensor_msgs/msg/PacketMsg", "ouster_ros")],
+)
+def test_packets_are_refused_with_what_makes_clouds(tmp_path, kind, says):
+    with Recorder(tmp_path / "bag") as record:
+        record.image(START)
+        record.info(START)
+        TYPES.register(get_types_from_msg("uint8[] buf", kind))
+        record.write("/packets", TYPES.types[kind](np.zeros(9, np.uint8)), START)
+    with pytest.raises(BadInputError, match=f"no PointCloud2 messages, only .*play the bag, run the .* node of {says}"):
+        BagSource(tmp_path / "bag")
 
 
 def test_compressed_images(tmp_path):
