@@ -20,12 +20,10 @@ CHUNK_HEAD = 40  # bytes before the name of its compression, which is empty: tim
 
 
 def storages_with_heads(reader: Any) -> list[Any] | None:
-    """The files of a reader of rosbags, None if their messages have to be read as a whole: of ROS 1, or compressed."""
+    """The files of a reader of rosbags, None if their messages have to be read as a whole: of ROS 1, or in compressed chunks."""
     if not isinstance(reader, Reader):
         return None
     storage: Any = reader.storage
-    if getattr(storage.metadata, "compression_mode", None):
-        return None
     storages = getattr(storage, "storages", [storage])
     return storages if all(_has_heads(one) for one in storages) else None
 

@@ -22,6 +22,7 @@ VIDEO = {
 }
 # What the format, or the encoder's name as in "libx264;yuv420p;bgr8;bgr8" or "hevc_nvenc", contains -> FFmpeg's decoder.
 CODECS = {"264": "h264", "265": "hevc", "hevc": "hevc", "av1": "libdav1d", "vp9": "vp9"}
+INSTALL = "python3 -m pip install av"
 NALS = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 SEQUENCE_HEADER = 1  # an OBU of AV1
 LOW_DELAY = 1 << 19  # AV_CODEC_FLAG_LOW_DELAY
@@ -83,7 +84,10 @@ class VideoDecoder:
 
     def __init__(self, codec: str) -> None:
         self._av = pyav()
-        self._context = self._av.CodecContext.create(codec, "r")
+        try:
+            self._context = self._av.CodecContext.create(codec, "r")
+        except ValueError:
+            raise MissingDependencyError(f"this PyAV has no decoder {codec}; install its wheel: {INSTALL}") from None
         self._context.thread_count = 1  # several delay pictures, and lose errors of damaged slices
         self._context.flags |= LOW_DELAY
         # Instead of grey or smeared areas, edges that no camera saw, an error; and no memory for what no camera has.
@@ -122,5 +126,5 @@ def pyav() -> Any:
     try:
         import av
     except ImportError:
-        raise MissingDependencyError("video is decoded by PyAV, which is missing: python3 -m pip install av") from None
+        raise MissingDependencyError(f"video is decoded by PyAV, which is missing: {INSTALL}") from None
     return av
