@@ -15,10 +15,10 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
-from calib_ros.datasets.bag_parts import METADATA, BagParts, storage_files, storage_of, typestore
+from calib_ros.datasets.bag_parts import METADATA, BagParts, layout_of, storage_files, storage_of, typestore
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS
-from calib_ros.messages.compressed_points import COMPRESSED_POINTS
+from calib_ros.messages.compressed_points import COMPRESSED_POINTS, REPUBLISH
 from calib_ros.messages.point_fields import LIVOX, decode_livox
 from calib_ros.messages.video import VIDEO
 
@@ -31,6 +31,7 @@ TF = "tf2_msgs/msg/TFMessage"
 REMEDIES = {
     "VelodyneScan": "play the bag, run the transform node of velodyne_pointcloud for your model, and record its cloud",
     "PacketMsg": "play the bag, run the cloud node of ouster_ros, and record its cloud",
+    "CompressedPointCloud2": REPUBLISH,  # of other packages
     "LaserScan": "a scan of one plane has no edges to calibrate by; record a 3-D LiDAR",
 }
 DEPTH = "/compressedDepth"  # how image_transport names the topics of depth images
@@ -65,6 +66,7 @@ class BagFile:
         self.remarks = tuple(self._parts.remarks)
         with self._readable():
             self.topics = _topics(self._parts.connections)
+            self._layouts = {connection.topic: layout_of(connection) for connection in self._parts.connections}
             self.start, self.stop = self._parts.start, self._parts.stop  # recording times, ns
             self.duration_s = (self.stop - self.start) / NANOSECONDS
             self.indexed = self._parts.indexed
@@ -95,7 +97,7 @@ class BagFile:
         if kind in LIVOX:
             return decode_livox(data)
         with self._readable(f"{topic}: "):
-            return self._types.deserialize_cdr(data, kind)
+            return self._types.deserialize_cdr(data, self._layouts[topic])
 
     @contextmanager
     def _readable(self, where: str = "") -> Iterator[None]:

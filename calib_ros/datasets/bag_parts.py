@@ -24,7 +24,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages.compressed_points import CLOUD_DEFINITION, COMPRESSED_POINTS
 from calib_ros.messages.point_fields import CUSTOM_MSG, CUSTOM_POINT, LIVOX
-from calib_ros.messages.video import VIDEO
+from calib_ros.messages.video import FORMER_DEFINITION, FORMER_PACKET, VIDEO
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -45,9 +45,15 @@ def typestore() -> Typestore:
         package = name.partition("/")[0]
         store.register(get_types_from_msg(CUSTOM_POINT, f"{package}/msg/CustomPoint"))
         store.register(get_types_from_msg(CUSTOM_MSG, name))
-    for name, definition in {**VIDEO, COMPRESSED_POINTS: CLOUD_DEFINITION}.items():
+    for name, definition in {**VIDEO, FORMER_PACKET: FORMER_DEFINITION, COMPRESSED_POINTS: CLOUD_DEFINITION}.items():
         store.register(get_types_from_msg(definition, name))
     return store
+
+
+def layout_of(connection: Any) -> str:
+    """The type of `typestore` by which a connection's messages are decoded: of a name that has had two, by its definition."""
+    former = connection.msgtype.endswith("/FFMPEGPacket") and "img_width" in connection.msgdef.data
+    return FORMER_PACKET if former else str(connection.msgtype)
 
 
 def storage_files(folder: Path) -> list[Path]:
@@ -172,7 +178,7 @@ def _messages(reader: Any, topics: Collection[str], start: int | None, stop: int
     is_ros1 = isinstance(reader, Ros1Reader)
     for connection, time, data in reader.messages(connections, start, stop):
         if is_ros1:
-            data = bytes(typestore().ros1_to_cdr(data, connection.msgtype))
+            data = bytes(typestore().ros1_to_cdr(data, layout_of(connection)))
         elif data[:4] == ZSTD:
             data = zstd.decompress(data)
         yield connection.topic, time, data

@@ -20,6 +20,11 @@ VIDEO = {
         "uint8[] data\n"
     ),
 }
+# FFMPEGPacket as in ROS 1, with its own name here.
+FORMER_PACKET = "ffmpeg_image_transport_msgs/msg/FormerFFMPEGPacket"
+FORMER_DEFINITION = (
+    "std_msgs/Header header\nuint8[] data\nint32 img_width\nint32 img_height\nstring encoding\nuint64 pts\nuint8 flags\n"
+)
 # What the format, or the encoder's name as in "libx264;yuv420p;bgr8;bgr8" or "hevc_nvenc", contains -> FFmpeg's decoder.
 CODECS = {"264": "h264", "265": "hevc", "hevc": "hevc", "av1": "libdav1d", "vp9": "vp9"}
 INSTALL = "python3 -m pip install av"

@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 from bag_recorder import MS, START, Recorder
 from compressed_bags import ENCODERS, FFMPEG, FOXGLOVE, encoded, record_video
+from ros_messages import TYPES
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from calib_ros.datasets.bag import BagSource
 from calib_ros.datasets.bag_file import BagFile
 from calib_ros.datasets.bag_video import BagVideo
 from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.messages.video import FORMER_DEFINITION
 
 KEYS = 10
 
@@ -122,6 +127,27 @@ def test_truncated_and_damaged_packets_are_refused_until_the_next_key_frame(tmp_
             bag[position]
     for position in (11, 20):
         assert_shows(bag[position].image, pictures, position)
+
+
+def test_packets_of_ros_1_have_another_layout(tmp_path, pictures):
+    ros1 = get_typestore(Stores.ROS1_NOETIC)
+    ros1.register(get_types_from_msg(FORMER_DEFINITION, FFMPEG))
+    packet = ros1.types[FFMPEG]
+    path = record(tmp_path / "bag", encoded(pictures), FFMPEG, "libx264")
+    with Reader(path) as reader, Ros1Writer(tmp_path / "drive.bag") as writer:
+        own = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=ros1) for c in reader.connections}
+        for connection, time, data in reader.messages():
+            if connection.msgtype == FFMPEG:
+                new = TYPES.deserialize_cdr(data, FFMPEG)
+                stamp = ros1.types["builtin_interfaces/msg/Time"](new.header.stamp.sec, new.header.stamp.nanosec)
+                header = ros1.types["std_msgs/msg/Header"](0, stamp, "cam")
+                written = ros1.serialize_ros1(packet(header, new.data, 192, 128, "libx264", 0, 0), FFMPEG)
+            else:
+                written = TYPES.cdr_to_ros1(data, connection.msgtype)
+            writer.write(own[connection.topic], time, written)
+    bag = BagSource(tmp_path / "drive.bag")
+    assert (len(bag), bag.describe()["kind"]) == (25, "ROS 1 bag")
+    assert_shows(bag[13].image, pictures, 13)
 
 
 def test_other_codecs_and_a_missing_library_say_what_helps(tmp_path, pictures, monkeypatch):
