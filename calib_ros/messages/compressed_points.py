@@ -23,6 +23,8 @@ CLOUD_DEFINITION = (
 )
 REPUBLISH = "republish the cloud as raw (`ros2 run point_cloud_transport republish`) and record that"
 MAX_BYTES = 2**28  # of a cloud: 8 million points of 32 bytes
+MAX_POINTS = MAX_BYTES // 32
+DRACO_HEADER, DRACO_METADATA = 11, 0x80  # bytes; in its last one
 FLOAT64 = 8  # of sensor_msgs/PointField
 GZIP_OR_ZLIB = 32 + zlib.MAX_WBITS  # the plugin writes the former
 
@@ -67,6 +69,12 @@ def _draco(msg: Any, data: bytes) -> PointCloud:
             "clouds compressed by Draco are read with DracoPy, which is missing: python3 -m pip install DracoPy"
         ) from None
     try:
+        count = _draco_points(data)
+    except (IndexError, RecursionError) as error:
+        raise _damaged("Draco", error) from None
+    if not 0 <= count <= min(int(msg.width) * int(msg.height), MAX_POINTS):
+        raise BadInputError(f"CompressedPointCloud2: {count} points of Draco for {msg.width}x{msg.height}; record the bag again")
+    try:
         decoded = DracoPy.decode(data)
         columns: list[NDArray[Any]] = [np.asarray(attribute["data"]) for attribute in decoded.attributes]
     except Exception as error:  # DracoPy has errors of its own
@@ -80,6 +88,36 @@ def _draco(msg: Any, data: bytes) -> PointCloud:
     cloud = cloud_of_columns({name: column for name, column in kept.items() if name not in lost}, stamp_ns(msg.header.stamp))
     problem = f"times as float64 are lost in decoding Draco; {REPUBLISH}"
     return replace(cloud, time_problem=problem) if lost and cloud.time is None else cloud
+
+
+def _draco_points(data: bytes) -> int:
+    """The number of points that a Draco file says it has, for which its decoder takes memory. IndexError if it is truncated."""
+    at = DRACO_HEADER
+
+    def number() -> int:
+        nonlocal at
+        value = shift = 0
+        while True:
+            value, shift, at = value | (data[at] & 127) << shift, shift + 7, at + 1
+            if data[at - 1] < 128:
+                return value
+
+    def skip_metadata() -> None:
+        nonlocal at
+        for _ in range(number()):
+            at += 1 + data[at]  # the name of an entry
+            size = number()  # which moves on, too
+            at += size
+        for _ in range(number()):
+            at += 1 + data[at]
+            skip_metadata()
+
+    if data[DRACO_HEADER - 1] & DRACO_METADATA:
+        for _ in range(number()):  # first those of the attributes
+            number()
+            skip_metadata()
+        skip_metadata()
+    return int.from_bytes(bytes(data[k] for k in range(at, at + 4)), "little", signed=True)
 
 
 def _damaged(kind: str, error: Exception) -> BadInputError:

@@ -40,19 +40,24 @@ def cases(short: int, long: int) -> pytest.MarkDecorator:
     )
 
 
-MESSAGES = ("cloud", "image", "compressed", "camera_info", "video", "compressed_cloud")
-
-
-@compression
 @pytest.mark.parametrize("seed", [0, pytest.param(100, marks=pytest.mark.slow)])
 @cases(300, 3000)
 def test_mutated_messages(seed, count):
     report = fuzz("messages", count, seed)
-    assert total(report, *MESSAGES) == count
+    assert total(report, "cloud", "image", "compressed", "camera_info") == count
     assert report["most"][0] < 100, "MiB for a message of at most 200 kB"
     # Mutations that leave nothing to decode, or nothing to refuse, would show nothing.
-    for kind in (*MESSAGES, "scan in use", "camera in use"):
+    for kind in ("cloud", "image", "compressed", "camera_info", "scan in use", "camera in use"):
         assert min(report["outcomes"][f"{kind} {what}"] for what in ("taken", "refused")) > count // 200
+
+
+@compression
+@cases(200, 3000)
+def test_mutated_videos_and_compressed_clouds(count):
+    report = fuzz("packed", count)
+    assert report["most"][0] < 100, "MiB for a message of at most 200 kB"
+    for kind in ("video", "compressed_cloud"):
+        assert min(report["outcomes"][f"{kind} {what}"] for what in ("taken", "refused")) > count // 10
 
 
 @cases(80, 300)
@@ -77,7 +82,7 @@ def test_mutated_bags_and_folders(count):
     kinds = ("bag_mcap", "bag_sqlite3", "bag_ros1", "bag_compressed", "raw", "odometry", "object", "nuscenes")
     kinds += ("plain", "plain_otherwise")
     assert total(report, *kinds) == count
-    assert min(report["outcomes"][f"{kind} {what}"] for kind in kinds for what in ("taken", "refused")) > count // 90
+    assert min(report["outcomes"][f"{kind} {what}"] for kind in kinds for what in ("taken", "refused")) >= count // 200
 
 
 @compression

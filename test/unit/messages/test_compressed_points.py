@@ -13,6 +13,7 @@ from ros_messages import STAMP, Messages, draco
 from calib_ros.datasets.bag import BagSource
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.messages import decode_cloud, decode_compressed_cloud
+from calib_ros.messages.compressed_points import _draco_points
 
 ROS = Messages("rosbags")
 FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("t", "<u4")]
@@ -73,6 +74,26 @@ def test_times_that_draco_loses_and_fields_that_it_has_not_are_told(monkeypatch)
     monkeypatch.setitem(sys.modules, "DracoPy", None)
     with pytest.raises(MissingDependencyError, match="pip install DracoPy"):
         decode_compressed_cloud(ROS.compressed_cloud(made, "draco"))
+
+
+def test_draco_with_metadata_and_of_too_many_points():
+    library = pytest.importorskip("DracoPy", reason="DracoPy is not installed")
+    made = points()
+    xyz, more = np.c_[made["x"], made["y"], made["z"]], {name: np.c_[made[name]] for name in ("intensity", "ring")}
+    packed = library.encode(
+        xyz, create_metadata=True, quantization_origin=[-99, -99, -99], quantization_range=200, generic_attributes=more
+    )
+    assert _draco_points(packed) == 50
+    for length in range(11, 60):
+        with pytest.raises(IndexError):
+            _draco_points(packed[:length])
+    nested = ROS.compressed_cloud(made, "draco", b"DRACO" + bytes([2, 3, 0, 0, 0, 128, 0]) + bytes([0, 1, 0]) * 5000)
+    with pytest.raises(BadInputError, match="Draco data is damaged"):
+        decode_compressed_cloud(nested)
+    data = bytearray(draco(made))
+    data[13] = 4  # 262,194 points, for which the decoder would take memory
+    with pytest.raises(BadInputError, match="262194 points of Draco for 50x1"):
+        decode_compressed_cloud(ROS.compressed_cloud(made, "draco", bytes(data)))
 
 
 def test_draco_as_its_own_encoder_quantises():
