@@ -17,8 +17,10 @@ VERSION = re.search(r'^__version__ = "(.+?)"', (HERE / PACKAGE / "__init__.py").
 EXTRAS = {
     # ROS 2 bags as sources, `calib-ros convert` and `~/capture`, without a ROS install.
     "bags": ["rosbags"],
-    # PCD, PLY and LAS files of plain folders as sources.
-    "clouds": ["laspy", "lazrs", "pypcd4", "trimesh"],
+    # PCD, PLY and LAS files of plain folders as sources; clouds of bags that Draco compressed.
+    "clouds": ["DracoPy", "laspy", "lazrs", "pypcd4", "trimesh"],
+    # Video topics of bags.
+    "video": ["av"],
     # Classes of pixels and points, which help the search (the built-in network, classes by shape), and Segment Anything.
     "models": ["onnxruntime"],
     # The vehicle's motion from consecutive scans, where no odometry gives it.

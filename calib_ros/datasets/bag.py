@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
@@ -33,12 +34,15 @@ from calib_ros.datasets.bag_index import (
     difference_in_words,
     located,
 )
+from calib_ros.datasets.bag_video import KEY_FRAMES, BagVideo
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.sweep import BLIND_CLOUDS, SweepOffset
-from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image
+from calib_ros.messages import decode_cloud, decode_compressed_cloud, decode_compressed_image, decode_image
+from calib_ros.messages.compressed_points import COMPRESSED_POINTS
+from calib_ros.messages.video import VIDEO
 from calib_ros.stamps import Stamps, nearest_index, nearest_pairs, pair_tolerance, usual_period
 
 # Half widths of windows, in periods of the slower sensor: four hold a frame and its neighbours; of late ones, it takes more.
@@ -98,11 +102,17 @@ class BagSource:
         self.camera_info_topic = choose_camera_info(self._bag, camera_info_topic, self.image_topic)
         self.rectified = is_rectified(self.image_topic) if rectified is None else rectified
         self._tolerance_s, self._motion, self._view = tolerance_s, motion or MotionConfig(), T_camera_lidar
+        is_video = self._bag.topics[self.image_topic].type in VIDEO
+        self._video = BagVideo(self._bag, self.image_topic) if is_video else None
         found = self._read_windows(windows) if windows and self._bag.indexed else None
         if found is None:
             self._index = self._new_index()
             # Of a short bag nearly every message is asked for, some several times.
             self._index.read(keep=bool(windows) and self._bag.size <= MAX_KEPT)
+            if self._index.without_key and not len(self._index.image):
+                raise BadInputError(
+                    f"bag {self.path}: {self.image_topic} has no key frame, with which decoding begins; {KEY_FRAMES}"
+                )
             if self._index.missing:
                 missing = ", ".join(self._index.missing)
                 raise BadInputError(f"bag {self.path}: no message on {missing} is readable; copy it again or record it again")
@@ -122,7 +132,9 @@ class BagSource:
         """What there is to know about the recording, for people."""
         ahead = self._index.clouds_ahead
         clocks = [difference_in_words(ahead, self._index.clock_difference != 0)] if ahead else []
-        return (*self._bag.remarks, *clocks)
+        left_out = self._index.without_key
+        begins = [f"{left_out} pictures before the video's first key frame are left out"] if left_out else []
+        return (*self._bag.remarks, *begins, *clocks)
 
     def _no_pairs(self) -> str:
         image, moments = self._index.image, self._index.cloud.stamps + self._sweep_offset
@@ -200,10 +212,8 @@ class BagSource:
         image_at, cloud_at = (int(positions[index]) for positions in self._pairs)
         stamp = int(self._index.image.stamps[image_at])
         name = f"{stamp // NANOSECONDS}.{stamp % NANOSECONDS:09d}"
-        message = self._fetch(self._index.image, image_at)
-        compressed = self._bag.topics[self.image_topic].type == COMPRESSED
         with located(self.path, f"{self.image_topic} at {name}"):
-            image = decode_compressed_image(message) if compressed else decode_image(message)
+            image = self._image(image_at)
         with located(self.path, f"{self.points_topic} at {name}"):
             cloud = self._cloud(cloud_at)
         with located(self.path, f"{self.image_topic} and {self.camera_info_topic} at {name}"):
@@ -217,9 +227,20 @@ class BagSource:
                 name=name,
             )
 
+    def _image(self, position: int) -> NDArray[np.uint8]:
+        index = self._index.image
+        if self._video is not None:
+            return self._video.picture(int(index.recorded[position]), int(index.headers[position]))
+        message = self._fetch(index, position)
+        compressed = self._bag.topics[self.image_topic].type == COMPRESSED
+        return decode_compressed_image(message) if compressed else decode_image(message)
+
     def _cloud(self, position: int) -> PointCloud:
         message = self._fetch(self._index.cloud, position)
-        return message if isinstance(message, PointCloud) else decode_cloud(message)
+        if isinstance(message, PointCloud):
+            return message
+        compressed = self._bag.topics[self.points_topic].type == COMPRESSED_POINTS
+        return decode_compressed_cloud(message) if compressed else decode_cloud(message)
 
     def _fetch(self, index: TopicIndex, position: int) -> Any:
         recorded = int(index.recorded[position])

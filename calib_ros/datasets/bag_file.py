@@ -15,10 +15,12 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
-from calib_ros.datasets.bag_parts import METADATA, BagParts, storage_files, storage_of, typestore
+from calib_ros.datasets.bag_parts import METADATA, BagParts, layout_of, storage_files, storage_of, typestore
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS
+from calib_ros.messages.compressed_points import COMPRESSED_POINTS, REPUBLISH
 from calib_ros.messages.point_fields import LIVOX, decode_livox
+from calib_ros.messages.video import VIDEO
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -29,10 +31,10 @@ TF = "tf2_msgs/msg/TFMessage"
 REMEDIES = {
     "VelodyneScan": "play the bag, run the transform node of velodyne_pointcloud for your model, and record its cloud",
     "PacketMsg": "play the bag, run the cloud node of ouster_ros, and record its cloud",
+    "CompressedPointCloud2": REPUBLISH,  # of other packages
     "LaserScan": "a scan of one plane has no edges to calibrate by; record a 3-D LiDAR",
-    "CompressedVideo": "play the bag, decode it with `ros2 run image_transport republish`, and record the images",
-    "FFMPEGPacket": "play the bag, decode it with `ros2 run image_transport republish ffmpeg raw`, and record the images",
 }
+DEPTH = "/compressedDepth"  # how image_transport names the topics of depth images
 YAML_MERGE, YAML_ALIAS, MAX_ALIASES = re.compile(rb"<<\s*:"), re.compile(rb"[\s\[{,:]\*\w"), 10  # no recorder writes either
 
 
@@ -64,6 +66,7 @@ class BagFile:
         self.remarks = tuple(self._parts.remarks)
         with self._readable():
             self.topics = _topics(self._parts.connections)
+            self._layouts = {connection.topic: layout_of(connection) for connection in self._parts.connections}
             self.start, self.stop = self._parts.start, self._parts.stop  # recording times, ns
             self.duration_s = (self.stop - self.start) / NANOSECONDS
             self.indexed = self._parts.indexed
@@ -83,13 +86,18 @@ class BagFile:
         with self._readable():
             yield from self._parts.messages(topics, start, stop)
 
+    def heads(self, topics: Collection[str], whole: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """As `raw` of all, about in order, and of topics that are not in `whole` maybe no more than the header."""
+        with self._readable():
+            yield from self._parts.heads(topics, whole)
+
     def decode(self, topic: str, data: bytes) -> Any:
         """CDR bytes -> message of the topic's type, of Livox's own type its PointCloud."""
         kind = self.topics[topic].type
         if kind in LIVOX:
             return decode_livox(data)
         with self._readable(f"{topic}: "):
-            return self._types.deserialize_cdr(data, kind)
+            return self._types.deserialize_cdr(data, self._layouts[topic])
 
     @contextmanager
     def _readable(self, where: str = "") -> Iterator[None]:
@@ -191,24 +199,26 @@ def choose_image(bag: BagFile, requested: str | None) -> str:
     """The image topic: the requested one, or the only one. A raw image wins over its compressed transport."""
     candidates = _with_type(bag, IMAGE, COMPRESSED)
     if requested is None:
-        candidates = [name for name in candidates if not name.endswith("/compressedDepth")]
+        candidates = [name for name in candidates if not name.endswith(DEPTH)]
         transports = {f"{name}/compressed" for name in candidates}
         candidates = [name for name in candidates if name not in transports]
-    return _choose(bag, requested, candidates, "Image or CompressedImage", "image_topic")
+    if requested is not None or not candidates:
+        candidates += _with_type(bag, *VIDEO)
+    return _choose(bag, requested, candidates, "Image, CompressedImage or video", "image_topic")
 
 
 def choose_points(bag: BagFile, requested: str | None) -> str:
     """The cloud topic: the requested one, or the only one."""
     candidates = _with_type(bag, POINTS)
     if requested is not None or not candidates:
-        candidates += _with_type(bag, *LIVOX)
+        candidates += _with_type(bag, *LIVOX, COMPRESSED_POINTS)
     return _choose(bag, requested, candidates, "PointCloud2", "points_topic")
 
 
 def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str) -> str:
     """The requested CameraInfo topic, or the one beside the image (image_transport's rule), or the only one."""
     candidates = _with_type(bag, CAMERA_INFO)
-    beside = re.sub(r"/compressed$", "", image_topic).rpartition("/")[0] + "/camera_info"
+    beside = re.sub(r"/(compressed|ffmpeg|foxglove)$", "", image_topic).rpartition("/")[0] + "/camera_info"
     if requested is None and beside in candidates:
         return beside
     return _choose(bag, requested, candidates, "CameraInfo", "camera_info_topic")
@@ -235,7 +245,9 @@ def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: st
         )
     others = ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics.values()) or "nothing at all"
     names = dict.fromkeys(topic.type.rpartition("/")[2] for topic in bag.topics.values() if topic.messages)
-    advice = "; ".join(f"{name}: {REMEDIES[name]}" for name in names if name in REMEDIES) or "record that topic too"
+    depth = [f"{topic} is a depth image, no camera picture" for topic in bag.topics if topic.endswith(DEPTH)]
+    known = [f"{name}: {REMEDIES[name]}" for name in names if name in REMEDIES]
+    advice = "; ".join([*(depth if option == "image_topic" else []), *known]) or "record that topic too"
     raise BadInputError(f"bag {bag.path} has no {kind} messages, only {others}; {advice}")
 
 

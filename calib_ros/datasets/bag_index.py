@@ -15,6 +15,7 @@ from calib_ros.datasets.bag_file import TF, BagFile, StaticTransforms, peek_head
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import decode_camera_info
+from calib_ros.messages.video import VIDEO, packet_of
 from calib_ros.stamps import Stamps, nearest_index, time_scales
 
 Span = tuple[int, int]  # [start, stop) of recording times, ns
@@ -44,18 +45,35 @@ class BagIndex:
         self._cameras: list[Camera] = []
         self._transforms: list[tuple[int, Any]] = []
         self._kept: dict[tuple[str, int, int], bytes] | None = None
+        self.without_key = 0  # pictures of a video before its first key frame, which are left out
         self._kept_bytes = 0
 
     def read(self, keep: bool = False) -> None:
         """Read the whole bag once. keep: hold messages in memory, as `read_spans` does."""
         if keep:
             self._kept = {}
-        for topic, recorded, data in self._bag.raw([*self._by_topic, *self._statics]):
+        topics, begin = [*self._by_topic, *self._statics], self._first_key()
+        for topic, recorded, data in (
+            self._bag.raw(topics) if keep else self._bag.heads(topics, [self.info.topic, *self._statics])
+        ):
             if topic in self._statics:
                 self._transforms.append((recorded, self._bag.decode(topic, data)))
+            elif topic == self.image.topic and recorded < begin:
+                self.without_key += 1
             else:
                 self._add(topic, recorded, data)
+        self._transforms.sort(key=lambda one: one[0])
         self._finish()
+
+    def _first_key(self) -> int:
+        """Recording time of the first picture that can be decoded, ns."""
+        if self._bag.topics[self.image.topic].type not in VIDEO:
+            return self._bag.start
+        for topic, recorded, data in self._bag.raw([self.image.topic]):
+            with located(self._bag.path, topic):
+                if packet_of(self._bag.decode(topic, data)).is_key:
+                    return recorded
+        return self._bag.stop
 
     def read_spans(self, spans: list[Span]) -> None:
         """Read only what was recorded in these spans, which neither overlap nor have been read; CameraInfo and static transforms

@@ -19,9 +19,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from calib_ros import io
+from calib_ros.datasets.bag_heads import ZSTD, heads, storages_with_heads
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
+from calib_ros.messages.compressed_points import CLOUD_DEFINITION, COMPRESSED_POINTS
 from calib_ros.messages.point_fields import CUSTOM_MSG, CUSTOM_POINT, LIVOX
+from calib_ros.messages.video import FORMER_DEFINITION, FORMER_PACKET, VIDEO
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -32,7 +35,6 @@ METADATA, COMPRESSED = "metadata.yaml", ".zstd"
 STORAGE = {".mcap": "mcap", ".db3": "sqlite3", ".bag": "ROS 1"}
 # ns, between parts of one recording: a recorder opens the next file where it closes the last one.
 MAX_OVERLAP, MAX_PAUSE = NANOSECONDS, 60 * NANOSECONDS
-ZSTD = b"\x28\xb5\x2f\xfd"  # begins what is compressed; a message begins with 0 and its byte order
 
 
 @cache
@@ -43,7 +45,15 @@ def typestore() -> Typestore:
         package = name.partition("/")[0]
         store.register(get_types_from_msg(CUSTOM_POINT, f"{package}/msg/CustomPoint"))
         store.register(get_types_from_msg(CUSTOM_MSG, name))
+    for name, definition in {**VIDEO, FORMER_PACKET: FORMER_DEFINITION, COMPRESSED_POINTS: CLOUD_DEFINITION}.items():
+        store.register(get_types_from_msg(definition, name))
     return store
+
+
+def layout_of(connection: Any) -> str:
+    """The type of `typestore` by which a connection's messages are decoded: of a name that has had two, by its definition."""
+    former = connection.msgtype.endswith("/FFMPEGPacket") and "img_width" in connection.msgdef.data
+    return FORMER_PACKET if former else str(connection.msgtype)
 
 
 def storage_files(folder: Path) -> list[Path]:
@@ -96,16 +106,18 @@ class BagParts:
     def messages(self, topics: Collection[str], start: int | None, stop: int | None) -> Iterator[tuple[str, int, bytes]]:
         """(topic, time of recording in ns, CDR bytes) of messages recorded in [start, stop), part by part."""
         for reader in self._readers:
-            connections = [c for c in reader.connections if c.topic in topics]
-            if not connections:  # rosbags reads an empty list as "all"
-                continue
-            is_ros1 = isinstance(reader, Ros1Reader)
-            for connection, time, data in reader.messages(connections, start, stop):
-                if is_ros1:
-                    data = bytes(typestore().ros1_to_cdr(data, connection.msgtype))
-                elif data[:4] == ZSTD:
-                    data = zstd.decompress(data)
-                yield connection.topic, time, data
+            yield from _messages(reader, topics, start, stop)
+
+    def heads(self, topics: Collection[str], whole: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """As all `messages`, but only the beginnings of those that are not of the topics `whole`, where that is less to read."""
+        for reader in self._readers:
+            storages = storages_with_heads(reader)
+            if storages is None:
+                yield from _messages(reader, topics, None, None)
+            else:
+                for storage in storages:
+                    for topic, time, data in heads(storage, topics, whole):
+                        yield topic, time, zstd.decompress(data) if data[:4] == ZSTD else data
 
     def _of_folder(self, path: Path, incomplete: bool) -> list[Any]:
         parts = storage_files(path)
@@ -157,6 +169,19 @@ class BagParts:
         reader.open()
         self._stack.callback(_close, reader)
         return reader
+
+
+def _messages(reader: Any, topics: Collection[str], start: int | None, stop: int | None) -> Iterator[tuple[str, int, bytes]]:
+    connections = [c for c in reader.connections if c.topic in topics]
+    if not connections:  # rosbags reads an empty list as "all"
+        return
+    is_ros1 = isinstance(reader, Ros1Reader)
+    for connection, time, data in reader.messages(connections, start, stop):
+        if is_ros1:
+            data = bytes(typestore().ros1_to_cdr(data, layout_of(connection)))
+        elif data[:4] == ZSTD:
+            data = zstd.decompress(data)
+        yield connection.topic, time, data
 
 
 def _listed(metadata: Path) -> list[str]:

@@ -220,7 +220,8 @@ class ScanMotion:
 
     def times(self, cloud: PointCloud, number: int) -> NDArray[np.float32]:
         """(n,) s after the scan's stamp, at which the scanner, which turns clockwise, faces forward."""
-        azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
+        with np.errstate(invalid="ignore"):  # signalling NaN of a damaged file
+            azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
         return np.asarray(-azimuth * (self.period_s(number) / (2 * np.pi)), np.float32)
 
 

@@ -196,7 +196,9 @@ def _cut(azimuth: Angles, step: Angles, turn: float) -> float:
     cell = ((after + np.pi) / CUT_BIN).astype(np.intp)
     count = np.bincount(cell, minlength=round(2 * np.pi / CUT_BIN) + 1)
     best = int(np.argmax(count + np.roll(count, 1)))
-    return float(np.median(after[(cell == best) | (cell == best - 1)]) - 0.5 * turn)
+    near = after[(cell == best) | (cell == (best - 1) % len(count))]
+    near = np.where(near > best * CUT_BIN, near - 2 * np.pi, near)  # both sides of half a turn, if the cell is the first
+    return float(np.median(near) - 0.5 * turn)
 
 
 def _ring_field(cloud: PointCloud) -> NDArray[np.int32] | None:

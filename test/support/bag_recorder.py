@@ -90,9 +90,16 @@ class Recorder:
         message.header = self.ros.header(stamp, "cam")
         self.write(topic, message, stamp)
 
-    def info(self, stamp: int, topic: str = "/cam/camera_info", fx: float = 5.0, time: int | None = None) -> None:
+    def info(
+        self,
+        stamp: int,
+        topic: str = "/cam/camera_info",
+        fx: float = 5.0,
+        time: int | None = None,
+        size: tuple[int, int] = (8, 6),
+    ) -> None:
         matrix = np.array([[fx, 0, 4], [0, fx, 3], [0, 0, 1]])
-        message = self.ros.camera_info(8, 6, matrix, [0.1, 0, 0, 0, 0], np.c_[matrix * [[2], [2], [1]], np.zeros(3)])
+        message = self.ros.camera_info(*size, matrix, [0.1, 0, 0, 0, 0], np.c_[matrix * [[2], [2], [1]], np.zeros(3)])
         message.header = self.ros.header(stamp, "cam")
         self.write(topic, message, stamp if time is None else time)
 

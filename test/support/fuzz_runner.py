@@ -1,6 +1,6 @@
 """The fuzzer's own process: its memory is limited, a hang ends it with a stack, and what it found goes to stdout as JSON.
 
-python -W error fuzz_runner.py messages|pipeline|texts|folders|cli SEED COUNT
+python -W error fuzz_runner.py messages|packed|pipeline|texts|folders|cli SEED COUNT
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from compressed_bags import ENCODERS, FOXGLOVE, video_message
 from fuzzing import HEIGHT, STAMP, WIDTH, K, MessageFuzzer, damage_folder, scan, text_file
 from paths import ROOT
 from sample_sources import originals
@@ -32,7 +33,15 @@ from calib_ros.config import Config, SemanticsConfig, load_stages
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image, stamp_ns
+from calib_ros.messages import (
+    decode_camera_info,
+    decode_cloud,
+    decode_compressed_cloud,
+    decode_compressed_image,
+    decode_image,
+    stamp_ns,
+)
+from calib_ros.messages.video import VideoDecoder, packet_of, picture_of
 from calib_ros.online.events import ExtrinsicUpdated, Inputs, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
@@ -158,6 +167,27 @@ def messages(run: Run, seed: int, count: int) -> None:
             image = run.case(kind, label, lambda m=message, d=decoder: d(m))
             if image is not None and k % 3 == 0:
                 run.case("picture in use", label, lambda i=image: ingest(Frame(i, good.cloud, CAMERA, STAMP, STAMP)))
+
+
+def packed(run: Run, seed: int, count: int) -> None:
+    """Video and compressed clouds, of which rclpy has no messages."""
+    fuzzer = MessageFuzzer(seed, "rosbags")
+    for codec in ENCODERS:  # their libraries, before memory is limited
+        watch([video_message(fuzzer.make, FOXGLOVE, codec, fuzzer.make.header(), one) for one in fuzzer.packets_of(codec)])
+    decode_compressed_cloud(fuzzer.make.compressed_cloud(np.zeros(3, [(name, "<f4") for name in "xyz"]), "draco"))
+    run.start()
+    for k in range(count):
+        kind, decoder = (("video", watch), ("compressed_cloud", decode_compressed_cloud))[k % 2]
+        message = getattr(fuzzer, kind)()
+        run.case(kind, f"{kind} {k}", lambda d=decoder, m=message: d(m))
+
+
+def watch(messages: list[Any]) -> None:
+    """What a bag does with a video topic from a key frame on."""
+    decoder = VideoDecoder(packet_of(messages[0]).codec)
+    for number, message in enumerate(messages):
+        for _, picture in decoder.decode(packet_of(message).data, number):
+            picture_of(picture)
 
 
 def in_use(camera: Camera, good: Frame) -> None:
@@ -349,6 +379,7 @@ if __name__ == "__main__":
     warnings.simplefilter("error")
     what, first, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     this = Run()
-    {"messages": messages, "pipeline": pipeline, "texts": texts, "folders": folders, "cli": cli}[what](this, first, number)
+    work = {"messages": messages, "packed": packed, "pipeline": pipeline, "texts": texts, "folders": folders, "cli": cli}
+    work[what](this, first, number)
     sys.__stdout__.write(json.dumps(this.report()) + "\n")
     sys.__stdout__.flush()

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from compressed_bags import ENCODERS, FFMPEG, FOXGLOVE, encoded, video_message
 from ros_messages import Messages
 
 from calib_ros.messages.image_encodings import ENCODINGS
@@ -55,6 +56,7 @@ class MessageFuzzer:
     def __init__(self, seed: int, family: str) -> None:
         self.rng = np.random.default_rng(seed)
         self.make = Messages(family)
+        self.packets: dict[str, list[bytes]] = {}
         self.sizes = WILD_SIZES if family == "rosbags" else SIZES
 
     # ---- choices ------------------------------------------------------------------------------------------------------
@@ -209,6 +211,42 @@ class MessageFuzzer:
             data = b"P5\n60000 60000\n255\n" + data
         layout = self.one(("jpeg", "png", "bgr8; jpeg compressed bgr8", "bayer_rggb8; png compressed", "16UC1; compressedDepth"))
         return self.make.compressed(self.one(TEXTS) if self.chance(0.2) else layout, data)
+
+    def video(self) -> list[Any]:
+        """Messages of a few pictures, of a type and a codec, of which some are changed, lost or in another place."""
+        codec, kind = self.one(tuple(ENCODERS)), self.one((FOXGLOVE, FFMPEG))
+        out = []
+        for packet in self.packets_of(codec):
+            data = self.damaged(packet) if self.chance(0.15) else packet
+            layout = self.one((*TEXTS, *ENCODERS)) if self.chance(0.05) else codec
+            out.append(video_message(self.make, kind, layout, self.make.header(), data))
+        if self.chance(0.2):
+            out.insert(int(self.rng.integers(len(out))), out.pop(int(self.rng.integers(len(out)))))
+        return out[int(self.chance(0.1)) :]
+
+    def packets_of(self, codec: str) -> list[bytes]:
+        if codec not in self.packets:
+            self.packets[codec] = encoded([self.picture() for _ in range(5)], codec, 3)
+        return self.packets[codec]
+
+    def compressed_cloud(self) -> Any:
+        kinds = [(name, "<f4") for name in ("x", "y", "z", "intensity")] + [("ring", "<u2"), ("time", self.one(("<f4", "<f8")))]
+        columns = scan(self.rng, 4, 30)
+        points = np.zeros(120, kinds)
+        for name in points.dtype.names or ():
+            points[name] = self._column(name, points.dtype[name], columns)
+        layout = self.one(("zlib", "zstd", "draco", "draco"))
+        message = self.make.compressed_cloud(points, layout)
+        for _ in range(int(self.one((0, 1, 1, 2)))):
+            how = self.one((self._cloud_size, self._field, self._fields, self._layout, self._packed, self._packed))
+            how(message)
+        return message
+
+    def _layout(self, message: Any) -> None:
+        message.format = self.one((*TEXTS, "zlib", "zstd", "draco", "cloudini"))
+
+    def _packed(self, message: Any) -> None:
+        message.compressed_data = self.make.data(self.damaged(bytes(message.compressed_data)))
 
     # ---- cameras ------------------------------------------------------------------------------------------------------
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from compressed_bags import compressed_bag
 from fuzzing import STAMP, K
 
 from calib_ros.camera import Camera
@@ -175,7 +177,7 @@ def nuscenes(folder: Path) -> None:
 
 
 def originals(root: Path) -> list[Path]:
-    """Three bags, three KITTI drives, two plain folders and nuScenes, intact."""
+    """Four bags, three KITTI drives, two plain folders and nuScenes, intact."""
     out = [write_bag(Listed(frames()), root / f"bag_{storage}", storage) for storage in ("mcap", "sqlite3")]
     for layout in ("raw", "odometry", "object"):
         folder = root / layout
@@ -186,4 +188,5 @@ def originals(root: Path) -> list[Path]:
         make(root / make.__name__)
         out.append(root / make.__name__)
     ros1(root / "bag_ros1")
-    return [*out, root / "bag_ros1"]
+    out.append(root / "bag_ros1")
+    return [*out, compressed_bag(out[0], root / "bag_compressed")] if find_spec("av") else out

@@ -12,6 +12,7 @@ from bag_recorder import DISTORTED, MS, PINHOLE, START, STORAGES, T_CAMERA_LIDAR
 from ros_messages import TYPES
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
+from rosbags.typesys import get_types_from_msg
 from sample_sources import Listed
 
 from calib_ros.camera import Camera
@@ -341,6 +342,24 @@ def test_missing_types_and_pairs_are_named(tmp_path):
         BagSource(tmp_path / "empty")
 
 
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("velodyne_msgs/msg/VelodyneScan", "play the bag, run the .* node of velodyne_pointcloud"),
+        ("ouster_sensor_msgs/msg/PacketMsg", "play the bag, run the .* node of ouster_ros"),
+        ("draco_point_cloud_transport/msg/CompressedPointCloud2", "ros2 run point_cloud_transport republish"),
+    ],
+)
+def test_packets_are_refused_with_what_makes_clouds(tmp_path, kind, says):
+    with Recorder(tmp_path / "bag") as record:
+        record.image(START)
+        record.info(START)
+        TYPES.register(get_types_from_msg("uint8[] buf", kind))
+        record.write("/packets", TYPES.types[kind](np.zeros(9, np.uint8)), START)
+    with pytest.raises(BadInputError, match=f"no PointCloud2 messages, only .*{says}"):
+        BagSource(tmp_path / "bag")
+
+
 def test_compressed_images(tmp_path):
     with Recorder(tmp_path / "bag") as record:
         record.compressed(START, "/cam/image_raw/compressed")
@@ -349,6 +368,14 @@ def test_compressed_images(tmp_path):
         record.cloud(START)
     bag = BagSource(tmp_path / "bag")
     assert (bag[0].image == 9).all()
+    with pytest.raises(BadInputError, match="this is a depth image"):
+        BagSource(tmp_path / "bag", "/cam/image_raw/compressedDepth")[0]
+    with Recorder(tmp_path / "depth") as record:
+        record.compressed(START, "/cam/depth/compressedDepth", "16UC1; compressedDepth png")
+        record.info(START)
+        record.cloud(START)
+    with pytest.raises(BadInputError, match=r"; /cam/depth/compressedDepth is a depth image, no camera picture"):
+        BagSource(tmp_path / "depth")
     with Recorder(tmp_path / "both") as record:
         record.trio(START, value=3)
         record.compressed(START, "/cam/image_raw/compressed")

@@ -132,7 +132,7 @@ def test_bags_of_ros_1(tmp_path):
     for i in range(3):
         assert_same(bag[i], expected[i])
     path.write_bytes(path.read_bytes()[:-200])
-    assert "record it again" in use(path)
+    assert "rosbag reindex" in use(path)
 
 
 def test_livox_clouds(tmp_path):

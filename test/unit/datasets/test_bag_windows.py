@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from bag_recorder import MS, PINHOLE, START, STORAGES, A, B, Recorder, assert_same, frame
-from rosbags.rosbag2 import CompressionMode
+from rosbags.rosbag2 import CompressionMode, Reader
 from sample_sources import Listed
 from test_bag_files import COMPRESSED, storage_of
 
@@ -33,7 +33,7 @@ def read() -> int:
 before = read()
 for windows in sys.argv[2:]:
     with BagSource(sys.argv[1], windows=int(windows)) as bag:
-        for middle in bag.middles:
+        for middle in bag.middles or [len(bag) // 2]:
             for position in (middle - 1, middle, middle + 1):
                 bag[position]
     before, now = read(), before
@@ -89,12 +89,14 @@ def test_windows_cost_a_fraction_of_the_bytes(tmp_path, storage):
     large = [replace(frame(i, points=10_000), camera=camera, image=image) for i in range(100)]
     path = write_bag(Listed(large), tmp_path / "bag", storage)
 
-    done = subprocess.run([sys.executable, "-c", BYTES, path, "3", "30"], capture_output=True, text=True, check=True)
-    few, many = map(int, done.stdout.split())
+    done = subprocess.run([sys.executable, "-c", BYTES, path, "3", "30", "0"], capture_output=True, text=True, check=True)
+    few, many, whole = map(int, done.stdout.split())
     size = storage_of(path).stat().st_size
     assert 15 * 316_000 * 0.5 < few < 0.3 * size
     # Windows that would cover the bag: it is read once, and kept.
     assert size < many < 1.1 * size
+    # Of the whole bag only the beginnings of messages, and the chunks of three frames.
+    assert 3 * 316_000 < whole < 0.3 * size
 
 
 def without_index(path: Path) -> Path:
@@ -114,6 +116,25 @@ def test_an_mcap_file_without_index_is_read_as_a_whole(tmp_path):
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(BadInputError, match="mcap recover"):
         BagSource(path, windows=4)
+
+
+def test_an_index_that_names_other_messages_is_told(tmp_path):
+    path = record(tmp_path / "bag", trio)
+    file = storage_of(path)
+    with Reader(path) as reader:
+        at = reader.storage.storages[0].chunks[0].message_index_offsets[1] + 9 + 6 + 8  # where the first message of a topic is
+    whole = file.read_bytes()
+    file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+    with pytest.raises(BadInputError, match=r"an index of messages is damaged.*mcap recover"):
+        BagSource(path)
+
+
+def test_messages_compressed_one_by_one_are_read_without_metadata(tmp_path):
+    path = record(tmp_path / "bag", trio, "sqlite3", compression=CompressionMode.MESSAGE)
+    stamps = [BagSource(path)[k].stamp for k in (0, MESSAGES - 1)]
+    (path / "metadata.yaml").unlink()
+    bag = BagSource(path)
+    assert [bag[k].stamp for k in (0, MESSAGES - 1)] == stamps
 
 
 def test_a_short_bag_is_read_as_a_whole(tmp_path):

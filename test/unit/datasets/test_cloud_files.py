@@ -72,7 +72,13 @@ def written(path: Path, columns: dict[str, np.ndarray]) -> None:
         path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + body)
     elif path.suffix in (".las", ".laz"):
         laspy = pytest.importorskip("laspy")
-        file = laspy.create(point_format=1, file_version="1.2")
+        file = laspy.create(
+            **(
+                {"point_format": 1, "file_version": "1.2"}
+                if path.suffix == ".las"
+                else {"point_format": 6, "file_version": "1.4"}
+            )
+        )
         file.header.scales = [2.0**-20] * 3
         file.x, file.y, file.z = (np.nan_to_num(columns[axis].astype(float)) for axis in "xyz")
         file.intensity, file.gps_time = np.round(columns["intensity"] * 65535).astype(np.uint16), columns["time"]

@@ -16,6 +16,7 @@ from calib_ros.frame import PointCloud
 from calib_ros.lidar.deskew import scan_times
 from calib_ros.lidar.edges import edge_points
 from calib_ros.lidar.range_image import range_image
+from calib_ros.lidar.rings import _cut
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose, upright
 
 CONFIG = LidarConfig()
@@ -144,3 +145,11 @@ def test_times_by_azimuth_are_those_about_the_scanner(scan, shift):
     over, turned = mounted(scan, shift, (180.0, 0.0, 0.0))
     by_azimuth = scan_times(over.xyz, MotionConfig(), turned)
     assert np.abs(by_azimuth + expected)[inside].max() < 1e-6  # it turns the other way as seen from above
+
+
+@pytest.mark.parametrize("others", [np.pi, 0.002 - np.pi])
+def test_rings_may_end_half_a_turn_from_the_view(others):
+    """Where the azimuth jumps: in the last cell of the histogram, and in the first."""
+    azimuth = np.full(51, np.pi)
+    azimuth[::2] = others
+    assert np.cos(_cut(azimuth, np.ones(50), 0.0)) == pytest.approx(-1, abs=1e-5)
