@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -22,27 +21,16 @@ PRECISE, EXACT = 1e-6, 1e-11  # of the image plane: of rays that count as found;
 
 @dataclass(frozen=True)
 class LensModel:
-    """What is known of a model, for all lenses of it.
-
-    names: of the coefficients, in their order. counts: how many may be given. image: (D, rays (n, 3)) -> (n, 2), for rays within
-    the domain. domain: D -> angle from the axis, rad, at which the formula ends. within: limits of coefficients, exclusive.
-    off_radius: places of those that move the image otherwise than along the radius; all are odd in the position.
-    """
+    """names: of the coefficients, in their order. counts: how many may be given. image: (D, rays (n, 3)) -> (n, 2), for rays
+    within the domain. domain: D -> angle from the axis, rad, at which the formula ends. within: open intervals of the first
+    coefficients. off_radius: places of those that move the image off the radius; all are odd in the position."""
 
     names: tuple[str, ...]
     counts: tuple[int, ...]
     image: Callable[[Floats, Floats], Floats]
     domain: Callable[[Floats], float]
-    within: Mapping[str, tuple[float, float]] = field(default_factory=lambda: MappingProxyType({}))
+    within: tuple[tuple[float, float], ...] = ()
     off_radius: tuple[int, ...] = ()
-
-    def problem(self, D: Floats) -> str:
-        """What is wrong with coefficients (n,) of a number that fits; empty = nothing."""
-        for name, value in zip(self.names, D, strict=False):
-            low, high = self.within.get(name, (-np.inf, np.inf))
-            if not low < value < high:
-                return f"{name} = {value:g} is not between {low:g} and {high:g}"
-        return ""
 
 
 class LensProjection:
@@ -53,12 +41,11 @@ class LensProjection:
 
     @property
     def model(self) -> LensModel:
-        """What all lenses of the model share; its functions cannot be copied with a camera."""
+        """Looked up: functions cannot be copied with a camera."""
         return LENSES[self.name]
 
     @property
     def limit(self) -> float:
-        """The end of the table."""
         return float(self._table[0][-1])
 
     @cached_property
@@ -72,9 +59,7 @@ class LensProjection:
         angle = np.linspace(0, self.model.domain(self.D), ANGLES)
         angle[-1] *= 1 - STEP  # before the pole
         radius = self.radius(angle)
-        with np.errstate(invalid="ignore"):
-            falls = np.flatnonzero(~(np.diff(radius) > 0))
-        end = max(int(falls[0]), 1) if len(falls) else ANGLES  # the turn may be just before the last that rises
+        end = _rises(radius)
         return angle[:end], radius[:end]
 
     def radius(self, angle: Floats) -> Floats:
@@ -195,9 +180,15 @@ def _division_table(D: Floats) -> tuple[Floats, Floats]:
     """Angles from the axis, rad, up to where they stop to rise with the distance from the centre, and these distances."""
     r = np.tan(np.linspace(0, np.deg2rad(89.9), ANGLES))
     angle = np.arctan2(r, np.polyval(_even(D), r))
-    falls = np.flatnonzero(np.diff(angle) <= 0)
-    end = int(falls[0]) + 1 if len(falls) else ANGLES
+    end = _rises(angle)
     return angle[:end], r[:end]
+
+
+def _rises(values: Floats) -> int:
+    """How many of the first values (n,) rise for certain: the turn may be just before the last that is higher."""
+    with np.errstate(invalid="ignore"):
+        falls = np.flatnonzero(~(np.diff(values) > 0))
+    return max(int(falls[0]), 1) if len(falls) else len(values)
 
 
 def _behind(w: float) -> float:
@@ -229,52 +220,39 @@ LENSES = {
     ),
     "equidistant": LensModel(tuple(f"k{n}" for n in range(1, 9)), (4, 5, 6, 7, 8), _kannala_brandt, lambda D: np.pi),
     "omnidir": LensModel(
-        ("xi", "k1", "k2", "p1", "p2"), (1, 5), _mei, lambda D: _behind(min(D[0], 1 / D[0]) if D[0] > 0 else D[0]),
-        {"xi": _SPHERE}, (3, 4),
+        ("xi", "k1", "k2", "p1", "p2"), (1, 5), _mei, lambda D: _behind(1 / D[0] if D[0] > 1 else D[0]), (_SPHERE,), (3, 4)
     ),
-    "double_sphere": LensModel(
-        ("xi", "alpha"), (2,), _double_sphere, _double_sphere_domain, {"xi": _SPHERE, "alpha": _SHARE}
-    ),
-    "eucm": LensModel(("alpha", "beta"), (2,), _eucm, _eucm_domain, {"alpha": _SHARE, "beta": (0.0, np.inf)}),
-    "ucm": LensModel(
-        ("alpha",), (1,), lambda D, rays: _eucm(np.r_[D, 1.0], rays), lambda D: _behind(_lesser(D[0])), {"alpha": _SHARE}
-    ),
-    "fov": LensModel(("w",), (1,), _fov, lambda D: np.pi, {"w": (0.0, np.pi)}),
+    "double_sphere": LensModel(("xi", "alpha"), (2,), _double_sphere, _double_sphere_domain, (_SPHERE, _SHARE)),
+    "eucm": LensModel(("alpha", "beta"), (2,), _eucm, _eucm_domain, (_SHARE, (0.0, np.inf))),
+    "ucm": LensModel(("alpha",), (1,), lambda D, rays: _eucm(np.r_[D, 1.0], rays), lambda D: _behind(_lesser(D[0])), (_SHARE,)),
+    "fov": LensModel(("w",), (1,), _fov, lambda D: np.pi, ((0.0, np.pi),)),
     "division": LensModel(("k1", "k2", "k3"), (1, 2, 3), _division, lambda D: float(_division_table(D)[0][-1])),
 }  # fmt: skip
 PERSPECTIVE = ("plumb_bob", "rational_polynomial")  # what OpenCV makes maps for
 ALIASES = {
-    "": "plumb_bob",
-    "none": "plumb_bob",
-    "pinhole": "plumb_bob",
-    "radtan": "plumb_bob",
-    "radtan8": "rational_polynomial",
-    "rational": "rational_polynomial",
-    "thin_prism": "rational_polynomial",
-    "equi": "equidistant",
-    "fisheye": "equidistant",
-    "kannala_brandt": "equidistant",
-    **{f"kb{n}": "equidistant" for n in LENSES["equidistant"].counts},
-    **dict.fromkeys(("mei", "omni", "omni_radtan", "unified"), "omnidir"),
-    "ds": "double_sphere",
-    "extended_unified": "eucm",
-    "atan": "fov",
+    "plumb_bob": ("", "none", "pinhole", "radtan"),
+    "rational_polynomial": ("rational", "radtan8", "thin_prism"),
+    "equidistant": ("equi", "fisheye", "kannala_brandt", "kb4", "kb5", "kb6", "kb7", "kb8"),
+    "omnidir": ("mei", "omni", "omni_radtan", "unified"),
+    "double_sphere": ("ds",),
+    "eucm": ("extended_unified",),
+    "fov": ("atan",),
 }
+_MODEL_OF = {alias: model for model, aliases in ALIASES.items() for alias in aliases}
 
 
 def lens_model(name: str) -> str:
     """The name in LENSES of a model as ROS, Kalibr, basalt, OpenCV and others call it; lower case if it is none."""
-    plain = "_".join(name.lower().replace("-", " ").split())
-    plain = plain.removeprefix("pinhole_").removesuffix("_none")
-    return ALIASES.get(plain, plain)
+    plain = "_".join(name.lower().replace("-", " ").split()).removeprefix("pinhole_").removesuffix("_none")
+    return _MODEL_OF.get(plain, plain)
 
 
 def refuse(model: str, D: Floats) -> None:
     """BadInputError if coefficients (n,), not all 0, are no lens of a model."""
-    counts = LENSES[model].counts if model in LENSES else ()
-    if len(D) not in counts:
-        expected = " or ".join(map(str, counts)) or "no"
+    own = LENSES.get(model)
+    if own is None or len(D) not in own.counts:
+        expected = " or ".join(map(str, own.counts)) if own else "no"
         raise BadInputError(f"CameraInfo: {model} has {expected} distortion coefficients, got {len(D)}")
-    problem = LENSES[model].problem(D)
-    if problem:
-        raise BadInputError(f"CameraInfo: {model}: {problem}; calibrate the camera's intrinsics again")
+    for name, value, (low, high) in zip(own.names, D, own.within, strict=False):
+        if not low < value < high:
+            raise BadInputError(f"CameraInfo: {model}: {name} = {value:g} is not between {low:g} and {high:g}; calibrate again")
