@@ -112,10 +112,6 @@ def _directions(at: Floats) -> Floats:
     return np.asarray(np.c_[at * np.sinc(angle / np.pi)[:, None], np.cos(angle)])
 
 
-def _flat(x: Floats, y: Floats, z: Floats) -> Floats:
-    return np.asarray(np.c_[x, y] / z[:, None])
-
-
 def _opencv(D: Floats, rays: Floats) -> Floats:
     """OpenCV's model of perspective lenses: radial, tangential, rational, thin prism, tilt."""
     zero = np.zeros(3)
@@ -124,62 +120,47 @@ def _opencv(D: Floats, rays: Floats) -> Floats:
 
 def _mei(D: Floats, rays: Floats) -> Floats:
     """C. Mei, P. Rives: Single view point omnidirectional camera calibration from planar grids, 2007."""
-    x, y, z = rays.T
-    return _opencv(D[1:] if len(D) > 1 else np.zeros(4), np.c_[x, y, z + D[0] * np.linalg.norm(rays, axis=1)])
+    z = rays[:, 2] + D[0] * np.linalg.norm(rays, axis=1)
+    return _opencv(D[1:] if len(D) > 1 else np.zeros(4), np.c_[rays[:, :2], z])
 
 
 def _double_sphere(D: Floats, rays: Floats) -> Floats:
     """V. Usenko et al.: The double sphere camera model, 2018."""
-    (x, y, z), (xi, alpha) = rays.T, D
-    first = z + xi * np.linalg.norm(rays, axis=1)
-    return _flat(x, y, alpha * np.sqrt(x * x + y * y + first * first) + (1 - alpha) * first)
+    z = rays[:, 2] + D[0] * np.linalg.norm(rays, axis=1)
+    return _eucm(np.array([D[1], 1.0]), np.c_[rays[:, :2], z])
 
 
 def _eucm(D: Floats, rays: Floats) -> Floats:
     """B. Khomutenko et al.: An enhanced unified camera model, 2016."""
-    (x, y, z), alpha, beta = rays.T, D[0], D[1]
-    return _flat(x, y, alpha * np.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z)
+    r, z = np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]
+    return np.asarray(rays[:, :2] / (D[0] * np.sqrt(D[1] * r * r + z * z) + (1 - D[0]) * z)[:, None])
 
 
-def _kannala_brandt(D: Floats, rays: Floats) -> Floats:
+def _by_angle(radius: Callable[[Floats, Floats], Floats]) -> Callable[[Floats, Floats], Floats]:
+    """The image by the distance from the centre at angles from the axis: (D, angle (n,)) -> (n,)."""
+
+    def image(D: Floats, rays: Floats) -> Floats:
+        r = np.hypot(rays[:, 0], rays[:, 1])
+        return np.asarray(rays[:, :2] * (radius(D, np.arctan2(r, rays[:, 2])) / np.maximum(r, 1e-300))[:, None])
+
+    return image
+
+
+def _kannala_brandt(D: Floats, angle: Floats) -> Floats:
     """J. Kannala, S. Brandt, 2006, without their asymmetric terms: r = a (1 + k1 a^2 + k2 a^4 + ...)."""
-    r = np.hypot(rays[:, 0], rays[:, 1])
-    angle = np.arctan2(r, rays[:, 2])
-    return np.asarray(rays[:, :2] * (angle * np.polyval(_even(D), angle) / np.maximum(r, 1e-300))[:, None])
+    return np.asarray(angle * np.polyval([*D[::-1], 1.0], angle * angle))
 
 
-def _fov(D: Floats, rays: Floats) -> Floats:
+def _fov(D: Floats, angle: Floats) -> Floats:
     """F. Devernay, O. Faugeras: Straight lines have to be straight, 2001."""
-    r = np.hypot(rays[:, 0], rays[:, 1])
-    radius = np.arctan2(2 * r * np.tan(D[0] / 2), rays[:, 2]) / D[0]
-    return np.asarray(rays[:, :2] * (radius / np.maximum(r, 1e-300))[:, None])
+    return np.asarray(np.arctan2(2 * np.sin(angle) * np.tan(D[0] / 2), np.cos(angle)) / D[0])
 
 
-def _division(D: Floats, rays: Floats) -> Floats:
+def _division(D: Floats) -> tuple[Floats, Floats]:
     """A. Fitzgibbon: Simultaneous linear estimation of multiple view geometry and lens distortion, 2001: the ray of a point at r
-    is (r, 1 + k1 r^2 + k2 r^4 + ...). The least r by Newton's method, from a table."""
-    flat = np.hypot(rays[:, 0], rays[:, 1])
-    angle = np.arctan2(flat, rays[:, 2])
-    z, r = _even(D), np.interp(angle, *_division_table(D))
-    s, c = np.sin(angle), np.cos(angle)
-    for _ in range(4):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            change = (s * np.polyval(z, r) - r * c) / (s * np.polyval(np.polyder(z), r) - c)
-        r = r - np.where(np.abs(change) < 0.1 + 0.1 * r, change, 0)  # at the limit the derivative is 0
-    return np.asarray(rays[:, :2] * (r / np.maximum(flat, 1e-300))[:, None])
-
-
-def _even(D: Floats) -> Floats:
-    """1 + k1 r^2 + k2 r^4 + ..., as numpy takes polynomials."""
-    out = np.zeros(2 * len(D) + 1)
-    out[::-2] = 1, *D
-    return out
-
-
-def _division_table(D: Floats) -> tuple[Floats, Floats]:
-    """Angles from the axis, rad, up to where they stop to rise with the distance from the centre, and these distances."""
-    r = np.tan(np.linspace(0, np.deg2rad(89.9), ANGLES))
-    angle = np.arctan2(r, np.polyval(_even(D), r))
+    is (r, 1 + k1 r^2 + k2 r^4 + ...). A table of angles from the axis, up to the limit, and r."""
+    r = np.tan(np.linspace(0, np.deg2rad(89.9), 10 * ANGLES))  # between its entries r is straight to 1e-7
+    angle = np.arctan2(r, np.polyval([*D[::-1], 1.0], r * r))
     end = _rises(angle)
     return angle[:end], r[:end]
 
@@ -218,15 +199,18 @@ LENSES = {
         ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty"), (8, 12, 14),
         _opencv, lambda D: np.pi / 2, off_radius=(2, 3, *range(8, 14)),
     ),
-    "equidistant": LensModel(tuple(f"k{n}" for n in range(1, 9)), (4, 5, 6, 7, 8), _kannala_brandt, lambda D: np.pi),
+    "equidistant": LensModel(tuple(f"k{n}" for n in range(1, 9)), (4, 5, 6, 7, 8), _by_angle(_kannala_brandt), lambda D: np.pi),
     "omnidir": LensModel(
         ("xi", "k1", "k2", "p1", "p2"), (1, 5), _mei, lambda D: _behind(1 / D[0] if D[0] > 1 else D[0]), (_SPHERE,), (3, 4)
     ),
     "double_sphere": LensModel(("xi", "alpha"), (2,), _double_sphere, _double_sphere_domain, (_SPHERE, _SHARE)),
     "eucm": LensModel(("alpha", "beta"), (2,), _eucm, _eucm_domain, (_SHARE, (0.0, np.inf))),
     "ucm": LensModel(("alpha",), (1,), lambda D, rays: _eucm(np.r_[D, 1.0], rays), lambda D: _behind(_lesser(D[0])), (_SHARE,)),
-    "fov": LensModel(("w",), (1,), _fov, lambda D: np.pi, ((0.0, np.pi),)),
-    "division": LensModel(("k1", "k2", "k3"), (1, 2, 3), _division, lambda D: float(_division_table(D)[0][-1])),
+    "fov": LensModel(("w",), (1,), _by_angle(_fov), lambda D: np.pi, ((0.0, np.pi),)),
+    "division": LensModel(
+        ("k1", "k2", "k3"), (1, 2, 3), _by_angle(lambda D, angle: np.interp(angle, *_division(D))),
+        lambda D: float(_division(D)[0][-1]),
+    ),
 }  # fmt: skip
 PERSPECTIVE = ("plumb_bob", "rational_polynomial")  # what OpenCV makes maps for
 ALIASES = {
