@@ -118,7 +118,7 @@ class Camera:
 
     def _lens_pixels(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """As `project`, pixels (n, 2) of rays (n, 3), also of those behind the image plane that a fisheye sees."""
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             if self.is_cylinder:
                 x, y, z = rays.T
                 xy = np.c_[np.arctan2(x, z), y / np.hypot(x, z)]
@@ -198,11 +198,13 @@ class Camera:
         edge, focal = self._border(), 0.8 * float(min(self.focal))
         for _ in range(40):
             rays = np.c_[(edge - self.K[:2, 2]) / focal, np.ones(len(edge))]
-            if self.project(rays)[1].all():
+            pixels, inside = self.project(rays)
+            if inside.all():
                 break
             focal *= 1.05
         else:
-            raise BadInputError("CameraInfo: no central field of the lens fills the image; check K and the image size")
+            if np.isnan(pixels).any():
+                raise BadInputError("CameraInfo: the lens shows next to nothing of what is ahead; calibrate again")
         return np.array([[focal, 0, self.K[0, 2]], [0, focal, self.K[1, 2]], [0, 0, 1]])
 
 

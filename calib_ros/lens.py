@@ -62,13 +62,14 @@ class LensProjection:
         end = _rises(radius)
         return angle[:end], radius[:end]
 
+    @np.errstate(all="ignore")
     def radius(self, angle: Floats) -> Floats:
         """Distances (n,) from the centre at angles (n,) from the axis, but for what is not along the radius."""
         D = self.D.copy()
         D[[k for k in self.model.off_radius if k < len(D)]] = 0
-        with np.errstate(over="ignore", invalid="ignore"):
-            return self.model.image(D, np.c_[np.sin(angle), 0 * angle, np.cos(angle)])[:, 0]
+        return self.model.image(D, np.c_[np.sin(angle), 0 * angle, np.cos(angle)])[:, 0]
 
+    @np.errstate(all="ignore")
     def image(self, rays: Floats, reach: float = np.inf) -> Floats:
         """Rays (n, 3) of any length -> (n, 2) of the image plane; NaN beyond the limit, or beyond the angle `reach`, rad."""
         angle = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
@@ -78,6 +79,7 @@ class LensProjection:
             out[seen] = self.model.image(self.D, rays[seen])
         return out
 
+    @np.errstate(all="ignore")
     def rays(self, xy: Floats) -> Floats:
         """Unit rays (n, 3) of (n, 2) on the image plane, by Newton's method; NaN where no ray has its image."""
         angle, radius = self._table
@@ -92,8 +94,7 @@ class LensProjection:
             if k % 3 == 0:  # they change little
                 slope = np.hstack([(self.image(_directions(now + step)) - here) / STEP for step in STEP * np.eye(2)])
             a, c, b, d = slope.T
-            with np.errstate(all="ignore"):
-                change = np.c_[d * u - b * v, a * v - c * u] / (a * d - b * c)[:, None]
+            change = np.c_[d * u - b * v, a * v - c * u] / (a * d - b * c)[:, None]
             error[left] = np.hypot(u, v)
             at[left] = now
             on = (error[left] > EXACT) & np.isfinite(change).all(axis=1)
@@ -156,6 +157,7 @@ def _fov(D: Floats, angle: Floats) -> Floats:
     return np.asarray(np.arctan2(2 * np.sin(angle) * np.tan(D[0] / 2), np.cos(angle)) / D[0])
 
 
+@np.errstate(all="ignore")
 def _division(D: Floats) -> tuple[Floats, Floats]:
     """A. Fitzgibbon: Simultaneous linear estimation of multiple view geometry and lens distortion, 2001: the ray of a point at r
     is (r, 1 + k1 r^2 + k2 r^4 + ...). A table of angles from the axis, up to the limit, and r."""
@@ -165,10 +167,10 @@ def _division(D: Floats) -> tuple[Floats, Floats]:
     return angle[:end], r[:end]
 
 
+@np.errstate(all="ignore")
 def _rises(values: Floats) -> int:
     """How many of the first values (n,) rise for certain: the turn may be just before the last that is higher."""
-    with np.errstate(invalid="ignore"):
-        falls = np.flatnonzero(~(np.diff(values) > 0))
+    falls = np.flatnonzero(~(np.diff(values) > 0))
     return max(int(falls[0]), 1) if len(falls) else len(values)
 
 

@@ -127,6 +127,7 @@ def test_files_of_basalt(tmp_path, kind, model, own):
         ("<opencv_storage><K>", "is not valid XML"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "is not valid"),
         ("<a/>", "has no names"),
+        ("K: !!opencv-matrix 3\n", "is not valid YAML"),
         ("[" * 4000, "is not valid"),
         ("model_type: MEI\n", "image size 0x0|camera_matrix must have"),
         ("K: [1, 2]\nwidth: 3\n", "image_height must be a whole number"),
