@@ -106,9 +106,8 @@ def _info(own: dict[str, Any], image_size: Callable[[], tuple[int, int]]) -> dic
     model, distortion = "", str(own.get("distortion_model") or "none")
     if "camera_type" in own:  # basalt
         model, lens = str(own["camera_type"]), own["intrinsics"]
-        names = LENSES[lens_model(model)].names if lens_model(model) in LENSES else ()
         numbers = [lens[name] for name in ("fx", "fy", "cx", "cy")]
-        D: list[Any] = [lens[name] for name in names if name in lens]
+        D = [lens[name] for name in LENSES[lens_model(model)].names if name in lens] if lens_model(model) in LENSES else []
     elif "camera_model" in own:  # Kalibr
         model, D = str(own["camera_model"]), list(own.get("distortion_coeffs") or ()) if distortion != "none" else []
         if model not in OF_KALIBR or (D and (model, distortion) != ("omni", "radtan") and model != "pinhole"):

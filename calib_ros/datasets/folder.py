@@ -102,10 +102,8 @@ class FolderSource:
 
     def _first_size(self) -> tuple[int, int]:
         """Width and height, px, of the first image; 0 without one."""
-        if not self._images:
-            return 0, 0
-        height, width = self._picture(min(self._images, key=_natural)).shape[:2]
-        return width, height
+        picture = self._picture(min(self._images, key=_natural)) if self._images else np.zeros((0, 0))
+        return picture.shape[1], picture.shape[0]
 
     def _picture(self, name: str) -> NDArray[Any]:
         path = self._images[name]
