@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -11,21 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros.errors import BadInputError
+from calib_ros.lens import LENSES, PERSPECTIVE, LensProjection, lens_model, refuse
 
-# Model -> allowed numbers of coefficients in ROS and OpenCV.
-DISTORTION_MODELS: dict[str, tuple[int, ...]] = {
-    "plumb_bob": (0, 4, 5),
-    "rational_polynomial": (0, 8, 12, 14),
-    "equidistant": (0, 4),
-}
-ALIASES = {
-    "": "plumb_bob",
-    "none": "plumb_bob",
-    "radtan": "plumb_bob",
-    "pinhole": "plumb_bob",
-    "fisheye": "equidistant",
-    "kannala_brandt": "equidistant",
-}
 NOISE = 1e-9  # of the largest element of K, that may be left where 0 should be
 MAX_SKEW_PX = 0.5  # of a pixel at the image's border, which no edge shows; OpenCV has none in its models
 MAX_SIDE = 32766  # px; OpenCV cannot rectify larger images
@@ -36,13 +23,13 @@ WIDEST, HIGHEST = np.deg2rad(100.0), np.deg2rad(60.0)  # rad from the axis, side
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Intrinsics of one camera, with the distortion models of sensor_msgs/CameraInfo.
+    """Intrinsics of one camera, with the distortion models of sensor_msgs/CameraInfo and others, see `calib_ros.lens`.
 
     Parameters
     ----------
     K : (3, 3), px. width, height : of the image, px, at most 32766 each.
-    model : ``plumb_bob``, ``rational_polynomial`` or ``equidistant``; some other names of the same models are understood.
-    D : (n,) distortion coefficients in ROS order; empty or all zero = a pinhole camera.
+    model : a name in LENSES; the names of ROS, Kalibr, basalt and OpenCV are understood.
+    D : (n,) distortion coefficients in the model's order, which is that of ROS; empty or all zero = a pinhole camera.
 
     Raises BadInputError if K is no camera matrix, the size is out of range, or D does not fit the model.
     """
@@ -77,20 +64,19 @@ class Camera:
             raise BadInputError(
                 f"CameraInfo: image size {self.width}x{self.height} is beyond {MAX_SIDE} px a side; check the camera driver"
             )
-        model = ALIASES.get(self.model.lower(), self.model.lower())
-        if model not in DISTORTION_MODELS and model != CYLINDER:
+        model = lens_model(self.model)
+        if model not in LENSES and model != CYLINDER:
             raise BadInputError(
                 f"CameraInfo: distortion model '{' '.join(self.model.split())[:80]}' is not supported; "
-                f"rectify the image or use one of {', '.join(DISTORTION_MODELS)}"
+                f"rectify the image or use one of {', '.join(LENSES)}"
             )
         D = np.array(self.D, float).ravel()
         if not np.isfinite(D).all():
             raise BadInputError("CameraInfo: distortion coefficients must be finite")
-        if not D.any():
-            D = np.zeros(0)
-        if len(D) not in DISTORTION_MODELS.get(model, (0,)):
-            expected = " or ".join(str(n) for n in DISTORTION_MODELS.get(model, ()) if n) or "no"
-            raise BadInputError(f"CameraInfo: {model} has {expected} distortion coefficients, got {len(D)}")
+        if D.any():
+            refuse(model, D)
+        else:
+            D, model = np.zeros(0), model if model in (*PERSPECTIVE, "equidistant", CYLINDER) else "plumb_bob"
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "D", D)
         object.__setattr__(self, "model", model)
@@ -124,70 +110,48 @@ class Camera:
         where distortion polynomials fold back into the image.
         """
         P = np.atleast_2d(np.asarray(points, float)).reshape(-1, 3)
-        uv = np.full((len(P), 2), np.nan)
-        front = (np.hypot(P[:, 0], P[:, 2]) if self.is_cylinder else P[:, 2]) > MIN_DEPTH
-        if self.is_cylinder:
-            x, y, z = P[front].T
-            uv[front] = np.c_[np.arctan2(x, z), y / np.hypot(x, z)] @ self.K[:2, :2].T + self.K[:2, 2]
-        elif self.is_pinhole:
-            x = P[front, :2] / P[front, 2:]
-            uv[front] = x @ self.K[:2, :2].T + self.K[:2, 2]
-        else:
-            radius = np.hypot(P[:, 0], P[:, 1])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                front &= radius <= self._field_radius * P[:, 2]
-            if front.any():
-                uv[front] = self._distort(P[front])
+        uv = self._lens_pixels(P)
+        uv[~((np.hypot(P[:, 0], P[:, 2]) if self.is_cylinder else P[:, 2]) > MIN_DEPTH)] = np.nan
         with np.errstate(invalid="ignore"):
             inside = (uv[:, 0] >= 0) & (uv[:, 0] <= self.width - 1) & (uv[:, 1] >= 0) & (uv[:, 1] <= self.height - 1)
         return uv, inside
 
     def _lens_pixels(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """As `project`, pixels (n, 2) of rays (n, 3), also of those behind the image plane that a fisheye sees."""
-        if self.model != "equidistant" or self.is_pinhole:
-            return self.project(rays)[0]
-        x, y, z = rays.T
-        r = np.hypot(x, y)
-        angle = np.arctan2(r, z)
-        powers = angle[:, None] ** np.array([3, 5, 7, 9])
-        radius = angle + powers @ self.D
-        uv = (np.c_[x, y] * (radius / np.maximum(r, 1e-12))[:, None]) @ self.K[:2, :2].T + self.K[:2, 2]
-        uv[angle > self._fold_angle] = np.nan
-        return np.asarray(uv)
+        with np.errstate(all="ignore"):
+            if self.is_cylinder:
+                x, y, z = rays.T
+                xy = np.c_[np.arctan2(x, z), y / np.hypot(x, z)]
+            elif self.is_pinhole:
+                xy = np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
+            else:
+                xy = self._lens.image(rays, self._reach)
+            return np.asarray(xy @ self.K[:2, :2].T + self.K[:2, 2])
+
+    def unproject(self, pixels: ArrayLike) -> NDArray[np.float64]:
+        """Unit rays (n, 3) of pixels (n, 2), also of those outside the image; NaN where the lens shows nothing."""
+        xy = (np.asarray(pixels, float).reshape(-1, 2) - self.K[:2, 2]) / np.diag(self.K)[:2]
+        if not (self.is_pinhole or self.is_cylinder):
+            return self._lens.rays(xy)
+        x, y = xy.T
+        rays = np.c_[np.sin(x), y, np.cos(x)] if self.is_cylinder else np.c_[xy, np.ones(len(xy))]
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     @cached_property
-    def _fold_angle(self) -> float:
-        """Angle from the axis, rad, at which a fisheye's radius stops growing; pi if it never does."""
-        angle = np.linspace(0, np.pi, 4000)
-        grows = 1 + angle[:, None] ** np.array([2, 4, 6, 8]) @ (self.D * [3, 5, 7, 9]) > 0
-        return float(np.pi if grows.all() else angle[np.argmin(grows)])
+    def _lens(self) -> LensProjection:
+        return LensProjection(self.model, self.D)
 
-    def _distort(self, P: NDArray[np.float64]) -> NDArray[np.float64]:
-        zero = np.zeros(3)
-        if self.model == "equidistant":
-            uv, _ = cv2.fisheye.projectPoints(P[:, None], zero, zero, self.K, self.D)
-        else:
-            uv, _ = cv2.projectPoints(P[:, None], zero, zero, self.K, self.D)
-        return np.asarray(uv).reshape(-1, 2)
+    @property
+    def focal(self) -> NDArray[np.float64]:
+        """(2,) px per rad at the optical axis: fx and fy of K, but for models that scale there."""
+        return np.diag(self.K)[:2] * (1.0 if self.is_pinhole or self.is_cylinder else self._lens.slope)
 
     @cached_property
-    def _field_radius(self) -> float:
-        """Largest tan(angle from the axis) in the image, plus 10 %, at which the distortion does not fold back."""
-        undistort: Any = cv2.fisheye.undistortPoints if self.model == "equidistant" else cv2.undistortPoints
-        rays = np.asarray(undistort(self._border()[:, None], self.K, self.D)).reshape(-1, 2)
-        radius = np.hypot(rays[:, 0], rays[:, 1])
-        radius = radius[np.isfinite(radius) & (radius < 1e3)]
-        return min(1.1 * float(radius.max()) if len(radius) else 20.0, self._fold_radius())
-
-    def _fold_radius(self) -> float:
-        """The tan(angle from the axis) at which the radial distortion stops growing; inf if it never does."""
-        radius = np.tan(np.linspace(0, np.deg2rad(89.5), 4000))
-        radial = self.D.copy()
-        if self.model != "equidistant":
-            radial[2:4] = 0  # the tangential terms
-        lens = replace(self, K=np.eye(3), D=radial)
-        grows = np.diff(lens._distort(np.c_[radius, 0 * radius, np.ones_like(radius)])[:, 0]) > 0
-        return float("inf") if grows.all() else float(radius[np.argmin(grows)])
+    def _reach(self) -> float:
+        """Angle from the axis, rad, up to which points are projected: of the image's border, the tangent plus 10 %."""
+        # What does not move along the radius may fold back before the limit of the lens, which is that of the radius.
+        angle = np.arccos(self.unproject(self._border())[:, 2]).max()
+        return float(np.arctan(1.1 * np.tan(angle))) if angle < np.pi / 2 else np.inf
 
     def _border(self) -> NDArray[np.float64]:
         """Pixels (132, 2) along the border of the image."""
@@ -200,7 +164,7 @@ class Camera:
         if self.is_pinhole:
             return self
         size = (self.width, self.height)
-        if self.model == "equidistant":
+        if self.model not in PERSPECTIVE:
             K = self._central_field()
         else:
             K, _ = cv2.getOptimalNewCameraMatrix(self.K, self.D, size, 0.0, size)
@@ -221,7 +185,7 @@ class Camera:
         """The camera of the image on a cylinder about the camera's y axis: of all that the lens sees up to 100 deg to either side
         and 60 deg up and down, at the lens's own focal length."""
         # 60 deg from the axis a pinhole stretches the image four times: one blur is not the same angle everywhere.
-        fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
+        fx, fy = map(float, self.focal)
         left, right = self._sides()
         slope = np.tan(np.linspace(-HIGHEST, HIGHEST, 241))
         top, bottom = _range_inside(slope, self._lens_pixels(np.c_[0 * slope, slope, np.ones_like(slope)])[:, 1], self.height)
@@ -229,14 +193,18 @@ class Camera:
         return Camera(np.array([[fx, 0, -fx * left], [0, fy, -fy * top], [0, 0, 1]]), width, rows, CYLINDER)
 
     def _central_field(self) -> NDArray[np.float64]:
-        """K (3, 3) of a fisheye's central field: of the shortest focal length, from 0.8 times the lens's, without empty rim."""
+        """K (3, 3) of a wide lens's central field: of the shortest focal length, from 0.8 times the lens's, without empty rim."""
         # OpenCV's estimate tries the whole field: a tenth of the focal length, and principal points outside the image.
-        edge, focal = self._border(), 0.8 * float(min(self.K[0, 0], self.K[1, 1]))
+        edge, focal = self._border(), 0.8 * float(min(self.focal))
         for _ in range(40):
             rays = np.c_[(edge - self.K[:2, 2]) / focal, np.ones(len(edge))]
-            if self.project(rays)[1].all():
+            pixels, inside = self.project(rays)
+            if inside.all():
                 break
             focal *= 1.05
+        else:
+            if np.isnan(pixels).any():
+                raise BadInputError("CameraInfo: the lens shows next to nothing of what is ahead; calibrate again")
         return np.array([[focal, 0, self.K[0, 2]], [0, focal, self.K[1, 2]], [0, 0, 1]])
 
 
@@ -257,23 +225,24 @@ class Rectifier:
 
     @cached_property
     def _maps(self) -> tuple[Any, Any]:
-        lens, size = self.source, (self.source.width, self.source.height)
-        if self.camera.is_cylinder:
+        lens, target = self.source, self.camera
+        fisheye = lens.model == "equidistant" and len(lens.D) == 4
+        if target.is_cylinder or not (fisheye or lens.model in PERSPECTIVE):
             at = np.nan_to_num(self._pixels, nan=-1.0)
             return cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)
-        init: Any = cv2.fisheye.initUndistortRectifyMap if lens.model == "equidistant" else cv2.initUndistortRectifyMap
-        maps: tuple[Any, Any] = init(lens.K, lens.D, np.eye(3), self.camera.K, size, cv2.CV_16SC2)
+        init: Any = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+        maps: tuple[Any, Any] = init(lens.K, lens.D, np.eye(3), target.K, (lens.width, lens.height), cv2.CV_16SC2)
         return maps
 
     @cached_property
     def _pixels(self) -> NDArray[np.float32]:
-        """Pixel (H, W, 2) of the lens that each pixel of a cylinder shows; NaN = none."""
-        K = self.camera.K
-        angle = (np.arange(self.camera.width) - K[0, 2]) / K[0, 0]
-        height = (np.arange(self.camera.height) - K[1, 2]) / K[1, 1]
-        angle, height = (a.ravel() for a in np.meshgrid(angle, height))
-        uv = self.source._lens_pixels(np.c_[np.sin(angle), height, np.cos(angle)])
-        return np.asarray(uv.reshape(self.camera.height, self.camera.width, 2), np.float32)
+        """Pixel (H, W, 2) of the lens that each pixel of the target shows; NaN = none."""
+        columns, rows = np.arange(self.camera.width), np.arange(self.camera.height)
+        out = np.empty((len(rows), len(columns), 2), np.float32)
+        for part in np.array_split(rows, max(1, out.size >> 19)):  # bounds the memory of what is between
+            uv = np.stack(np.meshgrid(columns, part), axis=-1)
+            out[part] = self.source._lens_pixels(self.camera.unproject(uv)).reshape(uv.shape)
+        return out
 
     def seen(self) -> NDArray[np.bool_] | None:
         """Pixels (H, W) of the rectified image that the lens shows; None = all but slivers along the border."""

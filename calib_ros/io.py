@@ -140,11 +140,12 @@ class _Loader(yaml.SafeLoader):
 
     def mapping(self, node: Any) -> Any:
         """A mapping with names of one line."""
-        for name, _ in node.value:
+        for name, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if not isinstance(name, yaml.ScalarNode) or len(name.value.splitlines()) > 1 or len(name.value) > 200:
                 raise yaml.constructor.ConstructorError(None, None, "a key that is no name", name.start_mark)
         return self.construct_yaml_map(node)
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.integer)
-_Loader.add_constructor("tag:yaml.org,2002:map", _Loader.mapping)
+for kind in ("map", "opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{kind}", _Loader.mapping)

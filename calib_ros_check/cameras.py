@@ -13,6 +13,7 @@ import numpy as np
 
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
+from calib_ros.lens import LENSES
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.parameters import REACH, noise_of
 from calib_ros.registration.score.point_score import PointScore
@@ -104,6 +105,6 @@ def turned_over(camera: Camera) -> Camera:
     """The camera of the same pictures upside down: principal point and tangential distortion are turned."""
     K, D = camera.K.copy(), np.array(camera.D, float)
     K[:2, 2] = camera.width - 1 - K[0, 2], camera.height - 1 - K[1, 2]
-    if camera.model != "equidistant" and len(D) >= 4:
-        D[2:4] *= -1
+    if len(D):
+        D[[k for k in LENSES[camera.model].off_radius if k < len(D)]] *= -1
     return replace(camera, K=K, D=D)

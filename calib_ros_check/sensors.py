@@ -19,6 +19,7 @@ from scipy.special import ndtri
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
+from calib_ros.lens import PERSPECTIVE
 from calib_ros.registration.nuisance.lens import CENTRE, FOCAL
 from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, REACH, noise_of
 from calib_ros.registration.progress import SILENT, Progress
@@ -140,7 +141,7 @@ def centre_of(camera: Camera, T_checked: Transform, T_found: Transform) -> LensC
     """The change of the principal point that looks like the rotation from T_checked to T_found (4, 4)."""
     turn = Rotation.from_matrix(T_found[:3, :3] @ T_checked[:3, :3].T).as_rotvec()
     across = np.array([turn[1], -turn[0]])
-    u, v = np.diag(camera.K)[:2] * (across if camera.model == "equidistant" else np.tan(across))
+    u, v = camera.focal * (across if camera.model not in PERSPECTIVE else np.tan(across))
     return LensChange(u=float(u) / camera.width, v=float(v) / camera.width)
 
 

@@ -12,6 +12,7 @@ from scipy.interpolate import make_interp_spline
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.frame import PointCloud
+from calib_ros.lens import PERSPECTIVE
 from calib_ros_synthetic import ego
 from calib_ros_synthetic.lidar import OwnReturns, own_returns
 from calib_ros_synthetic.rays import CameraView
@@ -63,7 +64,7 @@ class Installation:
 
     def view(self, camera: Camera) -> CameraView:
         """The pixels of a camera: the rig's, or one given instead of it."""
-        if camera == self.camera and camera.model == "equidistant":
+        if camera == self.camera and camera.model not in PERSPECTIVE:
             return WideView(camera, self.rig.lens.field)
         return CameraView(camera)
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +26,7 @@ Ints = NDArray[np.int32]
 SKY, ROAD, PAVEMENT, CURB, OWN = (-1, -2, -3, -4, -5)
 ZERO = np.zeros((1, 1), np.float32)
 ORIGIN = (ZERO, ZERO, ZERO)  # of rays that start where solids are relative to
+SHALLOWEST = 1e-3  # z of unit directions that x/z and y/z are taken of
 NEAREST = np.float32(0.05)  # ray parameter below which nothing is seen: the sensor's own housing
 TINY = 1e-20  # keeps a ray along an axis from dividing zero by zero
 LEAF_STEP, LEAF_STEPS = 0.2, 5  # m between the places where a ray looks for leaves, and their greatest number
@@ -247,29 +247,11 @@ def pixel_directions(camera: Camera) -> tuple[Float32, Float32, NDArray[np.bool_
 
 def _directions(camera: Camera, first: int, past: int) -> tuple[Float32, Float32, NDArray[np.bool_]]:
     """As `pixel_directions`, of the rows from first to before past."""
-    u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(first, past, dtype=float))
-    uv = np.stack([u, v], -1).reshape(-1, 1, 2)
-    if camera.is_pinhole:
-        rays = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
-    else:
-        # OpenCV's default of a few iterations is off by tenths of a pixel at the border of a strong lens.
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-9)
-        rays = _undistort(camera.model)(uv, camera.K, camera.D, None, None, criteria)
-    rays = np.nan_to_num(np.asarray(rays).reshape(-1, 2), nan=1e3, posinf=1e3, neginf=-1e3)
-    back, _ = camera.project(np.c_[rays, np.ones(len(rays))])
-    seen = (np.abs(back - uv.reshape(-1, 2)) < 0.01).all(axis=1).reshape(u.shape)
-    x, y = (np.where(seen, rays[:, k].reshape(u.shape), 0).astype(np.float32) for k in (0, 1))
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(first, past)), axis=-1)
+    rays = camera.unproject(pixels).reshape((*pixels.shape[:2], 3))
+    seen = rays[..., 2] > SHALLOWEST
+    x, y = (np.divide(rays[..., k], rays[..., 2], where=seen, out=np.zeros(seen.shape)).astype(np.float32) for k in (0, 1))
     return x, y, seen
-
-
-def _undistort(model: str) -> Any:
-    """OpenCV's inverse of a distortion model: (uv, K, D, R, P, criteria) -> directions."""
-    if model == "equidistant":
-        return lambda uv, K, D, R, P, criteria: cv2.fisheye.undistortPoints(uv, K, D, R=R, P=P, criteria=criteria)
-    # OpenCV 4 has a function of its own for a choice of iterations, 5 has an argument.
-    if hasattr(cv2, "undistortPointsIter"):
-        return cv2.undistortPointsIter
-    return lambda uv, K, D, R, P, criteria: cv2.undistortPoints(uv, K, D, R=R, P=P, criteria=criteria)
 
 
 def turned(M: Float32, directions: Vectors) -> Vectors:

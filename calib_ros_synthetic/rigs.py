@@ -10,7 +10,7 @@ from enum import Enum
 
 import numpy as np
 
-from calib_ros import se3
+from calib_ros import lens, se3
 from calib_ros.camera import Camera
 from calib_ros_synthetic.scanners import RATE
 from calib_ros_synthetic.solids import Floats
@@ -76,13 +76,8 @@ class Lens:
 
     def _radius(self) -> float:
         """Distance from the principal point, in focal lengths, at which the lens images half of its field."""
-        angle = np.deg2rad(self.field / 2)
-        D = np.r_[self.D, np.zeros(8)]
-        if self.model == "equidistant":
-            return float(angle * (1 + D[:4] @ angle ** np.array([2, 4, 6, 8])))
-        r = np.tan(angle)
-        k1, k2, _, _, k3, k4, k5, k6 = D[:8]
-        return float(r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6))
+        D = np.array(self.D) if self.D else np.zeros(4)
+        return float(lens.LensProjection(self.model, D).radius(np.deg2rad([self.field / 2]))[0])
 
 
 @dataclass(frozen=True)

@@ -5,48 +5,40 @@ from __future__ import annotations
 import numpy as np
 
 from calib_ros.camera import Camera
+from calib_ros.lens import LensProjection
 from calib_ros_synthetic.rays import SMALLEST, CameraView, Jobs, RowMotion, Vectors, nearest_first
 from calib_ros_synthetic.solids import Float32, Floats, Solids
 
 STEPS = 8  # parts of each edge of a solid's box whose ends are projected
 BEHIND = np.deg2rad(150.0)  # from the axis; what reaches further may wrap around the picture
-TABLE = np.linspace(0, np.pi, 20_001)  # angles from the axis, rad
 _CORNERS = np.array([(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1])
 
 
 class WideView(CameraView):
-    """All pixels of an equidistant lens with a field of up to 200 deg or so; beyond it the picture is black."""
+    """All pixels of a lens with a field of up to 200 deg or so; beyond it the picture is black."""
 
     def __init__(self, camera: Camera, field: float) -> None:
-        """camera: of the model `equidistant`. field: degrees across, of the circle that the lens images."""
+        """camera: of a wide model. field: degrees across, of the circle that the lens images."""
         self.K = camera.K
-        self._D = np.r_[camera.D, np.zeros(4)][:4]
+        self._lens = LensProjection(camera.model, camera.D)
         self._field = np.deg2rad(field / 2)
-        v, u = np.mgrid[: camera.height, : camera.width].astype(float)
-        mx, my = (u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1]
-        radius = np.hypot(mx, my)
-        # The table ends where the polynomial stops to rise.
-        image = self._radius(TABLE)
-        rising = np.argmax(np.diff(image) <= 0) if (np.diff(image) <= 0).any() else len(TABLE) - 1
-        angle = np.interp(radius, image[: rising + 1], TABLE[: rising + 1], right=np.pi)
-        self.seen = angle <= self._field
-        scale = np.sin(angle) / np.maximum(radius, 1e-12)
-        self.x, self.y = (mx * scale).astype(np.float32), (my * scale).astype(np.float32)
-        self.z = np.cos(angle).astype(np.float32)
+        pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+        rays = self._lens.rays(((pixels - self.K[:2, 2]) / np.diag(self.K)[:2]).reshape(-1, 2)).reshape((*pixels.shape[:2], 3))
+        self.seen = rays[..., 2] >= np.cos(self._field)
+        # What the lens does not show is behind it.
+        rays[np.isnan(rays[..., 2])] = 0, 0, -1
+        self.x, self.y, self.z = np.moveaxis(rays.astype(np.float32), -1, 0)
         self.dx, self.dy, self.dz = np.gradient(self.x), np.gradient(self.y), np.gradient(self.z)
 
-    def _radius(self, angle: Floats) -> Floats:
-        """Distance from the principal point in focal lengths at angles from the axis, rad, of any shape."""
-        square = angle * angle
-        k1, k2, k3, k4 = self._D
-        return np.asarray(angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))))
-
     def _image(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
-        """Columns, rows (px) and angles from the axis (rad) of points at x, y, z in the camera's frame."""
+        """Columns, rows (px) and angles from the axis (rad) of points at x, y, z in the camera's frame; of those beyond what the
+        lens shows, as if they were at its limit."""
         flat = np.hypot(x, y)
         angle = np.arctan2(flat, z)
-        scale = self._radius(angle) / np.maximum(flat, 1e-12)
-        return self.K[0, 0] * x * scale + self.K[0, 2], self.K[1, 1] * y * scale + self.K[1, 2], angle
+        shown = np.minimum(angle, (1 - 1e-9) * self._lens.limit)
+        across = np.sin(shown) / np.maximum(flat, 1e-12)
+        xy = self._lens.image(np.stack([x * across, y * across, np.cos(shown)], axis=-1).reshape(-1, 3)).reshape((*x.shape, 2))
+        return self.K[0, 0] * xy[..., 0] + self.K[0, 2], self.K[1, 1] * xy[..., 1] + self.K[1, 2], angle
 
     def pixels(self, points: Vectors) -> Float32:
         """Where points (x, y, z parts of any shape) in the camera's frame are in the picture -> (..., 2) px."""

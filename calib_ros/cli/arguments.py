@@ -173,7 +173,7 @@ def add_source(command: argparse.ArgumentParser, default: str | None = None) -> 
 
 
 def add_camera_and_topics(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--camera", help="KITTI: 0-3 (default 2); nuScenes: channel or number (default CAM_FRONT)")
+    command.add_argument("--camera", help="KITTI: 0-3 (default 2); nuScenes, folder: name or number (CAM_FRONT, the first)")
     for topic in ("image", "points", "camera-info"):
         command.add_argument(f"--{topic}-topic", help="topic of a bag that holds several of the kind")
     command.add_argument("--incomplete", action="store_true", help="use what is left of a bag of which parts are missing")

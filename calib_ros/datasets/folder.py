@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from calib_ros import io, se3
-from calib_ros.arrays import Matrix
-from calib_ros.camera import Camera
+from calib_ros.datasets.camera_files import camera_file, read_camera
 from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, FOREIGN, TEXT_SUFFIXES, read_cloud
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.messages import decode_camera_info
 from calib_ros.messages.image_encodings import picture_to_bgr
 from calib_ros.messages.pictures import decode_picture
 from calib_ros.messages.wire import shown
@@ -36,19 +31,22 @@ class FolderSource:
     """Frames of a folder: images/NAME.png and the like with clouds/NAME.pcd and the like, calibration.yaml, and times.csv.
 
     A frame is a name with an image and a cloud; files are read on access. calibration.yaml is what ROS camera_calibration writes,
-    with an optional T_camera_lidar (four rows). times.csv has the columns name, image_ns and, where known, cloud_ns; frames are
-    in the order of their image's stamp, without it in the order of their names, 0.1 s apart.
+    with an optional T_camera_lidar (four rows), or a file of `camera_files`, of which `camera` is a name or number. times.csv has
+    the columns name, image_ns and, where known, cloud_ns; frames are in the order of their image's stamp, without it in the order
+    of their names, 0.1 s apart.
 
     Raises BadInputError, with the file and what to do, for missing, contradictory or damaged files.
     """
 
     lidar_frame = "lidar"
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, camera: int | str | None = None) -> None:
         self.path = Path(path)
         self.name = self.path.resolve().name
-        self.camera, self.reference, self.camera_frame = _read_calibration(self.path / CALIBRATION)
         self._images = named_files(self.path / IMAGES, IMAGE_SUFFIXES)
+        self._calibration = camera_file(self.path)
+        read = read_camera(self._calibration, camera, self._first_size)
+        self.camera, self.reference, self.camera_frame, self._other_cameras = read
         self._clouds = named_files(self.path / CLOUDS, CLOUD_SUFFIXES)
         names = sorted(self._images.keys() & self._clouds.keys(), key=_natural)
         if not names:
@@ -96,13 +94,18 @@ class FolderSource:
             "frames": f"{len(self)}, names {self.names[0]} to {self.names[-1]}; left out: {left_out}",
             "stamps": TIMES if self._has_times else f"none: 10 Hz assumed ({TIMES} gives them)",
             "points": f"{len(first)} in the first cloud, with {', '.join(['x, y, z', *fields])}",
-            "camera": describe_camera(self.camera),
+            "camera": describe_camera(self.camera) + "".join(f"; not {name}" for name in self._other_cameras),
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,
-            "reference": "none" if self.reference is None else f"T_camera_lidar of {CALIBRATION}",
+            "reference": "none" if self.reference is None else f"T_camera_lidar of {self._calibration.name}",
         }
 
-    def _read_image(self, name: str) -> NDArray[np.uint8]:
+    def _first_size(self) -> tuple[int, int]:
+        """Width and height, px, of the first image; 0 without one."""
+        picture = self._picture(min(self._images, key=_natural)) if self._images else np.zeros((0, 0))
+        return picture.shape[1], picture.shape[0]
+
+    def _picture(self, name: str) -> NDArray[Any]:
         path = self._images[name]
         try:
             picture = decode_picture(np.fromfile(path, np.uint8))
@@ -110,18 +113,22 @@ class FolderSource:
             raise BadInputError(f"image {path} cannot be read ({error.strerror}); check the file") from error
         if picture is None:
             raise BadInputError(f"image {path} is no complete PNG, JPEG, BMP, TIFF or WebP; copy it again")
+        return picture
+
+    def _read_image(self, name: str) -> NDArray[np.uint8]:
+        path, picture = self._images[name], self._picture(name)
         height, width = picture.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             raise BadInputError(
-                f"image {path} is {width}x{height}, but {CALIBRATION} says {self.camera.width}x{self.camera.height}; give the "
-                "calibration that belongs to images of this size"
+                f"image {path} is {width}x{height}, but {self._calibration.name} says {self.camera.width}x{self.camera.height}; "
+                "give the calibration that belongs to images of this size"
             )
         return picture_to_bgr(picture)
 
 
 def is_folder_dataset(path: Path) -> bool:
     """Whether a path looks like such a folder, complete or not."""
-    parts = [(path / IMAGES).is_dir(), (path / CLOUDS).is_dir(), (path / CALIBRATION).is_file()]
+    parts = [(path / IMAGES).is_dir(), (path / CLOUDS).is_dir(), camera_file(path).is_file()]
     return sum(parts) >= 2
 
 
@@ -151,32 +158,6 @@ def _nothing_readable(folder: Path, known: tuple[str, ...]) -> str:
     why = "; ".join(f"{suffix} is {FOREIGN[suffix]}" for suffix in others if suffix in FOREIGN)
     has = ", ".join(suffix or "files without an ending" for suffix in others)
     return f"{folder} has only {has}; {why or 'convert them'}; read are {', '.join(known)}"
-
-
-def _read_calibration(path: Path) -> tuple[Camera, Matrix | None, str]:
-    """Camera, T_camera_lidar (4, 4) if given, and name of the camera's frame."""
-    wanted = "what ROS camera_calibration writes: image_width, image_height, camera_matrix, distortion_coefficients"
-    if not path.is_file():
-        raise BadInputError(f"calibration {path} is missing; put there {wanted}")
-    try:
-        values = io.load(io.read_text(path, "calibration", wanted))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise BadInputError(f"calibration {path} is not valid YAML{io.what_is_wrong(error)}; give {wanted}") from None
-    if not isinstance(values, dict):
-        raise BadInputError(f"calibration {path} has no names; give {wanted}")
-    try:
-        info = SimpleNamespace(
-            width=_integer(values, "image_width"),
-            height=_integer(values, "image_height"),
-            k=_numbers(values, "camera_matrix", 9),
-            d=_numbers(values, "distortion_coefficients") if values.get("distortion_coefficients") else np.zeros(0),
-            distortion_model=values.get("distortion_model") or "",
-        )
-        T = values.get("T_camera_lidar")
-        reference = None if T is None else se3.as_transform(T, "T_camera_lidar")
-        return decode_camera_info(info), reference, shown(values.get("camera_name") or "camera")
-    except BadInputError as error:
-        raise BadInputError(f"calibration {path}: {str(error).removeprefix('CameraInfo: ')}") from error
 
 
 def _read_times(path: Path, names: list[str]) -> dict[str, tuple[int, int | None]]:
@@ -211,27 +192,6 @@ def _stamp(text: str, where: str) -> int:
     if abs(stamp) >= MAX_STAMP:
         raise BadInputError(f"{where}: '{shown(text)}' is no stamp; give whole nanoseconds")
     return stamp
-
-
-def _integer(values: dict[str, Any], name: str) -> int:
-    value = values.get(name)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise BadInputError(f"{name} must be a whole number of pixels, got {shown(value)}")
-    return value
-
-
-def _numbers(values: dict[str, Any], name: str, count: int | None = None) -> Matrix:
-    """The numbers of a matrix {rows, cols, data}."""
-    value = values.get(name)
-    data = value.get("data") if isinstance(value, dict) else None
-    try:
-        numbers = np.asarray(data, float).ravel() if data is not None else None
-    except (TypeError, ValueError, OverflowError):
-        numbers = None
-    if numbers is None or not np.isfinite(numbers).all() or (count is not None and len(numbers) != count):
-        of = f"{count} numbers" if count else "numbers"
-        raise BadInputError(f"{name} must have rows, cols and data: [{of}], as ROS camera_calibration writes it")
-    return numbers
 
 
 def _natural(name: str) -> tuple[int, int, str]:

@@ -28,7 +28,8 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         calibration.yaml (see `FolderSource`), or of nuScenes (``"ROOT#scene-0061"``, by default the first scene; see
         `NuScenesSource`). Or ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as
         ``"synthetic[:name=value,...]"``, the simulated drive.
-    camera : of a KITTI folder, 0 to 3 (default 2), or of nuScenes, its channel or number (default CAM_FRONT).
+    camera : of a KITTI folder, 0 to 3 (default 2), of nuScenes, its channel or number (default CAM_FRONT), or of a plain folder,
+        a name or number in its calibration (default the first).
     **options : of a bag, see `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion,
         T_camera_lidar, windows; None = default.
 
@@ -59,7 +60,7 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         return BagSource(path, **options)
     if is_folder_dataset(path):
         _refuse(options, text)
-        return FolderSource(path)
+        return FolderSource(path, camera)
     folder = find_drive(path) if path.is_dir() else None
     if folder is not None:
         _refuse(options, text)

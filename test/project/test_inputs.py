@@ -10,6 +10,7 @@ from paths import ROOT
 from calib_ros.datasets.bag_file import COMPRESSED, REMEDIES
 from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES
 from calib_ros.datasets.folder import IMAGE_SUFFIXES
+from calib_ros.lens import LENSES
 from calib_ros.messages.compressed_points import COMPRESSED_POINTS
 from calib_ros.messages.video import VIDEO
 
@@ -60,7 +61,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "VelodyneScan": ("datasets/test_bag.py::test_packets_are_refused_with_what_makes_clouds",),
     "PacketMsg of Ouster": ("datasets/test_bag.py::test_packets_are_refused_with_what_makes_clouds",),
     "LaserScan": ("datasets/test_bag.py::test_missing_types_and_pairs_are_named",),
-    "CameraInfo": ("messages/test_messages.py::test_camera_info",),
+    "CameraInfo": ("messages/test_messages.py::test_camera_info", "test_lens.py::test_names_of_other_tools"),
     "`.png` `.jpg` `.jpeg` `.bmp` `.tif` `.tiff` `.webp`": ("datasets/test_folder.py::test_pictures_of_every_kind",),
     "`.pcd`": ("datasets/test_cloud_files.py::test_every_format_gives_the_same_points",),
     "`.ply`": ("datasets/test_cloud_files.py::test_every_format_gives_the_same_points",),
@@ -75,7 +76,12 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "`.npz`": ("datasets/test_cloud_files.py::test_every_format_gives_the_same_points",),
     "`.e57` and others": ("datasets/test_folder.py::test_files_of_a_format_that_is_not_read_are_named",),
-    "`calibration.yaml`": ("datasets/test_folder.py::test_frames_are_the_names_with_image_and_cloud",),
+    "`calibration.yaml` `.json` `.xml` `camchain.yaml`": (
+        "datasets/test_folder.py::test_frames_are_the_names_with_image_and_cloud",
+        "datasets/test_camera_files.py::test_files_of_opencv",
+        "datasets/test_camera_files.py::test_files_of_kalibr",
+        "datasets/test_camera_files.py::test_files_of_basalt",
+    ),
     "`times.csv`": ("datasets/test_folder.py::test_times_give_stamps_and_order_and_points_count_from_the_clouds_stamp",),
 }
 
@@ -90,6 +96,7 @@ def test_a_row_has_a_test_that_makes_such_an_input(row: str) -> None:
 def test_no_row_is_missing() -> None:
     assert list(TESTS) == list(ROWS)
     suffixes = re.findall(r"`(\.\w+)`", " ".join(ROWS))
-    assert set(suffixes) == {*IMAGE_SUFFIXES, *CLOUD_SUFFIXES, ".e57"}
+    assert set(suffixes) == {*IMAGE_SUFFIXES, *CLOUD_SUFFIXES, ".e57", ".json", ".xml"}
+    assert set(ROWS["CameraInfo"].split(", ")) == set(LENSES)
     types = {kind.rpartition("/")[2] for kind in (COMPRESSED, COMPRESSED_POINTS, *VIDEO)} | set(REMEDIES)
     assert types <= {word.rpartition("/")[2] for row in ROWS for word in row.split()}

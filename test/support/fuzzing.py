@@ -35,6 +35,7 @@ LAYOUTS: tuple[Any, ...] = (
     [("x", "<i2"), ("y", "<i2"), ("z", "<i2"), ("i", "<u2"), ("line", "i1"), ("time", "<i4")],
 )
 DISTORTIONS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4, "": 0}
+OTHER_DISTORTIONS = {"omnidir": 5, "double_sphere": 2, "eucm": 2, "ucm": 1, "fov": 1, "division": 2, "kb6": 6}
 
 
 def scan(rng: np.random.Generator, rings: int = 16, columns: int = 100) -> dict[str, np.ndarray]:
@@ -251,9 +252,10 @@ class MessageFuzzer:
     # ---- cameras ------------------------------------------------------------------------------------------------------
 
     def camera_info(self) -> Any:
-        model = self.one(tuple(DISTORTIONS))
+        counts = self.one((DISTORTIONS, DISTORTIONS, OTHER_DISTORTIONS))
+        model = self.one(tuple(counts))
         P = np.c_[K, np.zeros(3)]
-        D = self.rng.normal(0, self.one((0.0, 0.02, 0.3)), DISTORTIONS[model])
+        D = self.rng.normal(0, self.one((0.0, 0.02, 0.3)), counts[model])
         message = self.make.camera_info(WIDTH, HEIGHT, K, D, P, model=model)
         for _ in range(int(self.one((0, 1, 1, 2, 3)))):
             self._change(message, self.one(("size", "matrix", "matrix", "distortion", "distortion", "model", "part")))
@@ -262,7 +264,7 @@ class MessageFuzzer:
     def _change(self, message: Any, what: str) -> None:
         """Another size, matrix, distortion, model or part of the picture for a CameraInfo."""
         if what == "model":
-            message.distortion_model = self.one((*DISTORTIONS, "fisheye", "none", "thin_prism", *TEXTS))
+            message.distortion_model = self.one((*DISTORTIONS, *OTHER_DISTORTIONS, "fisheye", "none", "thin_prism", *TEXTS))
         elif what == "matrix":
             name = self.one("kkp")
             values = np.array(getattr(message, name), float)
@@ -272,7 +274,7 @@ class MessageFuzzer:
                 values[self.some(values)] *= self.one((0.0, -1.0, 1e-3, 1e3))
             setattr(message, name, values)
         elif what == "distortion":
-            D = self.rng.normal(0, self.one((0.1, 10.0, 1e6)), int(self.one((0, 1, 3, 4, 5, 8, 12, 14, 15, 1000))))
+            D = self.rng.normal(0, self.one((0.1, 10.0, 1e6)), int(self.one((0, 1, 2, 3, 4, 5, 8, 12, 14, 15, 1000))))
             if len(D) and self.chance(0.5):
                 D[self.some(D)] = self.one(FLOATS)
             message.d = D if self.make.family == "rosbags" else D.tolist()

@@ -107,7 +107,7 @@ def plain(folder: Path) -> None:
 
 
 def plain_otherwise(folder: Path) -> None:
-    """The same in other formats: LAS and CSV, TIFF and WebP."""
+    """The same in other formats: LAS and CSV, TIFF and WebP, a camera of Kalibr."""
     import cv2
     import laspy
 
@@ -122,6 +122,9 @@ def plain_otherwise(folder: Path) -> None:
     las.x, las.y, las.z = first.cloud.xyz.T.astype(float)
     las.write(folder / "clouds/0.las")
     np.savetxt(folder / "clouds/1.csv", second.cloud.xyz, "%.3f", ",", header="x,y,z")
+    (folder / "calibration.yaml").unlink()
+    lens = f"[-0.2, 0.6, {K[0, 0]:g}, {K[1, 1]:g}, {K[0, 2]:g}, {K[1, 2]:g}]"
+    (folder / "camchain.yaml").write_text(f"cam0:\n  camera_model: ds\n  intrinsics: {lens}\n  resolution: [40, 24]\n")
 
 
 def ros1(folder: Path) -> None:

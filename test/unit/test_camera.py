@@ -178,9 +178,9 @@ def test_unusable_intrinsics_are_refused():
         ({"K": K + np.eye(3, k=1) * [[0, 5, 0]]}, r"skew moves pixels by \d"),
         ({"K": K.T}, "lower left is not 0"),
         ({"width": 0}, "0x480"),
-        ({"model": "mei"}, "'mei' is not supported.*plumb_bob"),
+        ({"model": "ocam"}, "'ocam' is not supported.*plumb_bob"),
         ({"D": np.ones(8)}, "4 or 5 distortion coefficients, got 8"),
-        ({"D": np.ones(5), "model": "equidistant"}, "equidistant has 4 distortion coefficients, got 5"),
+        ({"D": np.ones(3), "model": "equidistant"}, "equidistant has 4 or .* distortion coefficients, got 3"),
         ({"D": np.ones(5), "model": "rational_polynomial"}, "8 or 12 or 14"),
         ({"D": [0, np.inf, 0, 0]}, "finite"),
     ):

@@ -19,7 +19,7 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig
-from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, IntrinsicEstimate, RefinedCamera, change_between, changed
+from calib_ros.intrinsics import CENTRE, COEFFICIENTS, FOCAL, RADIAL, IntrinsicEstimate, RefinedCamera, change_between, changed
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.nuisance.lens import CENTRE as CENTRE_VALUES
@@ -62,16 +62,17 @@ def lens_parameters(config: CameraConfig, source: Camera, working: Camera) -> tu
     K = working.K
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
     shift = _shifts(source, rays)
-    radial = shift(RADIAL, DIFFERENCE)
-    radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
-    corner = int(radius.argmax())
-    share = float(np.linalg.norm(radial[corner])) / radius[corner]  # by which a k1 of 1 moves the corner
     focal = _grid(shift(FOCAL, DIFFERENCE))
     out = [LensParameter(FOCAL, 1.0, config.focal_sigma, Intrinsic.gross, focal, FOCAL_VALUES)]
     for name in CENTRE:
         field, unit = _grid(shift(name, 1.0) * source.width), float(source.width)
         out.append(LensParameter(name, unit, config.centre_sigma, Intrinsic.gross, field, CENTRE_VALUES))
-    out.append(LensParameter(RADIAL, 1 / share, RADIAL_USUAL, RADIAL_GROSS, _grid(radial / share), RADIAL_VALUES))
+    if source.model in COEFFICIENTS:  # of the other models the first coefficient is no share of the radius
+        radial = shift(RADIAL, DIFFERENCE)
+        radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
+        corner = int(radius.argmax())
+        share = float(np.linalg.norm(radial[corner])) / radius[corner]  # by which a k1 of 1 moves the corner
+        out.append(LensParameter(RADIAL, 1 / share, RADIAL_USUAL, RADIAL_GROSS, _grid(radial / share), RADIAL_VALUES))
     return tuple(parameter for parameter in out if parameter.usual > 0)
 
 
@@ -208,9 +209,9 @@ def joint_optimum(
     halves at T. extrinsic: its covariance (6, 6) if the intrinsics are right. search: values far off are tried as well. given:
     the camera that was stated, where `camera` corrects it already.
     """
-    if score.camera.is_cylinder or not limits.open_axes.any():
+    parameters = () if score.camera.is_cylinder else lens_parameters(config, camera, score.camera)
+    if not parameters or not limits.open_axes.any():
         return None
-    parameters = lens_parameters(config, camera, score.camera)
     part = score.subset(POINTS if given is None else FINE_POINTS, np.random.default_rng(0))
     limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     advance = _Doubted(

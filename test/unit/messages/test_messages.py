@@ -358,6 +358,8 @@ def test_camera_info(ros):
     assert rectified.is_pinhole
     loose = {"K": list(K.ravel()), "D": [0.1, 0, 0, 0], "P": list(P.ravel()), "distortion_model": "equidistant"}  # ROS 1's names
     assert decode_camera_info(SimpleNamespace(width=640, height=480, **loose)).model == "equidistant"
+    for model, D in (("mei", [1.2, -0.1, 0.02, 1e-3, 0.0]), ("double_sphere", [-0.2, 0.6]), ("fisheye", [0.1, 0, 0, 0, 0.01])):
+        assert np.array_equal(decode_camera_info(ros.camera_info(640, 480, K, D, model=model)).D, D)
     camera = decode_camera_info(ros.camera_info(640, 480, K, roi=(20, 40, 400, 600), binning=2))
     assert (camera.width, camera.height) == (300, 200)
     assert np.array_equal(camera.K, [[350, 0, 150], [0, 355, 100], [0, 0, 1]])

@@ -178,6 +178,15 @@ def test_exact_intrinsics_are_left_alone(scene):
     assert names == [RADIAL]
 
 
+@pytest.mark.parametrize(
+    ("model", "D"), [("double_sphere", [-0.2, 0.5]), ("omnidir", [1.2, -0.1, 0.02, 1e-3, 0]), ("fov", [0.9])]
+)
+def test_of_models_without_a_radial_coefficient_focal_length_and_centre_are_refined(model, D):
+    camera = Camera(K, 1280, 720, model, np.array(D))
+    assert [own.name for own in lens_parameters(CameraConfig(), camera, camera.rectified())] == [FOCAL, *CENTRE]
+    assert lens_parameters(CameraConfig(focal_sigma=0.0, centre_sigma=0.0), camera, camera.rectified()) == ()
+
+
 def test_unrolled_pictures_show_no_intrinsics(scene):
     calibrator = Calibrator(scene.camera, update(REFINE, {"image": {"projection": "cylinder"}}))
     with pytest.raises(BadInputError, match="not observable"):
