@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import combinations
 
 import cv2
@@ -159,22 +158,18 @@ class _Joint:
     advance: _Doubted
     noise: float
 
-    @cached_property
-    def _fields(self) -> NDArray[np.float32]:
-        """(h, w, 2 n) of all parameters."""
-        return np.concatenate([own.field for own in self.parameters], axis=2)
-
     def seen(self, T: Transform, change: Matrix) -> _Seen:
         """The points from T (4, 4) with a change (n,) of the lens."""
         P = T[:3, :3] @ self.score.points.astype(np.float64) + T[:3, 3:]
         z, K, camera = np.maximum(P[2], 1e-3), self.score.camera.K, self.score.camera
         scale = (NODES[0] - 1) / (camera.width - 1), (NODES[1] - 1) / (camera.height - 1)
         node = [((K[i, i] * P[i] / z + K[i, 2]) * scale[i]).clip(-1, 2 * NODES[i]).astype(np.float32)[None] for i in (0, 1)]
+        fields = np.concatenate([own.field for own in self.parameters], axis=2)
         shifts = np.empty((2 * len(self.parameters), P.shape[1]))
         for first in range(0, P.shape[1], 30000):  # what OpenCV takes at once
             own = slice(first, first + 30000)
             at = [np.ascontiguousarray(part[:, own]) for part in node]
-            shifts[:, own] = cv2.remap(self._fields, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].T
+            shifts[:, own] = cv2.remap(fields, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].T
         shifts = shifts.reshape(len(self.parameters), 2, -1) * z
         P[:2] += np.einsum("k,kin->in", change, shifts)
         return _Seen(self.score.with_points(P.astype(np.float32)), shifts)
