@@ -8,6 +8,8 @@ TEST_PROCESSES ?= 3
 # A sourced ROS install would shadow the wheels.
 unexport CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONPATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# Some hundred processes start in a run of the tests, and each would compile all modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 export AMENT_PREFIX_PATH := $(CURDIR)/.venv
 
 .PHONY: help env demo test test-all bench lint docs clean distclean

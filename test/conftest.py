@@ -10,11 +10,14 @@ from calib_ros.runtime import use_one_blas_thread
 use_one_blas_thread()  # as the commands and the node do; processes that run tests share the cores
 os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
+import fcntl
 import shutil
 import tempfile
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
 import pytest
 from paths import ROOT
@@ -26,6 +29,7 @@ from calib_ros_synthetic.drive import SyntheticDrive
 
 LABORATORY = ("evaluation", "benchmarks", "training")  # folders of tests that do not guard the product
 LONGEST_FIRST = ("integration", "evaluation", "unit")  # so that no long file begins when the others are done
+LOCKS: list[IO[str]] = []  # open as long as this process runs
 DOMAINS = 100  # ROS domains 1 to 100 need none of the ports that Linux gives to outgoing connections
 
 
@@ -36,7 +40,21 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["ROS_DOMAIN_ID"] = str(1 + (zlib.crc32(run.encode()) + int(worker)) % DOMAINS)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     if "PYTEST_XDIST_WORKER" not in os.environ:  # whose environment is this one's
-        os.environ[RENDERINGS] = tempfile.mkdtemp(prefix="calib_ros_renderings_")
+        os.environ[RENDERINGS] = folder_of_renderings()
+
+
+def folder_of_renderings() -> str:
+    """A new one, locked until this process ends; those of runs that were killed are removed."""
+    prefix = "calib_ros_renderings_"
+    folder = Path(tempfile.mkdtemp(prefix=prefix))
+    file = (folder / "lock").open("w")
+    fcntl.flock(file, fcntl.LOCK_EX)
+    LOCKS.append(file)
+    for lock in Path(tempfile.gettempdir()).glob(f"{prefix}*/lock"):
+        with suppress(OSError), lock.open() as other:
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(lock.parent, ignore_errors=True)
+    return str(folder)
 
 
 def pytest_unconfigure() -> None:

@@ -17,6 +17,9 @@ from calib_ros.registration.covariance import free_axes
 # Sizes of movements that are thought of, alike: from what estimates would follow to what a knock does. 10 cm go with a degree.
 SIZES_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)
 M_PER_DEG = 0.1
+# Variances of the twist: of no movement, of a rotation of each size, of a shift of each.
+_TURNS, _SHIFTS = np.deg2rad(SIZES_DEG) ** 2 / 3, (M_PER_DEG * np.array(SIZES_DEG)) ** 2 / 3
+_MOVEMENTS = np.concatenate([np.zeros((1, 6)), np.outer(_TURNS, [1, 1, 1, 0, 0, 0]), np.outer(_SHIFTS, [0, 0, 0, 1, 1, 1])])
 REMEMBERED = 50  # keyframes that tell how well a right extrinsic matches here
 MIN_REMEMBERED = 3  # of these, needed to judge
 TAIL = 0.9  # quantile of shifts by which covariances are scaled: of REMEMBERED ones five lie beyond
@@ -43,14 +46,11 @@ def shift_evidence(shift: Matrix, covariance: Covariance, freedom: float) -> flo
     sigma = np.sqrt(np.diag(covariance))[axes]
     x, correlation = shift[axes] / sigma, covariance[np.ix_(axes, axes)] / np.outer(sigma, sigma)
 
-    def log_density(added: Matrix) -> float:
-        S = correlation + np.diag(added[axes] / sigma**2)
-        return log_student(float(x @ np.linalg.solve(S, x)), float(np.linalg.slogdet(S)[1]), len(axes), freedom)
-
-    turns = [np.r_[[np.deg2rad(deg) ** 2 / 3] * 3, [0.0] * 3] for deg in SIZES_DEG]
-    shifts = [np.r_[[0.0] * 3, [(M_PER_DEG * deg) ** 2 / 3] * 3] for deg in SIZES_DEG]
-    moved = [log_density(added) for added in turns + shifts]
-    return float(logsumexp(moved) - np.log(len(moved)) - log_density(np.zeros(6)))
+    added = _MOVEMENTS[:, axes] / sigma**2
+    S = correlation + added[:, None] * np.eye(len(axes))
+    squared = [float(x @ y) for y in np.linalg.solve(S, x[:, None])[..., 0]]
+    densities = [log_student(*own, len(axes), freedom) for own in zip(squared, np.linalg.slogdet(S)[1].tolist(), strict=True)]
+    return float(logsumexp(densities[1:]) - np.log(len(_MOVEMENTS) - 1) - densities[0])
 
 
 class ShiftNoise:

@@ -40,6 +40,7 @@ from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.results import TWIST_AXES
 from calib_ros_thesis.features import importance
 
+pytestmark = pytest.mark.usefixtures("rendered_once")
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=400,height=150"
 TINY = replace(
     QUICK, curve_frames=1, curve_samples=5, single_frames=1, size_frames=1, sizes=((0.5, 0.05),), counts=(2,), cost_frames=1
@@ -198,7 +199,7 @@ def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixtur
     Result(moved, "converged", "").save(tmp_path / "moved.json")
     cache = WorkerCache(Setup((SourceSpec("bag", str(bag), reference=tuple(map(tuple, moved.tolist()))),), Config()))
     assert np.allclose(cache.reference("bag", 0), moved)
-    command = ["evaluate", str(bag), "--quick", "--methods", "ours", "--experiments", "single"]
+    command = ["evaluate", str(bag), "--quick", "--methods", "ours", "--experiments", "single", "--workers", "1"]
     assert main.main([*command, "--reference", str(tmp_path / "moved.json"), "--out", str(tmp_path / "out")]) == 0
     found = rows(tmp_path / "out")
     assert all(float(row["rotation_deg"]) > 0.3 for row in found)  # it finds the true one, 0.57 deg from the stated
@@ -243,7 +244,8 @@ def test_a_damaged_answer_is_named() -> None:
 
 
 def test_results_of_another_version_are_not_reused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--experiments", "cost", "--out", str(tmp_path)]
+    command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--experiments", "cost", "--workers", "1"]
+    command += ["--out", str(tmp_path)]
     assert main.main(command) == 0
     journal = tmp_path / "results.jsonl"
     first, rest = journal.read_text().split("\n", 1)

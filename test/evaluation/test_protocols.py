@@ -11,7 +11,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.cli import main
-from calib_ros.config import Config
+from calib_ros.config import Config, SearchConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
 from calib_ros_check.outcome import CheckVerdict
@@ -35,6 +35,7 @@ from calib_ros_evaluation.protocols.published import rows_of
 from calib_ros_evaluation.protocols.tables import accuracy_table, sets_table, size_table, trial_section
 from calib_ros_evaluation.results import Trial
 
+pytestmark = pytest.mark.usefixtures("rendered_once")
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
 
 
@@ -174,7 +175,7 @@ def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> No
     """1.6 deg as printed are 3.2 deg, on real code."""
     name = open_dataset(DRIVE)[0].name
     rows = read_table(table_file(tmp_path, f"pos,{name},0,0,0,0,0,0", f"rot_hard,{name},0,0,0,0,1.6,0"))
-    setup = Setup((SourceSpec("drive", DRIVE),), Config())
+    setup = Setup((SourceSpec("drive", DRIVE),), Config(search=SearchConfig(rounds=1, starts=64)))
     jobs = detection_jobs(rows, {name: 0}, summary(3), (3,))
     found = decisions(jobs, {one.key: answer for one, answer in zip(jobs, run_checks(setup, jobs), strict=True)})
     assert [one.error_deg for one in found] == pytest.approx([0, 3.2], abs=1e-6)

@@ -24,6 +24,7 @@ from calib_ros_evaluation.steps.pictures import VIRIDIS, RegisteredFrame, Scale,
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.maps import complete
 
+pytestmark = pytest.mark.usefixtures("rendered_once")
 SOURCE = "synthetic:seed=1,frames=2,rings=32,width=480,height=144"
 NONE = Config.from_dict({"semantics": {"segmentation": "none"}})
 FEW = 5  # samples of a loss curve, where it is not looked at

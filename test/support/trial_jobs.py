@@ -1,4 +1,4 @@
-"""Jobs of a few milliseconds for test_trials.py, in a module that workers can import; run, a small evaluation of them."""
+"""Jobs of a few milliseconds for test_pools.py, in a module that workers can import; run, a small evaluation of them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+
+from waiting import until
 
 from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.local import LocalPool
@@ -26,9 +28,11 @@ def answers(jobs: Sequence[EvaluationJob]) -> list[Answer]:
     return [{"value": one.frames[0] / 3 + one.option("seed"), "missing": None} for one in jobs]
 
 
-def work(folder: Path, duration: float, jobs: Sequence[EvaluationJob]) -> list[Answer]:
-    """`answers`, after a while; who did what stands in the file "log": process and key. Who began: files "at-work-..."."""
+def work(folder: Path, duration: float, jobs: Sequence[EvaluationJob], workers: int = 1) -> list[Answer]:
+    """`answers`, after a while, and not before so many workers have begun; who did what stands in the file "log": process and
+    key. Who began: files "at-work-..."."""
     (folder / f"at-work-{os.getpid()}").touch()
+    until(lambda: len(list(folder.glob("at-work-*"))) >= workers, "work of the other workers")
     time.sleep(duration)
     with open(folder / "log", "ab", buffering=0) as log:
         for one in jobs:
@@ -70,7 +74,8 @@ def threads(jobs: Sequence[EvaluationJob]) -> list[Answer]:
 def main(folder: Path, n: int, workers: int, duration: float) -> None:
     """The evaluation of n groups."""
     with Journal(folder, {"version": "1"}) as journal:
-        run(groups(n), partial(work, folder, duration), journal, LocalPool(workers), lambda done, total: None)
+        doing = partial(work, folder, duration, workers=workers)
+        run(groups(n), doing, journal, LocalPool(workers), lambda done, total: None)
 
 
 if __name__ == "__main__":

@@ -170,9 +170,7 @@ class _Joint:
         for first in range(0, P.shape[1], 30000):  # what OpenCV takes at once
             own = slice(first, first + 30000)
             at = [np.ascontiguousarray(part[:, own]) for part in node]
-            for k in range(0, len(shifts), 2):
-                moved = cv2.remap(fields[..., k : k + 2], at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                shifts[k : k + 2, own] = moved[0].T
+            shifts[:, own] = cv2.remap(fields, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].T
         shifts = shifts.reshape(len(self.parameters), 2, -1) * z
         P[:2] += np.einsum("k,kin->in", change, shifts)
         return _Seen(self.score.with_points(P.astype(np.float32)), shifts)

@@ -50,8 +50,10 @@ def levenberg_marquardt(
             B = H + np.diag(prior.information)
         axes = np.flatnonzero(limits.movable(T, gradient))
         gradient, B, step = gradient[axes], B[np.ix_(axes, axes)], np.zeros(6)
+        steep, damped = B.diagonal(), B.copy()
         for _ in range(6):
-            step[axes] = np.linalg.solve(B + np.diag(damping * np.diag(B) + 1e-9), gradient)
+            damped.flat[:: len(axes) + 1] = steep + (damping * steep + 1e-9)
+            step[axes] = np.linalg.solve(damped, gradient)
             candidate = limits.clip(se3.exp(step) @ T)
             value = score.value(candidate)
             new_cost, new_slope = prior.cost(candidate) if prior else (0.0, slope)

@@ -20,6 +20,7 @@ from calib_ros_check.outcome import Cause, CauseState, CheckVerdict
 from calib_ros_check.sensors import LensChange, moved_deg, moves_by
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
+QUICK = Config(search=SearchConfig(rounds=1, starts=64))
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +35,8 @@ def fisheye():
     return [made[k] for k in range(4)], made.reference
 
 
-def checked(frames, camera, truth, config=None):
-    return Checker(camera, config).check([replace(frame, camera=camera) for frame in frames], truth)
+def checked(frames, camera, truth):
+    return Checker(camera, QUICK).check([replace(frame, camera=camera) for frame in frames], truth)
 
 
 def halved(camera):
@@ -90,7 +91,7 @@ def test_guesses_about_cameras_with_and_without_a_distortion():
 
 def test_intrinsics_of_half_the_image_size_are_named_with_the_factor(drive):
     frames, truth = drive
-    result = checked(frames, halved(frames[0].camera), truth, Config(search=SearchConfig(rounds=1, starts=64)))
+    result = checked(frames, halved(frames[0].camera), truth)
     assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 

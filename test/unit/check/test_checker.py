@@ -27,6 +27,7 @@ from calib_ros_check.hypotheses import axis_rotations, distinct_poses, hypothese
 from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
+QUICK = Config(search=SearchConfig(rounds=1, starts=64))
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 
@@ -47,13 +48,8 @@ def drive(made):
 
 @pytest.fixture(scope="module")
 def checker(made):
-    return Checker(made.camera)
-
-
-@pytest.fixture(scope="module")
-def quick(made):
-    """Of a smaller search, for what is found or missed far away."""
-    return Checker(made.camera, Config(search=SearchConfig(rounds=1, starts=256)))
+    """Of a small search, which finds what is to be found here."""
+    return Checker(made.camera, QUICK)
 
 
 @pytest.mark.parametrize(("deg", "tolerance"), [(0.0, Tolerance()), (0.8, Tolerance(2.0, 0.2))])
@@ -82,7 +78,7 @@ def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, 
 
 def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypatch):
     frames, truth = drive
-    checker = Checker(frames[0].camera)
+    checker = Checker(frames[0].camera, QUICK)
     missed = Result(truth, REFUSED, "missed", refusal=RefusalCode.NOT_SIGNIFICANT)
     monkeypatch.setattr(checker._calibrator, "estimate", lambda *_: missed)
     result = checker.check(frames, se3.perturb(truth, [2.0, 0, 0], [0, 0, 0]))
@@ -95,7 +91,7 @@ def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypa
 def test_further_looks_are_at_half_the_p_value_whatever_the_clocks(drive, monkeypatch, p_value, taken):
     """The limit is 0.01, which holds for an optimum that is refused for its time stamps as well."""
     frames, truth = drive
-    checker = Checker(frames[0].camera)
+    checker = Checker(frames[0].camera, QUICK)
     late = Result(
         truth, REFUSED, "late", refusal=RefusalCode.WRONG_TIMES, evidence=Evidence(5.0, None, p_value, 1.0), optimum=truth
     )
@@ -127,16 +123,16 @@ def test_a_check_may_be_ended_in_every_stage(made, checker):
     assert all(0 <= share <= 1 for _, share in stages)
 
 
-def test_what_edges_find_far_away_needs_no_classes(drive, quick, monkeypatch):
+def test_what_edges_find_far_away_needs_no_classes(drive, checker, monkeypatch):
     """A scene with few objects matches less by its classes than by its edges."""
     frames, truth = drive
     # This mount is nearly that of a cloud in the camera's body frame.
-    monkeypatch.setattr(quick._alternatives, "mixed_up", lambda *_: None)
-    features = [quick._calibrator.extract(frame) for frame in frames]
+    monkeypatch.setattr(checker._alternatives, "mixed_up", lambda *_: None)
+    features = [checker._calibrator.extract(frame) for frame in frames]
     asked: list[str] = []
     checked = se3.perturb(truth, [0, 16.0, 6.0], [0, 0, 0])
     asked_for = CheckInputs(checked, Tolerance(), lambda numbers: asked.append("classes") or features)
-    result = quick.check_features(features, asked_for)
+    result = checker.check_features(features, asked_for)
     assert result.verdict is CheckVerdict.FAIL, result.reason
     assert result.rotation.error == pytest.approx(np.hypot(16, 6), abs=0.3)
     assert not asked
@@ -152,10 +148,10 @@ def test_what_edges_find_far_away_needs_no_classes(drive, quick, monkeypatch):
         (lambda T: T, (0, 1), Cause.ROTATED_IMAGE),
     ],
 )
-def test_transforms_and_pictures_that_were_mixed_up_are_named(drive, checker, quick, wrong, flip, cause):
+def test_transforms_and_pictures_that_were_mixed_up_are_named(drive, checker, wrong, flip, cause):
     frames, truth = drive
     pictures = [replace(frame, image=np.ascontiguousarray(np.flip(frame.image, flip))) for frame in frames]
-    result = (quick if flip else checker).check(pictures, wrong(truth))
+    result = checker.check(pictures, wrong(truth))
     assert (result.verdict, result.cause) == (CheckVerdict.FAIL, cause), result.reason
 
 
@@ -175,24 +171,24 @@ def test_a_cloud_in_another_frame_of_the_vehicle_is_named(drive, checker):
     assert len(causes) == len(result.causes)
 
 
-def test_a_mount_that_is_far_off_is_no_cloud_in_the_body_frame(drive, quick):
+def test_a_mount_that_is_far_off_is_no_cloud_in_the_body_frame(drive, checker):
     """Cameras that look ahead, next to the scanner, have about the extrinsic that such a cloud would have."""
     frames, truth = drive
     checked = se3.perturb(truth, [0, 12.0, 3.0], [0, 0, 0])
-    result = quick.check(frames, checked)
+    result = checker.check(frames, checked)
     assert (result.verdict, result.cause) == (CheckVerdict.FAIL, None), result.reason
     assert result.rotation.error == pytest.approx(se3.rotation_error_deg(checked, truth), abs=0.3)
     link = se3.inverse(BODY) @ truth
     moved = [replace(f, cloud=replace(f.cloud, xyz=se3.transform(link, f.cloud.xyz).astype(np.float32))) for f in frames]
-    assert quick.check(moved, checked).cause is Cause.CLOUD_FRAME
+    assert checker.check(moved, checked).cause is Cause.CLOUD_FRAME
 
 
-def test_pictures_of_elsewhere_are_inconclusive_and_none_are_bad_input(drive, quick):
+def test_pictures_of_elsewhere_are_inconclusive_and_none_are_bad_input(drive, checker):
     frames, truth = drive
     with pytest.raises(BadInputError, match="no frames"):
-        quick.check([], truth)
+        checker.check([], truth)
     noise = np.random.default_rng(0).integers(0, 255, frames[0].image.shape, dtype=np.uint8)
-    result = quick.check([replace(frames[0], image=noise)], truth)
+    result = checker.check([replace(frames[0], image=noise)], truth)
     assert result.verdict is CheckVerdict.INCONCLUSIVE
     assert result.T_estimated is None
     assert all(finding.state is CauseState.NOT_JUDGED for finding in result.causes)
@@ -200,10 +196,10 @@ def test_pictures_of_elsewhere_are_inconclusive_and_none_are_bad_input(drive, qu
     assert "more frames" in result.reason
 
 
-def test_where_nothing_matches_the_effort_is_bounded(made, quick, monkeypatch):
+def test_where_nothing_matches_the_effort_is_bounded(made, checker, monkeypatch):
     """Searches do not depend on the number of frames; pictures are taken anew of a few, and of all for the best guess alone."""
     barrel = replace(made.camera, D=np.array([-0.3, 0.08, 0.0, 0.0, 0.0]))
-    checker = Checker(barrel, quick.config)
+    checker = Checker(barrel, checker.config)
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 255, made[0].image.shape, dtype=np.uint8) for _ in range(4)]
     frames = [replace(made[k % 4], camera=barrel, image=noise[k % 4]) for k in range(6)]
@@ -240,9 +236,9 @@ def symmetric(made):
 
 
 @pytest.mark.parametrize("deg", [0.0, 1.5])
-def test_a_mix_up_under_which_the_scene_is_symmetric_is_not_named(symmetric, quick, deg):
+def test_a_mix_up_under_which_the_scene_is_symmetric_is_not_named(symmetric, checker, deg):
     frames, truth = symmetric
-    result = quick.check(frames, se3.perturb(truth, [0, deg, 0], [0, 0, 0]))
+    result = checker.check(frames, se3.perturb(truth, [0, deg, 0], [0, 0, 0]))
     assert result.cause is None, result.reason
 
 

@@ -33,6 +33,7 @@ from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import CONVERGED, Result, load
 from calib_ros_synthetic.drive import SyntheticDrive
 
+pytestmark = pytest.mark.usefixtures("rendered_once")
 SOURCE = "synthetic:seed=1,frames=6,rings=32,width=640,height=192,speed=3"
 # Enough for what these tests are about; test_calibrate_writes_result_and_overlay runs the defaults.
 QUICK: dict[str, dict[str, Any]] = {
@@ -351,7 +352,7 @@ def test_refined_intrinsics_are_written_as_camera_info(
     folder = vehicle(tmp_path / "vehicle", street[:4], changed(street[0].camera, FOCAL, 0.03))
     out, result, camera = tmp_path / "front.yaml", tmp_path / "result.json", street[0].camera
     refine = ["calibrate", str(folder), *quick, "--intrinsics", "refine", "--camera-info", str(out)]
-    code, _, err = run(capsys, *refine, "--yaw-deg", "180", "--search-deg", "1", "--search-m", "0.1")
+    code, _, err = run(capsys, *refine, "--frames", "0", "--yaw-deg", "180", "--search-deg", "1", "--search-m", "0.1")
     assert code == 1
     assert f"{out} is not written: the estimate is " in err
     assert not out.exists()

@@ -17,7 +17,7 @@ import pytest
 import trial_jobs
 from paths import ROOT, SUPPORT
 from trial_jobs import answers, fall, groups, refuse, work
-from waiting import until
+from waiting import LIMIT_S, until
 
 from calib_ros.errors import BadInputError, CalibrationError, TooFewFeaturesError
 from calib_ros_check.jobs import cluster
@@ -121,7 +121,7 @@ def test_every_job_once(tmp_path: Path, workers: int) -> None:
 
 
 def test_a_killed_evaluation_ends_its_workers_and_resumes(tmp_path: Path) -> None:
-    for seconds, begun in ((0.05, 10), (60, 0)):  # also of workers in the middle of a group
+    for seconds, begun in ((0.5, 10), (60, 0)):  # also of workers in the middle of a group
         folder = tmp_path / f"{seconds}"
         folder.mkdir()
         process = subprocess.Popen(command(folder, 30, 2, seconds), env=environment())
@@ -129,7 +129,7 @@ def test_a_killed_evaluation_ends_its_workers_and_resumes(tmp_path: Path) -> Non
         process.kill()
         process.wait()
         until(lambda folder=folder: not any(map(alive, busy(folder))), "their end")
-    folder = tmp_path / "0.05"
+    folder = tmp_path / "0.5"
     before, first = set(kept(folder)), performed(folder)
     assert 9 < len(before) < 90
     subprocess.run(command(folder, 30, 2, 0.05), env=environment(), check=True)
@@ -156,7 +156,7 @@ def test_ctrl_c_stops_all_at_once(tmp_path: Path) -> None:
     until(lambda: lines(tmp_path) > before + 6, "answers")
     assert busy(tmp_path) == workers  # they do not mind
     os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=LIMIT_S)
     assert process.returncode == -signal.SIGINT
     assert err.count("Traceback") == 1  # its own, none of a worker
     assert not any(map(alive, workers))
@@ -267,7 +267,7 @@ def test_where_all_dask_workers_have_gone_it_is_said(tmp_path: Path) -> None:
     with scheduler(0) as address:
         options = (address, "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path))
         with process_of_dask("worker", tmp_path, *options) as worker:
-            pool = ClusterPool(address)
+            pool = ClusterPool(address, wait_s=LIMIT_S)
 
             def end(done: int, total: int) -> None:
                 if done:
@@ -313,7 +313,12 @@ def test_worker_without_calib_ros_is_reported(tmp_path: Path) -> None:
         process_of_dask("worker", tmp_path, address, *options, PYTHONPATH=str(tmp_path)),
         pytest.raises(CalibrationError, match=r"must be installed.*tcp://.*No module named 'calib_ros'"),
     ):
-        ran(tmp_path, ClusterPool(address), answers)
+        ran(tmp_path, ClusterPool(address, wait_s=LIMIT_S), answers)
+
+
+def is_listening(port: int) -> bool:
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", port)) == 0
 
 
 def test_a_scheduler_without_workers_and_one_that_is_lost(tmp_path: Path) -> None:
@@ -323,15 +328,23 @@ def test_a_scheduler_without_workers_and_one_that_is_lost(tmp_path: Path) -> Non
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     address = f"tcp://127.0.0.1:{port}"
+    pool = ClusterPool(address, wait_s=0.2)
+
+    def end(done: int, total: int) -> None:
+        if done:
+            head.kill()
+            pool.wait_s = 5.0
+
     with process_of_dask("scheduler", tmp_path, "--host", "127.0.0.1", "--port", port) as head:
+        until(lambda: is_listening(int(port)), "a scheduler")
         with pytest.raises(CalibrationError, match=r"no workers.*dask worker"):
-            ran(tmp_path, ClusterPool(address, wait_s=0.2), answers)
-        slow = partial(work, tmp_path, 0.1)
+            ran(tmp_path, pool, answers)
+        pool.wait_s = LIMIT_S
         with (
             process_of_dask("worker", tmp_path, address, "--nthreads", "1", "--no-nanny"),
             pytest.raises(CalibrationError, match=r"scheduler at tcp.* is lost.*goes on where it stopped"),
         ):
-            ran(tmp_path, ClusterPool(address), slow, groups(40), lambda done, total: head.kill() if done else None)
+            ran(tmp_path, pool, partial(work, tmp_path, 0.1), groups(40), end)
     assert 3 <= len(kept(tmp_path)) < 120
 
 
