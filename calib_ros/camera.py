@@ -30,8 +30,8 @@ NOISE = 1e-9  # of the largest element of K, that may be left where 0 should be
 MAX_SKEW_PX = 0.5  # of a pixel at the image's border, which no edge shows; OpenCV has none in its models
 MAX_SIDE = 32766  # px; OpenCV cannot rectify larger images
 MIN_DEPTH = 0.1  # m; nearer points are out of focus, and 1/z diverges
-CYLINDER = "cylinder"  # model of images on a cylinder about the camera's y axis; not a lens, but what wide ones are shown on
-WIDEST, HIGHEST = np.deg2rad(100.0), np.deg2rad(60.0)  # rad from the axis, sideways and upward, to which images are unrolled
+SPHERE = "sphere"  # model of images whose radius is the angle from the axis; not a lens, but what wide ones are shown on
+WIDEST = np.deg2rad(140.0)  # rad from the axis to which images are unrolled: no lens sees farther
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class Camera:
                 f"CameraInfo: image size {self.width}x{self.height} is beyond {MAX_SIDE} px a side; check the camera driver"
             )
         model = ALIASES.get(self.model.lower(), self.model.lower())
-        if model not in DISTORTION_MODELS and model != CYLINDER:
+        if model not in DISTORTION_MODELS and model != SPHERE:
             raise BadInputError(
                 f"CameraInfo: distortion model '{' '.join(self.model.split())[:80]}' is not supported; "
                 f"rectify the image or use one of {', '.join(DISTORTION_MODELS)}"
@@ -110,12 +110,13 @@ class Camera:
     @property
     def is_pinhole(self) -> bool:
         """Whether there is no distortion: the image is rectified, or the lens ideal."""
-        return len(self.D) == 0 and not self.is_cylinder
+        return len(self.D) == 0 and not self.is_sphere
 
     @property
-    def is_cylinder(self) -> bool:
-        """Whether columns are angles: u = fx atan2(x, z) + cx, v = fy y / hypot(x, z) + cy."""
-        return self.model == CYLINDER
+    def is_sphere(self) -> bool:
+        """Whether the radius is the angle from the axis: u = fx a x / r + cx, v = fy a y / r + cy, where r = hypot(x, y) and
+        a = atan2(r, z)."""
+        return self.model == SPHERE
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Points (n, 3) in the camera's optical frame, m -> pixels (n, 2) and whether each is in the image (n,).
@@ -125,10 +126,9 @@ class Camera:
         """
         P = np.atleast_2d(np.asarray(points, float)).reshape(-1, 3)
         uv = np.full((len(P), 2), np.nan)
-        front = (np.hypot(P[:, 0], P[:, 2]) if self.is_cylinder else P[:, 2]) > MIN_DEPTH
-        if self.is_cylinder:
-            x, y, z = P[front].T
-            uv[front] = np.c_[np.arctan2(x, z), y / np.hypot(x, z)] @ self.K[:2, :2].T + self.K[:2, 2]
+        front = (np.linalg.norm(P, axis=1) if self.is_sphere else P[:, 2]) > MIN_DEPTH
+        if self.is_sphere:
+            uv[front] = angles_from_axis(P[front]) @ self.K[:2, :2].T + self.K[:2, 2]
         elif self.is_pinhole:
             x = P[front, :2] / P[front, 2:]
             uv[front] = x @ self.K[:2, :2].T + self.K[:2, 2]
@@ -214,19 +214,26 @@ class Camera:
 
     def _sides(self) -> tuple[float, float]:
         """Angles (rad) from the optical axis of the left and the right border, at most WIDEST to either side."""
-        angle = np.linspace(-WIDEST, WIDEST, 401)
+        angle = np.linspace(-WIDEST, WIDEST, 561)
         return _range_inside(angle, self._lens_pixels(np.c_[np.sin(angle), 0 * angle, np.cos(angle)])[:, 0], self.width)
 
     def unrolled(self) -> Camera:
-        """The camera of the image on a cylinder about the camera's y axis: of all that the lens sees up to 100 deg to either side
-        and 60 deg up and down, at the lens's own focal length."""
+        """The camera of the image on a sphere about the camera, of all that the lens sees, at its own focal length."""
         # 60 deg from the axis a pinhole stretches the image four times: one blur is not the same angle everywhere.
-        fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
-        left, right = self._sides()
-        slope = np.tan(np.linspace(-HIGHEST, HIGHEST, 241))
-        top, bottom = _range_inside(slope, self._lens_pixels(np.c_[0 * slope, slope, np.ones_like(slope)])[:, 1], self.height)
-        width, rows = max(round(fx * (right - left)), 1), max(round(fy * (bottom - top)), 1)
-        return Camera(np.array([[fx, 0, -fx * left], [0, fy, -fy * top], [0, 0, 1]]), width, rows, CYLINDER)
+        around, angle = np.meshgrid(np.linspace(0, 2 * np.pi, 361), np.linspace(0, WIDEST, 561))
+        at = np.stack([angle * np.cos(around), angle * np.sin(around)], axis=-1).reshape(-1, 2)
+        u, v = self._lens_pixels(rays_of_angles(at)).T
+        with np.errstate(invalid="ignore"):
+            seen = at[(u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1)]
+        first, last, focal = seen.min(axis=0, initial=0.0), seen.max(axis=0, initial=0.0), np.diag(self.K)[:2]
+        width, height = (max(round(size), 1) for size in focal * (last - first))
+        K = np.array([[focal[0], 0, -focal[0] * first[0]], [0, focal[1], -focal[1] * first[1]], [0, 0, 1]])
+        return Camera(K, width, height, SPHERE)
+
+    def angles(self) -> NDArray[np.float64]:
+        """Of a sphere, the angles (H, W, 2) rad from the axis of each pixel, see `angles_from_axis`."""
+        u, v = ((np.arange(size) - self.K[k, 2]) / self.K[k, k] for k, size in enumerate((self.width, self.height)))
+        return np.stack(np.meshgrid(u, v), axis=-1)
 
     def _central_field(self) -> NDArray[np.float64]:
         """K (3, 3) of a fisheye's central field: of the shortest focal length, from 0.8 times the lens's, without empty rim."""
@@ -240,6 +247,33 @@ class Camera:
         return np.array([[focal, 0, self.K[0, 2]], [0, focal, self.K[1, 2]], [0, 0, 1]])
 
 
+def angles_from_axis(rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rays (n, 3) of any length, the optical axis z -> (n, 2) rad: the angle from the axis, towards x and towards y."""
+    radius = np.hypot(rays[:, 0], rays[:, 1])
+    return np.asarray(rays[:, :2] * (np.arctan2(radius, rays[:, 2]) / np.maximum(radius, 1e-12))[:, None])
+
+
+def rays_of_angles(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse of `angles_from_axis`: (n, 2) rad -> unit vectors (n, 3)."""
+    angle = np.hypot(angles[:, 0], angles[:, 1])
+    return np.asarray(np.c_[angles * np.sinc(angle / np.pi)[:, None], np.cos(angle)])
+
+
+def across_meridians(sphere: Camera) -> NDArray[np.float64]:
+    """Unit vectors (2, H, W) of a sphere's picture, at every pixel normal to the image of the line there that is parallel to the
+    camera's y axis: to the meridian, whose poles are above and below."""
+    x, y, z = rays_of_angles(sphere.angles().reshape(-1, 2) + 1e-9).T  # on the axis itself there is no direction outward
+    radius = np.hypot(x, y)
+    # d/de of the ray at elevation e: along the radius, and around the axis, where the picture is stretched by angle / sine.
+    level = np.maximum(np.hypot(x, z), 1e-12)
+    upward = np.stack([-y * x / level, level, -y * z / level])
+    outward = ((x * upward[0] + y * upward[1]) * z / radius) - radius * upward[2]
+    around = (x * upward[1] - y * upward[0]) / radius * (np.arctan2(radius, z) / radius)
+    u = sphere.K[0, 0] * (outward * x - around * y) / radius
+    v = sphere.K[1, 1] * (outward * y + around * x) / radius
+    return np.asarray(np.stack([v, -u]) / np.maximum(np.hypot(u, v), 1e-12)).reshape(2, sphere.height, sphere.width)
+
+
 def _range_inside(values: NDArray[np.float64], pixel: NDArray[np.float64], size: int) -> tuple[float, float]:
     """Least and largest of the values (n,) whose pixel (n,) is one of the image's `size`."""
     with np.errstate(invalid="ignore"):
@@ -249,7 +283,7 @@ def _range_inside(values: NDArray[np.float64], pixel: NDArray[np.float64], size:
 
 class Rectifier:
     """Removes lens distortion from images; look-up tables are made once, with the first image. target: camera of the rectified
-    image, a pinhole or a cylinder; None = ``camera.rectified()``."""
+    image, a pinhole or a sphere; None = ``camera.rectified()``."""
 
     def __init__(self, camera: Camera, target: Camera | None = None) -> None:
         self.source = camera
@@ -258,7 +292,7 @@ class Rectifier:
     @cached_property
     def _maps(self) -> tuple[Any, Any]:
         lens, size = self.source, (self.source.width, self.source.height)
-        if self.camera.is_cylinder:
+        if self.camera.is_sphere:
             at = np.nan_to_num(self._pixels, nan=-1.0)
             return cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)
         init: Any = cv2.fisheye.initUndistortRectifyMap if lens.model == "equidistant" else cv2.initUndistortRectifyMap
@@ -267,17 +301,13 @@ class Rectifier:
 
     @cached_property
     def _pixels(self) -> NDArray[np.float32]:
-        """Pixel (H, W, 2) of the lens that each pixel of a cylinder shows; NaN = none."""
-        K = self.camera.K
-        angle = (np.arange(self.camera.width) - K[0, 2]) / K[0, 0]
-        height = (np.arange(self.camera.height) - K[1, 2]) / K[1, 1]
-        angle, height = (a.ravel() for a in np.meshgrid(angle, height))
-        uv = self.source._lens_pixels(np.c_[np.sin(angle), height, np.cos(angle)])
+        """Pixel (H, W, 2) of the lens that each pixel of a sphere shows; NaN = none."""
+        uv = self.source._lens_pixels(rays_of_angles(self.camera.angles().reshape(-1, 2)))
         return np.asarray(uv.reshape(self.camera.height, self.camera.width, 2), np.float32)
 
     def seen(self) -> NDArray[np.bool_] | None:
         """Pixels (H, W) of the rectified image that the lens shows; None = all but slivers along the border."""
-        if not self.camera.is_cylinder:
+        if not self.camera.is_sphere:
             return None
         size = np.array([self.source.width - 1, self.source.height - 1])
         with np.errstate(invalid="ignore"):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
-from calib_ros.camera import Camera
+from calib_ros.camera import Camera, rays_of_angles
 from calib_ros.config import MotionConfig
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.image.enhance import to_gray
@@ -234,7 +234,7 @@ def track(pictures: Sequence[Gray], mask: Gray | None = None) -> tuple[Matrix, M
 
 
 def bearings(camera: Camera, uv: Matrix) -> Matrix:
-    """Unit vectors (n, 3) in the camera's frame of pixels (n, 2) of a pinhole or a cylinder."""
-    x, y = ((uv - camera.K[:2, 2]) / [camera.K[0, 0], camera.K[1, 1]]).T
-    rays = np.stack([np.sin(x), y, np.cos(x)] if camera.is_cylinder else [x, y, np.ones_like(x)], axis=1)
+    """Unit vectors (n, 3) in the camera's frame of pixels (n, 2) of a pinhole or a sphere."""
+    at = (uv - camera.K[:2, 2]) / [camera.K[0, 0], camera.K[1, 1]]
+    rays = rays_of_angles(at) if camera.is_sphere else np.c_[at, np.ones(len(at))]
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -208,7 +208,7 @@ def joint_optimum(
     halves at T. extrinsic: its covariance (6, 6) if the intrinsics are right. search: values far off are tried as well. given:
     the camera that was stated, where `camera` corrects it already.
     """
-    if score.camera.is_cylinder or not limits.open_axes.any():
+    if score.camera.is_sphere or not limits.open_axes.any():
         return None
     parameters = lens_parameters(config, camera, score.camera)
     part = score.subset(POINTS if given is None else FINE_POINTS, np.random.default_rng(0))
