@@ -97,6 +97,13 @@ class LidarConfig(Stage):
         " from the points",
         choices=("auto", "rings", "projection"),
     )
+    accumulate_s: float = option(
+        0.0,
+        "time over which scans are put together, moved by the vehicle's motion, s: about 1 for scanners whose pattern does not "
+        "repeat (Livox), of which one scan is too sparse; 0 = each scan alone",
+        low=0.0,
+        high=3.0,
+    )
     scanner_pose: str = option(
         "auto",
         "pose of the scanner in the frame of its clouds: auto = that frame itself, unless the rings show another one; "
