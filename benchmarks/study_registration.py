@@ -271,7 +271,7 @@ def refined(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int
     said = ""
     if result.covariance is not None:
         off = se3.log(result.T_camera_lidar @ se3.inverse(case.truth))
-        unrolled = own[0].camera.is_cylinder
+        unrolled = own[0].camera.is_sphere
         least = np.full((6, 6), np.nan) if unrolled else bound(own, case.frames, case.truth, calibrator.config)
         parts = [np.linalg.norm(off[k]) / np.sqrt(np.trace(least[k, k])) for k in (slice(0, 3), slice(3, 6))]
         said = " ".join(f"{value:.3g}" for value in (*off / np.sqrt(np.diag(result.covariance)), *parts))

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros.errors import BadInputError
-from calib_ros.lens import LENSES, PERSPECTIVE, LensProjection, lens_model, refuse
+from calib_ros.lens import LENSES, PERSPECTIVE, LensProjection, angles_of_rays, lens_model, rays_of_angles, refuse
 
 NOISE = 1e-9  # of the largest element of K, that may be left where 0 should be
 MAX_SKEW_PX = 0.5  # of a pixel at the image's border, which no edge shows; OpenCV has none in its models
 MAX_SIDE = 32766  # px; OpenCV cannot rectify larger images
 MIN_DEPTH = 0.1  # m; nearer points are out of focus, and 1/z diverges
-CYLINDER = "cylinder"  # model of images on a cylinder about the camera's y axis; not a lens, but what wide ones are shown on
-WIDEST, HIGHEST = np.deg2rad(100.0), np.deg2rad(60.0)  # rad from the axis, sideways and upward, to which images are unrolled
+SPHERE = "sphere"  # model of images whose radius is the angle from the axis; not a lens, but what wide ones are shown on
+WIDEST = np.deg2rad(140.0)  # rad from the axis to which images are unrolled: no lens sees farther
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Camera:
                 f"CameraInfo: image size {self.width}x{self.height} is beyond {MAX_SIDE} px a side; check the camera driver"
             )
         model = lens_model(self.model)
-        if model not in LENSES and model != CYLINDER:
+        if model not in LENSES and model != SPHERE:
             raise BadInputError(
                 f"CameraInfo: distortion model '{' '.join(self.model.split())[:80]}' is not supported; "
                 f"rectify the image or use one of {', '.join(LENSES)}"
@@ -76,7 +76,7 @@ class Camera:
         if D.any():
             refuse(model, D)
         else:
-            D, model = np.zeros(0), model if model in (*PERSPECTIVE, "equidistant", CYLINDER) else "plumb_bob"
+            D, model = np.zeros(0), model if model in (*PERSPECTIVE, "equidistant", SPHERE) else "plumb_bob"
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "D", D)
         object.__setattr__(self, "model", model)
@@ -96,12 +96,13 @@ class Camera:
     @property
     def is_pinhole(self) -> bool:
         """Whether there is no distortion: the image is rectified, or the lens ideal."""
-        return len(self.D) == 0 and not self.is_cylinder
+        return len(self.D) == 0 and not self.is_sphere
 
     @property
-    def is_cylinder(self) -> bool:
-        """Whether columns are angles: u = fx atan2(x, z) + cx, v = fy y / hypot(x, z) + cy."""
-        return self.model == CYLINDER
+    def is_sphere(self) -> bool:
+        """Whether the radius is the angle from the axis: u = fx a x / r + cx, v = fy a y / r + cy, where r = hypot(x, y) and
+        a = atan2(r, z)."""
+        return self.model == SPHERE
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Points (n, 3) in the camera's optical frame, m -> pixels (n, 2) and whether each is in the image (n,).
@@ -111,7 +112,7 @@ class Camera:
         """
         P = np.atleast_2d(np.asarray(points, float)).reshape(-1, 3)
         uv = self._lens_pixels(P)
-        uv[~((np.hypot(P[:, 0], P[:, 2]) if self.is_cylinder else P[:, 2]) > MIN_DEPTH)] = np.nan
+        uv[~((np.linalg.norm(P, axis=1) if self.is_sphere else P[:, 2]) > MIN_DEPTH)] = np.nan
         with np.errstate(invalid="ignore"):
             inside = (uv[:, 0] >= 0) & (uv[:, 0] <= self.width - 1) & (uv[:, 1] >= 0) & (uv[:, 1] <= self.height - 1)
         return uv, inside
@@ -119,9 +120,8 @@ class Camera:
     def _lens_pixels(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """As `project`, pixels (n, 2) of rays (n, 3), also of those behind the image plane that a fisheye sees."""
         with np.errstate(all="ignore"):
-            if self.is_cylinder:
-                x, y, z = rays.T
-                xy = np.c_[np.arctan2(x, z), y / np.hypot(x, z)]
+            if self.is_sphere:
+                xy = angles_of_rays(rays)
             elif self.is_pinhole:
                 xy = np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
             else:
@@ -131,11 +131,10 @@ class Camera:
     def unproject(self, pixels: ArrayLike) -> NDArray[np.float64]:
         """Unit rays (n, 3) of pixels (n, 2), also of those outside the image; NaN where the lens shows nothing."""
         xy = (np.asarray(pixels, float).reshape(-1, 2) - self.K[:2, 2]) / np.diag(self.K)[:2]
-        if not (self.is_pinhole or self.is_cylinder):
-            return self._lens.rays(xy)
-        x, y = xy.T
-        rays = np.c_[np.sin(x), y, np.cos(x)] if self.is_cylinder else np.c_[xy, np.ones(len(xy))]
-        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        if self.is_pinhole:
+            rays = np.c_[xy, np.ones(len(xy))]
+            return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        return rays_of_angles(xy) if self.is_sphere else self._lens.rays(xy)
 
     @cached_property
     def _lens(self) -> LensProjection:
@@ -144,7 +143,7 @@ class Camera:
     @property
     def focal(self) -> NDArray[np.float64]:
         """(2,) px per rad at the optical axis: fx and fy of K, but for models that scale there."""
-        return np.diag(self.K)[:2] * (1.0 if self.is_pinhole or self.is_cylinder else self._lens.slope)
+        return np.diag(self.K)[:2] * (1.0 if self.is_pinhole or self.is_sphere else self._lens.slope)
 
     @cached_property
     def _reach(self) -> float:
@@ -178,19 +177,20 @@ class Camera:
 
     def _sides(self) -> tuple[float, float]:
         """Angles (rad) from the optical axis of the left and the right border, at most WIDEST to either side."""
-        angle = np.linspace(-WIDEST, WIDEST, 401)
+        angle = np.linspace(-WIDEST, WIDEST, 561)
         return _range_inside(angle, self._lens_pixels(np.c_[np.sin(angle), 0 * angle, np.cos(angle)])[:, 0], self.width)
 
     def unrolled(self) -> Camera:
-        """The camera of the image on a cylinder about the camera's y axis: of all that the lens sees up to 100 deg to either side
-        and 60 deg up and down, at the lens's own focal length."""
+        """The camera of the image on a sphere about the camera, of all that the lens sees, at its own focal length."""
         # 60 deg from the axis a pinhole stretches the image four times: one blur is not the same angle everywhere.
-        fx, fy = map(float, self.focal)
-        left, right = self._sides()
-        slope = np.tan(np.linspace(-HIGHEST, HIGHEST, 241))
-        top, bottom = _range_inside(slope, self._lens_pixels(np.c_[0 * slope, slope, np.ones_like(slope)])[:, 1], self.height)
-        width, rows = max(round(fx * (right - left)), 1), max(round(fy * (bottom - top)), 1)
-        return Camera(np.array([[fx, 0, -fx * left], [0, fy, -fy * top], [0, 0, 1]]), width, rows, CYLINDER)
+        around, angle = np.meshgrid(np.linspace(0, 2 * np.pi, 361), np.linspace(0, WIDEST, 561))
+        at = np.stack([angle * np.cos(around), angle * np.sin(around)], axis=-1).reshape(-1, 2)
+        u, v = self._lens_pixels(rays_of_angles(at)).T
+        with np.errstate(invalid="ignore"):
+            seen = at[(u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1)]
+        first, last, (fx, fy) = seen.min(axis=0, initial=0.0), seen.max(axis=0, initial=0.0), self.focal
+        width, height = (max(round(float(size)), 1) for size in (last - first) * [fx, fy])
+        return Camera(np.array([[fx, 0, -fx * first[0]], [0, fy, -fy * first[1]], [0, 0, 1]]), width, height, SPHERE)
 
     def _central_field(self) -> NDArray[np.float64]:
         """K (3, 3) of a wide lens's central field: of the shortest focal length, from 0.8 times the lens's, without empty rim."""
@@ -208,6 +208,22 @@ class Camera:
         return np.array([[focal, 0, self.K[0, 2]], [0, focal, self.K[1, 2]], [0, 0, 1]])
 
 
+def across_meridians(sphere: Camera) -> NDArray[np.float64]:
+    """Unit vectors (2, H, W) of a sphere's picture, at every pixel normal to the image of the line there that is parallel to the
+    camera's y axis: to the meridian, whose poles are above and below."""
+    grid = np.stack(np.meshgrid(np.arange(sphere.width), np.arange(sphere.height)), axis=-1)
+    x, y, z = sphere.unproject(grid + 1e-6).T  # on the axis itself there is no direction outward
+    radius = np.hypot(x, y)
+    # d/de of the ray at elevation e: along the radius, and around the axis, where the picture is stretched by angle / sine.
+    level = np.maximum(np.hypot(x, z), 1e-12)
+    upward = np.stack([-y * x / level, level, -y * z / level])
+    outward = ((x * upward[0] + y * upward[1]) * z / radius) - radius * upward[2]
+    around = (x * upward[1] - y * upward[0]) / radius * (np.arctan2(radius, z) / radius)
+    u = sphere.K[0, 0] * (outward * x - around * y) / radius
+    v = sphere.K[1, 1] * (outward * y + around * x) / radius
+    return np.asarray(np.stack([v, -u]) / np.maximum(np.hypot(u, v), 1e-12)).reshape(2, sphere.height, sphere.width)
+
+
 def _range_inside(values: NDArray[np.float64], pixel: NDArray[np.float64], size: int) -> tuple[float, float]:
     """Least and largest of the values (n,) whose pixel (n,) is one of the image's `size`."""
     with np.errstate(invalid="ignore"):
@@ -217,7 +233,7 @@ def _range_inside(values: NDArray[np.float64], pixel: NDArray[np.float64], size:
 
 class Rectifier:
     """Removes lens distortion from images; look-up tables are made once, with the first image. target: camera of the rectified
-    image, a pinhole or a cylinder; None = ``camera.rectified()``."""
+    image, a pinhole or a sphere; None = ``camera.rectified()``."""
 
     def __init__(self, camera: Camera, target: Camera | None = None) -> None:
         self.source = camera
@@ -227,7 +243,7 @@ class Rectifier:
     def _maps(self) -> tuple[Any, Any]:
         lens, target = self.source, self.camera
         fisheye = lens.model == "equidistant" and len(lens.D) == 4
-        if target.is_cylinder or not (fisheye or lens.model in PERSPECTIVE):
+        if target.is_sphere or not (fisheye or lens.model in PERSPECTIVE):
             at = np.nan_to_num(self._pixels, nan=-1.0)
             return cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)
         init: Any = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
@@ -246,7 +262,7 @@ class Rectifier:
 
     def seen(self) -> NDArray[np.bool_] | None:
         """Pixels (H, W) of the rectified image that the lens shows; None = all but slivers along the border."""
-        if not self.camera.is_cylinder:
+        if not self.camera.is_sphere:
             return None
         size = np.array([self.source.width - 1, self.source.height - 1])
         with np.errstate(invalid="ignore"):

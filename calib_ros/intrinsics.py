@@ -132,7 +132,7 @@ def change_between(given: Camera, camera: Camera, name: str) -> float:
 def camera_info_yaml(camera: Camera, name: str) -> str:
     """A camera of this name as camera_calibration writes it and camera_info_manager reads it. It is monocular: R is the identity,
     and P is K of the rectified image. BadInputError for an unrolled image, which is no lens."""
-    if camera.is_cylinder:
+    if camera.is_sphere:
         raise BadInputError("an unrolled picture has no CameraInfo")
     D = camera.D if len(camera.D) else np.zeros(COEFFICIENTS[camera.model])
 

@@ -89,10 +89,10 @@ class LensProjection:
         for k in range(ITERATIONS):
             # Derivatives are taken inside the limit.
             now = at[left] * np.minimum(1, (self.limit - 2 * STEP) / np.maximum(np.hypot(*at[left].T), 1e-300))[:, None]
-            here = self.image(_directions(now))
+            here = self.image(rays_of_angles(now))
             u, v = (here - xy[left]).T
             if k % 3 == 0:  # they change little
-                slope = np.hstack([(self.image(_directions(now + step)) - here) / STEP for step in STEP * np.eye(2)])
+                slope = np.hstack([(self.image(rays_of_angles(now + step)) - here) / STEP for step in STEP * np.eye(2)])
             a, c, b, d = slope.T
             change = np.c_[d * u - b * v, a * v - c * u] / (a * d - b * c)[:, None]
             error[left] = np.hypot(u, v)
@@ -102,13 +102,19 @@ class LensProjection:
             at[left] -= change[on]
             if not len(left):
                 break
-        out = _directions(at)
+        out = rays_of_angles(at)
         out[~(error < PRECISE)] = np.nan
         return out
 
 
-def _directions(at: Floats) -> Floats:
-    """Unit vectors (n, 3) of (n, 2) directions times angles from the axis, rad."""
+def angles_of_rays(rays: Floats) -> Floats:
+    """Rays (n, 3) of any length -> (n, 2) rad: the angle from the axis, towards x and towards y."""
+    r = np.hypot(rays[:, 0], rays[:, 1])
+    return np.asarray(rays[:, :2] * (np.arctan2(r, rays[:, 2]) / np.maximum(r, 1e-300))[:, None])
+
+
+def rays_of_angles(at: Floats) -> Floats:
+    """The inverse of `angles_of_rays`: (n, 2) rad -> unit vectors (n, 3)."""
     angle = np.hypot(at[:, 0], at[:, 1])
     return np.asarray(np.c_[at * np.sinc(angle / np.pi)[:, None], np.cos(angle)])
 

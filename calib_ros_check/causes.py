@@ -110,7 +110,7 @@ def centre_finding(lens: LensChange, camera: Camera, state: CauseState) -> Cause
 
 def distorts(camera: Camera) -> bool:
     """Whether CameraInfo says that the image is distorted."""
-    return not (camera.is_pinhole or camera.is_cylinder)
+    return not (camera.is_pinhole or camera.is_sphere)
 
 
 def cause_of(fit: LensFit, camera: Camera) -> Cause:

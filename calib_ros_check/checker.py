@@ -227,7 +227,7 @@ class Checker:
             return []
         off = se3.rotation_error_deg(inputs.T, found) > inputs.tolerance.deg
         guesses = [*rectified_already(self.camera)]
-        if score.camera.is_cylinder:
+        if score.camera.is_sphere:
             guesses += other_focal_lengths(self.camera)
         if not inputs.tolerance.covers(inputs.T, found):
             guesses += unrectified_fisheye(self.camera)

@@ -120,7 +120,7 @@ def _read(
     reading: Callable[[float], object],
     warn: Callable[[str], None] | None,
 ) -> tuple[list[Frame], list[str]]:
-    moving = WithMotion(source, config.motion, warn)
+    moving = WithMotion(source, config.motion, warn, config.lidar.accumulate_s)
     frames: list[Frame] = []
     notes: list[str] = []
     for k, position in enumerate(positions):

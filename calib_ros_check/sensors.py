@@ -97,7 +97,7 @@ def scaled(camera: Camera, scale: float) -> LensChange:
 def judged(score: PointScore) -> bool:
     """Whether intrinsics can be judged: by several scenes, one may gain much by chance, and not on unrolled pictures, where a
     shift is a rotation and lenses of another focal length are unrolled otherwise."""
-    return shows_noise(score) and not score.camera.is_cylinder
+    return shows_noise(score) and not score.camera.is_sphere
 
 
 def fit_lens(

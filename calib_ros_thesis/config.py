@@ -87,8 +87,8 @@ class ThesisConfig(Stage):
             return
         if self.completion != MORPHOLOGICAL:
             check_completion(self.completion, config.semantics)
-        if config.image.projection == "cylinder":
-            raise ConfigError("image.projection = cylinder does not go with refine.objective = thesis, which needs a pinhole")
+        if config.image.projection == "sphere":
+            raise ConfigError("image.projection = sphere does not go with refine.objective = thesis, which needs a pinhole")
         if self.dense_edges == "every_evaluation" and config.refine.optimizer == "levenberg_marquardt":
             raise ConfigError(
                 "refine.optimizer = levenberg_marquardt needs a gradient, which eq. 3.12 does not have; use nelder_mead or "

@@ -74,7 +74,7 @@ def calibrate(
 
 
 def _read(source: Source, positions: list[int], config: Config) -> list[Frame]:
-    moving = WithMotion(source, config.motion, note)
+    moving = WithMotion(source, config.motion, note, config.lidar.accumulate_s)
     chosen = []
     with progress_bar("reading  ") as step:
         for k, i in enumerate(positions):
@@ -120,7 +120,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
     recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
     # The recalibrator estimates motion from the previous cloud; where frames are skipped, that one is read for it.
     if any(b != a + 1 for a, b in pairwise(positions)):
-        source = WithMotion(source, config.motion, note)
+        source = WithMotion(source, config.motion, note, config.lidar.accumulate_s)
     status = recalibrator.current.result.status
     with progress_bar("replaying") as step:
         for k, i in enumerate(positions):

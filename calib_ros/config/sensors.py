@@ -29,9 +29,9 @@ class ImageConfig(Stage):
     max_width: int = option(1280, "wider images are shrunk to this width for the registration, px", low=160, high=8192)
     projection: str = option(
         "auto",
-        "what images are rectified to: pinhole, cylinder (up to 100 deg to either side and 60 deg up and down), or auto ="
-        " cylinder for lenses of more than 125 deg",
-        choices=("auto", "pinhole", "cylinder"),
+        "what images are rectified to: pinhole, sphere (the radius is the angle from the axis, up to 140 deg), or auto ="
+        " sphere for lenses of more than 125 deg",
+        choices=("auto", "pinhole", "sphere"),
     )
     mask: str = option(
         "",
@@ -96,6 +96,13 @@ class LidarConfig(Stage):
         "scan layout: rings (spinning scanners), projection (solid-state and non-repetitive scanners), or auto = detected"
         " from the points",
         choices=("auto", "rings", "projection"),
+    )
+    accumulate_s: float = option(
+        0.0,
+        "time over which scans are put together, moved by the vehicle's motion, s: about 1 for scanners whose pattern does not "
+        "repeat (Livox), of which one scan is too sparse; 0 = each scan alone",
+        low=0.0,
+        high=3.0,
     )
     scanner_pose: str = option(
         "auto",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.errors import CalibrationError, MissingDependencyError
-from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.lidar.accumulation import Accumulator, Stamped
 from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
 
-Stamped = tuple[int, PointCloud]
-CACHED_CLOUDS = 4
+CACHED_CLOUDS, SCANS_PER_S = 4, 20
 RUN_S, ENOUGH = 5.0, 0.8  # s of frames from which motion is estimated, and the share of it that is enough
 CENTRES = (0.5, 0.2, 0.8, 0.0, 1.0)  # around which of the chosen frames, as shares of their number
 
@@ -63,10 +63,15 @@ def describe_camera(camera: Camera) -> str:
 
 class WithMotion:
     """A source whose frames without a twist get it from the scans before and after them, if these are near enough in time. warn:
-    called once with a message if small_gicp is missing; frames then stay as they are."""
+    called once with a message if small_gicp is missing; frames then stay as they are. accumulate_s: time over which scans are put
+    together, as ``lidar.accumulate_s``."""
 
-    def __init__(self, source: Source, config: MotionConfig, warn: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self, source: Source, config: MotionConfig, warn: Callable[[str], None] | None = None, accumulate_s: float = 0.0
+    ) -> None:
         self._source, self._config, self._warn = source, config, warn
+        self._accumulate_s, self._accumulated = accumulate_s, Accumulator()
+        self._cached = CACHED_CLOUDS + round(accumulate_s * SCANS_PER_S)
         self.name, self.camera, self.reference = source.name, source.camera, source.reference
         self.camera_frame, self.lidar_frame = source.camera_frame, source.lidar_frame
         self._clouds: OrderedDict[int, Stamped | None] = OrderedDict()
@@ -80,16 +85,18 @@ class WithMotion:
         frame = self._source[index]
         index %= max(len(self), 1)
         self._keep(index, _stamped(frame))
-        if self._library_missing or not needs_ego_motion(frame, self._config):
+        if self._library_missing:
             return frame
         try:
-            found = [motion.twist for motion in self._motions(index) if motion.twist is not None]
+            if needs_ego_motion(frame, self._config):
+                found = [motion.twist for motion in self._motions(index) if motion.twist is not None]
+                frame = replace(frame, twist=np.mean(found, axis=0)) if found else frame
+            return self._accumulated(frame, self._earlier(index), self._accumulate_s, self._config)
         except MissingDependencyError as error:
             self._library_missing = True
             if self._warn:
                 self._warn(f"scans are not corrected for the vehicle's motion: {error}")
             return frame
-        return replace(frame, twist=np.mean(found, axis=0)) if found else frame
 
     def describe(self) -> dict[str, str]:
         """As the source."""
@@ -106,6 +113,13 @@ class WithMotion:
                 motions.append(estimate_motion(before[1], after[1], gap, self._config, start))
         return motions
 
+    def _earlier(self, index: int) -> Iterator[Stamped]:
+        """The scans before that of a frame, newest first, as far as they are usable."""
+        for k in range(index - 1, -1, -1):
+            if (cloud := self._cloud(k)) is None:
+                return
+            yield cloud
+
     def _cloud(self, index: int) -> Stamped | None:
         """The cloud of a frame with its stamp; None if unusable."""
         if index not in self._clouds:
@@ -116,7 +130,7 @@ class WithMotion:
     def _keep(self, index: int, cloud: Stamped | None) -> None:
         self._clouds[index] = cloud
         self._clouds.move_to_end(index)
-        while len(self._clouds) > CACHED_CLOUDS:
+        while len(self._clouds) > self._cached:
             self._clouds.popitem(last=False)
 
 
@@ -160,4 +174,4 @@ def _readable(source: Source, position: int) -> Frame | None:
 
 
 def _stamped(frame: Frame) -> Stamped | None:
-    return None if frame.cloud_stamp is None or frame.compensated else (frame.cloud_stamp, frame.cloud)
+    return None if frame.cloud_stamp is None else (frame.cloud_stamp, frame.cloud)

@@ -59,17 +59,20 @@ class EdgeLevel:
         return np.asarray(self.packed * np.float32(UNIT), np.float32)
 
 
-def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig, used: Mask | None = None) -> tuple[Map, ...]:
+def oriented_edges(
+    gray: NDArray[np.uint8], config: ImageConfig, used: Mask | None = None, across: Map | None = None
+) -> tuple[Map, ...]:
     """Prepared grey image (H, W) -> edge strength of horizontal and of vertical gradients, two (H, W) maps in 0..1.
 
     Sobel magnitude, saturated at a percentile, half of it thinned by non-maximum suppression, split by the direction of
-    the gradient: E cos^2 and E sin^2. used: (H, W), the pixels whose percentile it is; None = all.
+    the gradient: E cos^2 and E sin^2. used: (H, W), the pixels whose percentile it is; None = all. across: unit vectors
+    (2, H, W) of the direction that counts as horizontal; None = along the rows.
     """
     gx, gy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
     # cv2.magnitude rounds by the alignment of the array in memory: not repeatable
-    across = gx * gx
+    along = gx if across is None else gx * across[0] + gy * across[1]
     square = gy * gy
-    square += across
+    square += gx * gx
     magnitude = np.sqrt(square)
     magnitude[magnitude <= smallest_magnitude(magnitude, used)] = 0
     full = _percentile(magnitude if used is None else magnitude[used], GRADIENT_PERCENTILE)
@@ -78,9 +81,9 @@ def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig, used: Mask | No
     np.minimum(edge, np.float32(1), out=edge)
     edge *= np.where(ridge, np.float32(1), np.float32(0.5))
     square += np.float32(1e-6)
-    across /= square
-    across *= edge
-    return across, edge - across
+    along = along * along / square
+    along *= edge
+    return along, edge - along
 
 
 def smallest_magnitude(magnitude: Map, used: Mask | None = None) -> float:
@@ -127,15 +130,16 @@ def edge_levels(
     semantic: Map | None = None,
     share: float = 0.0,
     used: Mask | None = None,
+    across: Map | None = None,
 ) -> list[EdgeLevel]:
     """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine (see `blurred_levels`).
 
     semantic: oriented edges (2, H, W) in 0..1, of which `share` is blended in (figure 3.10). used: (H, W), False where there are
-    to be no edges, nor one along the border; None = everywhere.
+    to be no edges, nor one along the border; None = everywhere. across: see `oriented_edges`.
     """
     if used is not None:
         used = without_border(used, reach(config) + EDGE_REACH)
-    edges = oriented_edges(prepare(image, config), config, used)
+    edges = oriented_edges(prepare(image, config), config, used, across)
     if semantic is not None:
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
     if used is not None:

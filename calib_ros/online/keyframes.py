@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from calib_ros.config import Config, MotionConfig, OnlineConfig, TrackerConfig
 from calib_ros.errors import BadTimesError, MissingDependencyError
-from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.lidar.accumulation import Accumulator, Stamped
 from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
 from calib_ros.registration.features import FrameFeatures
 
@@ -29,8 +30,8 @@ REMEMBERED_S = 3.0  # a vehicle that moved so long ago may still move
 MAX_MEASUREMENT_AGE_S = 0.5  # a measurement farther than this from a frame's stamp says nothing about the frame
 
 Histogram = NDArray[np.float32]
-StampedCloud = tuple[int, PointCloud]
-ScanBefore = Callable[[int], StampedCloud | None]
+
+ScanBefore = Callable[[int], Stamped | None]
 Permit = Callable[[], bool]
 
 
@@ -228,19 +229,37 @@ class EgoMotion:
     small_gicp is not installed, else "". left_out: keyframes that were given up, see `check_known`.
     """
 
-    def __init__(self, config: MotionConfig) -> None:
-        self.config = config
+    def __init__(self, config: MotionConfig, accumulate_s: float = 0.0) -> None:
+        self.config, self.accumulate_s = config, accumulate_s
+        self._scans: deque[Stamped] = deque()  # of the last accumulate_s, oldest first
+        self._accumulator = Accumulator()
         self.last: Motion | None = None
         self.left_out = 0
         self._known: tuple[int, NDArray[np.float64]] | None = None  # stamp and twist, the newest
         self.missing = ""
-        self._before: StampedCloud | None = None
-        self._newest: StampedCloud | None = None
+        self._before: Stamped | None = None
+        self._newest: Stamped | None = None
 
     def add(self, frame: Frame) -> None:
-        """Every frame, in the order of time. Keeps references to two clouds, and costs nothing."""
+        """Every frame, in the order of time. Keeps references to two clouds and those of accumulate_s, and costs nothing."""
+        own = frame.cloud_stamp or 0, frame.cloud
         usable = frame.cloud_stamp is not None and not frame.compensated
-        self._before, self._newest = self._newest, (frame.cloud_stamp or 0, frame.cloud) if usable else None
+        self._before, self._newest = self._newest, own if usable else None
+        oldest = own[0] - round(self.accumulate_s * NANOSECONDS)
+        while self._scans and not oldest < self._scans[0][0] < own[0]:  # also where time goes back
+            self._scans.popleft()
+        if self.accumulate_s > 0 and frame.cloud_stamp is not None:
+            self._scans.append(own)
+
+    def accumulated(self, frame: Frame) -> Frame:
+        """The newest frame with the scans of the last accumulate_s, see `Accumulator`."""
+        if self.missing or not self._scans:
+            return frame
+        try:
+            return self._accumulator(frame, list(self._scans)[-2::-1], self.accumulate_s, self.config)
+        except MissingDependencyError as error:
+            self.missing = f"scans are not put together: {error}"
+            return frame
 
     def with_twist(self, frame: Frame, scan_before: ScanBefore = lambda since: None) -> Frame:
         """The newest frame with its twist, if it has none and the cloud before allows an estimate; 50 ms for 130 000 points.

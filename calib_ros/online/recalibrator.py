@@ -88,7 +88,7 @@ class Recalibrator:
         self.segmentation = segmentation or models_of(self.config.semantics)
         self.segmenter = KeyframeSegmenter()
         self.selector = KeyframeSelector(self.config.online)
-        self.motion = EgoMotion(self.config.motion)
+        self.motion = EgoMotion(self.config.motion, self.config.lidar.accumulate_s)
         self.speed_gate = speed_gate or SpeedGate(self.config.online)
         self.schedule = Schedule(self.config.online)
         self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
@@ -205,6 +205,7 @@ class Recalibrator:
             self.motion.check_known(frame_with_twist, self.config.tracker)
             if frame_with_twist is not frame and not self.speed_gate.allows(frame_with_twist):
                 return False  # the selector goes on from this frame: scans in a turn are not aligned one by one
+            frame_with_twist = self.motion.accumulated(frame_with_twist)
             features = self.calibrator.extract(frame_with_twist)
         except Exception:
             if is_keyframe:
@@ -401,7 +402,7 @@ class Recalibrator:
             # Where it begins to guess, only points near the nominal view have classes so far.
             features_changed = self.first_guess.configure(config, self.tracker.current.accepted > 0) or features_changed
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
-            self.motion.config = config.motion
+            self.motion.config, self.motion.accumulate_s = config.motion, config.lidar.accumulate_s
             self.monitor.config = self.sensors.config = config.monitor
             self.tracker.config = config
             self.keyframes.resize(config.online.buffer_size)

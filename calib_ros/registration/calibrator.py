@@ -110,7 +110,7 @@ class Calibrator:
         """
         if self.config.camera.intrinsics != REFINE:
             return self._calibrated(frames, initial, search, progress, consecutive)
-        if self.extract.camera.is_cylinder:
+        if self.extract.camera.is_sphere:
             raise BadInputError(
                 "camera.intrinsics: refine needs pictures that show the intrinsics, and those of this lens are unrolled, where "
                 "another focal length or principal point is not observable: set image.projection: pinhole, or camera.intrinsics: "

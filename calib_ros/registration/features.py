@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import extensions, se3
-from calib_ros.camera import Camera, Rectifier
+from calib_ros.camera import Camera, Rectifier, across_meridians
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
@@ -39,7 +39,7 @@ def other_objective(config: Config) -> ObjectiveKind | None:
 
 @dataclass(frozen=True, eq=False)
 class FrameFeatures:
-    """What is kept of one frame. points: LiDAR frame. levels: coarse to fine. camera: pinhole, or cylinder, of the maps.
+    """What is kept of one frame. points: LiDAR frame. levels: coarse to fine. camera: pinhole, or sphere, of the maps.
 
     has_reflectivity: False if the source gave no usable intensity. twist: (6,) the LiDAR's velocity, rad/s and m/s in its own
     frame, by which the points were moved to the image's moment; None = they were not. timed_by_azimuth: the times of its points
@@ -87,6 +87,12 @@ class FeatureExtractor:
         shown = None if seen is None else np.asarray(self._shrunk(seen.astype(np.uint8) * 255) == 255)
         return shown & masked if shown is not None and masked is not None else (shown if masked is None else masked)
 
+    @cached_property
+    def across(self) -> Map | None:
+        """Directions (2, h, w) in which lines parallel to the camera's y axis change a sphere's picture; None on a pinhole, where
+        it is along the rows everywhere."""
+        return across_meridians(self.camera).astype(np.float32) if self.camera.is_sphere else None
+
     def __call__(
         self, frame: Frame, semantics: FrameSemantics | None = None, plain: FrameFeatures | None = None
     ) -> FrameFeatures:
@@ -122,7 +128,7 @@ class FeatureExtractor:
         if plain is not None:
             levels = plain.levels
         else:
-            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, used=self.used)
+            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, used=self.used, across=self.across)
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
         facts = (self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist, by_azimuth)
         features = FrameFeatures(points, levels, *facts)
@@ -133,14 +139,16 @@ class FeatureExtractor:
 
     def seen_anew(self, features: FrameFeatures, image: NDArray[np.uint8]) -> FrameFeatures:
         """Features of the same scan, had this camera taken the image; without semantics."""
-        levels = edge_levels(self.working_image(image), float(self.camera.K[0, 0]), self.config.image, used=self.used)
+        levels = edge_levels(
+            self.working_image(image), float(self.camera.K[0, 0]), self.config.image, used=self.used, across=self.across
+        )
         return replace(features, levels=levels, camera=self.camera, plain=None, view=None)
 
     def _with_semantics(
         self, features: FrameFeatures, frame: Frame, image: NDArray[np.uint8], semantics: FrameSemantics
     ) -> FrameFeatures:
         edges = self.semantic_edges(semantics) if semantics.edges_of == OF_MASKS else None
-        out = with_semantics(features, image, edges, self.config, self.used)
+        out = with_semantics(features, image, edges, self.config, self.used, self.across)
         models = class_models()
         if models is None or semantics.classes is None or frame.cloud.label is None:
             return out
@@ -175,14 +183,15 @@ def with_semantics(
     edges: Map | None,
     config: Config,
     used: NDArray[np.bool_] | None = None,
+    across: Map | None = None,
 ) -> FrameFeatures:
     """Features with semantic edges and weights of classes, as far as they are known. image: (h, w[, 3]) of plain.camera. edges:
-    (2, h, w) in 0..1 of masks in that image. used: see FeatureExtractor."""
+    (2, h, w) in 0..1 of masks in that image. used, across: see FeatureExtractor."""
     points, levels = plain.points, plain.levels
     if points.label is not None:
         points = replace(points, strength=points.strength * edge_weights(points.label))
     if edges is not None:
-        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, edges, EDGE_SHARE, used)
+        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, edges, EDGE_SHARE, used, across)
     return replace(plain, points=points, levels=levels, plain=plain)
 
 
@@ -208,18 +217,18 @@ def at_time_offset(features: FrameFeatures, seconds: float) -> FrameFeatures:
 
 
 def rectified_camera(camera: Camera, config: Config) -> Camera:
-    """The camera of the rectified image: a pinhole, or a cylinder for what a pinhole cannot show (``image.projection``), where
+    """The camera of the rectified image: a pinhole, or a sphere for what a pinhole cannot show (``image.projection``), where
     the objective can project onto one."""
     projection, other = config.image.projection, other_objective(config)
     wide = projection == "auto" and (other is None or not other.pinholes_only) and camera.field_deg > WIDE_DEG
-    return camera.unrolled() if wide or projection == "cylinder" else camera.rectified()
+    return camera.unrolled() if wide or projection == "sphere" else camera.rectified()
 
 
 def working_camera(camera: Camera, max_width: int) -> Camera:
-    """The pinhole or cylinder of an image shrunk to at most `max_width`; pixel centres at integers, so (c + 0.5) s - 0.5."""
+    """The pinhole or sphere of an image shrunk to at most `max_width`; pixel centres at integers, so (c + 0.5) s - 0.5."""
     if camera.width <= max_width:
         return camera
     width, height = max_width, round(camera.height * max_width / camera.width)
     sx, sy = width / camera.width, height / camera.height
     S = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
-    return Camera(S @ camera.K, width, height, camera.model if camera.is_cylinder else "plumb_bob")
+    return Camera(S @ camera.K, width, height, camera.model if camera.is_sphere else "plumb_bob")

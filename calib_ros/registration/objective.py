@@ -84,7 +84,7 @@ class Objective(Protocol):
 
 class ObjectiveKind(Protocol):
     """Another objective, which joins by the entry point ``calib_ros.objectives``. pinholes_only: it cannot project onto
-    cylinders. moves_points: the points that it keeps follow a time offset. uses: kinds of models, in doubt or not."""
+    spheres. moves_points: the points that it keeps follow a time offset. uses: kinds of models, in doubt or not."""
 
     pinholes_only: bool
     moves_points: bool

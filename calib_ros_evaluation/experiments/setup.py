@@ -116,7 +116,7 @@ class WorkerCache:
 
     def _opened(self, label: str) -> Source:
         """The source of a scene."""
-        return WithMotion(self.setup.scene(label).open(), self.config.motion, self._note)
+        return WithMotion(self.setup.scene(label).open(), self.config.motion, self._note, self.config.lidar.accumulate_s)
 
     def _read(self, label: str, position: int) -> Frame:
         """A frame of a scene. SourceGoneError if it cannot be read."""

@@ -23,7 +23,7 @@ class NumpySampler:
     """See Sampler, pose by pose."""
 
     def __init__(self, points: Map, weights: Map, tiles: NDArray[np.int32], atlas: Atlas) -> None:
-        self._points, self._weights, self._levels, self._cylinder = points, weights, atlas.levels, atlas.camera.is_cylinder
+        self._points, self._weights, self._levels, self._sphere = points, weights, atlas.levels, atlas.camera.is_sphere
         self._corners = [np.ascontiguousarray(level.corner[tiles].T, np.float32) for level in atlas.levels]
         self._images = [level.image * np.float32(UNIT) for level in atlas.levels]
 
@@ -45,13 +45,21 @@ class NumpySampler:
         return np.array([self.jacobian(T, level) @ self._weights for T in transforms], float)
 
     def _project(self, T: Matrix, level: int) -> tuple[Map, Map, Map, Map]:
-        """Pixels (u, v), u far outside for points too near or behind; depth, on a cylinder from its axis; points (3, n)."""
+        """Pixels (u, v), u far outside for points too near or behind; depth, on a sphere the distance; points (3, n)."""
         K = self._levels[level].K.astype(np.float32)
         y = T[:3, :3].astype(np.float32) @ self._points + T[:3, 3].astype(np.float32)[:, None]
-        depth = np.hypot(y[0], y[2]) if self._cylinder else y[2]
-        z = np.where(depth < MIN_DEPTH, FAR, depth)
-        u = K[0, 0] * (np.arctan2(y[0], y[2]) if self._cylinder else y[0] / z) + K[0, 2]
-        return np.where(depth < MIN_DEPTH, np.float32(-9), u), K[1, 1] * (y[1] / z) + K[1, 2], z, y
+        depth = np.sqrt((y * y).sum(axis=0)) if self._sphere else y[2]
+        hidden = (depth < MIN_DEPTH) | (self._sphere & (y[2] < np.float32(-0.95) * depth))
+        z = np.where(hidden, FAR, depth)
+        stretch = self._stretch(y, z) if self._sphere else 1 / z
+        return np.where(hidden, np.float32(-9), K[0, 0] * (y[0] * stretch) + K[0, 2]), K[1, 1] * (y[1] * stretch) + K[1, 2], z, y
+
+    @staticmethod
+    def _stretch(y: Map, distance: Map) -> Map:
+        """Angle from the axis per distance from it, rad/m (n,), of points (3, n) so far away (n,)."""
+        r = np.hypot(y[0], y[1])
+        near = r <= 1e-6
+        return np.where(near, 1 / distance, np.arctan2(r, y[2]) / np.where(near, 1, r)).astype(np.float32)
 
     def _sample(self, level: int, u: Map, v: Map) -> Map:
         """Map value (n,) of a level under the pixels."""
@@ -69,9 +77,11 @@ class NumpySampler:
         per_depth = inside / (2 * h * z)
         jx = (self._sample(level, u + h, v) - self._sample(level, u - h, v)) * per_depth * np.float32(own.K[0, 0])
         jy = (self._sample(level, u, v + h) - self._sample(level, u, v - h)) * per_depth * np.float32(own.K[1, 1])
-        if self._cylinder:
-            sine, cosine, upward = X / z, Z / z, jy * Y / z
-            jx, jz = jx * cosine - upward * sine, -jx * sine - upward * cosine
+        if self._sphere:
+            r = np.hypot(X, Y)
+            x, y = np.where(r > 1e-6, (X, Y) / np.maximum(r, 1e-6), [[1], [0]])
+            outward, around = jx * x + jy * y, np.where(inside, (jy * x - jx * y) * z * self._stretch(np.stack([X, Y, Z]), z), 0)
+            jx, jy, jz = outward * Z / z * x - around * y, outward * Z / z * y + around * x, -outward * r / z
         else:
             jz, Z = -(jx * X + jy * Y) / z, z
         return np.stack([Y * jz - Z * jy, Z * jx - X * jz, X * jy - Y * jx, jx, jy, jz]).astype(np.float32)

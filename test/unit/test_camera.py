@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calib_ros.camera import CYLINDER, Camera, Rectifier
+from calib_ros.camera import SPHERE, Camera, Rectifier, across_meridians
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
+from calib_ros.lens import angles_of_rays, rays_of_angles
 from calib_ros.registration.features import working_camera
 
 K = np.array([[410.0, 0, 322.3], [0, 405.0, 241.7], [0, 0, 1]])
@@ -125,15 +126,40 @@ FISHEYE = Camera(
 )
 
 
-def test_the_columns_of_a_cylinder_are_angles():
-    cylinder = Camera(np.array([[100.0, 0, 200], [0, 110, 50], [0, 0, 1]]), 401, 101, CYLINDER)
-    points = [[1, 0, 1], [3, -2, 0], [2, 0, -2], [3, 2, 4], [0, 1, 0.05]]
-    uv, inside = cylinder.project(points)
-    angle = np.array([np.pi / 4, np.pi / 2, 3 * np.pi / 4, np.arctan2(3, 4)])
-    assert np.allclose(uv[:4], np.c_[200 + 100 * angle, 50 + 110 * np.array([0, -2 / 3, 0, 2 / 5])])
-    assert inside.tolist() == [True, False, False, True, False]
-    assert np.isnan(uv[4]).all()  # too near the axis
-    assert not cylinder.is_pinhole
+SPHERE_CAMERA = Camera(np.array([[100.0, 0, 200], [0, 110, 150], [0, 0, 1]]), 401, 301, SPHERE)  # 230 deg wide
+
+
+def test_the_radius_on_a_sphere_is_the_angle_from_the_axis():
+    points = [[1, 0, 1], [0, -2, 0], [2, 0, -2], [3, 4, 5], [0, 0, 7], [0.05, 0, 0.05], [4, 0, -2]]
+    uv, inside = SPHERE_CAMERA.project(points)
+    quarter = np.pi / 4
+    expected = [[quarter, 0], [0, -2 * quarter], [3 * quarter, 0], [0.6 * quarter, 0.8 * quarter], [0, 0]]
+    assert np.allclose(uv[:5], [200, 150] + np.array(expected) * [100, 110])
+    assert inside.tolist() == [True, False, False, True, True, False, False]
+    assert np.isnan(uv[5]).all()  # too near
+    assert not SPHERE_CAMERA.is_pinhole
+
+
+def test_angles_from_the_axis_and_their_rays():
+    rays = np.random.default_rng(0).normal(size=(200, 3))
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    assert np.allclose(rays_of_angles(angles_of_rays(rays)), unit)
+    assert np.allclose(np.linalg.norm(angles_of_rays(rays), axis=1), np.arccos(unit[:, 2]))
+    assert np.allclose(rays_of_angles(np.zeros((1, 2))), [[0, 0, 1]])
+
+
+def test_lines_parallel_to_the_y_axis_are_known_on_a_sphere():
+    across = across_meridians(SPHERE_CAMERA)
+    assert np.allclose(np.linalg.norm(across, axis=0), 1)
+    for x, z in ((1, 2), (-3, 1), (2, -0.5)):
+        y = np.linspace(-3, 3, 61)
+        uv, inside = SPHERE_CAMERA.project(np.c_[np.full_like(y, x), y, np.full_like(y, z)])
+        between = inside[1:] & inside[:-1]
+        line, middle = np.diff(uv, axis=0)[between], np.rint((uv[1:] + uv[:-1])[between] / 2).astype(int)
+        own = across[:, middle[:, 1], middle[:, 0]]
+        assert between.sum() > 10
+        assert (np.abs((own.T * line).sum(axis=1)) < 0.03 * np.linalg.norm(line, axis=1)).all()
+    assert np.allclose(across[:, 150], [[1], [0]])  # on the horizon lines stand upright
 
 
 def test_the_field_is_what_lies_between_the_borders():
@@ -146,11 +172,12 @@ def test_the_field_is_what_lies_between_the_borders():
 
 
 def test_a_fisheye_is_unrolled_also_behind_its_image_plane():
-    """Spots drawn where the lens's polynomial puts rays lie where the cylinder projects them."""
+    """Spots drawn where the lens's polynomial puts rays lie where the sphere projects them."""
     rectifier = Rectifier(FISHEYE, FISHEYE.unrolled())
-    assert rectifier.camera.is_cylinder
+    assert rectifier.camera.is_sphere
     angles = np.deg2rad([-91, -60, -20, 0, 45, 80, 91])
-    for ray in [[np.sin(a), y, np.cos(a)] for a in angles for y in (-0.3, 0.1)]:
+    above = [[0, -np.sin(a), np.cos(a)] for a in np.deg2rad([50, 70])]
+    for ray in [*above, *([np.sin(a), y, np.cos(a)] for a in angles for y in (-0.3, 0.1))]:
         off = np.arctan2(np.hypot(ray[0], ray[1]), ray[2])
         radius = off * (1 + 0.02 * off**2 - 0.004 * off**4 + 8e-4 * off**6)
         direction = np.array(ray[:2]) / np.hypot(ray[0], ray[1])
@@ -158,7 +185,7 @@ def test_a_fisheye_is_unrolled_also_behind_its_image_plane():
         assert rectifier.camera.project([ray])[0][0] == pytest.approx(centre, abs=1.0), ray
 
 
-def test_what_a_lens_does_not_show_of_its_cylinder_is_told():
+def test_what_a_lens_does_not_show_of_its_sphere_is_told():
     for lens, least in ((FISHEYE, 0.85), (camera("plumb_bob"), 0.9), (Camera(K, 640, 480), 0.8)):
         rectifier = Rectifier(lens, lens.unrolled())
         seen = rectifier.seen()
@@ -220,7 +247,7 @@ def test_the_working_camera_sees_the_same_directions():
     assert np.allclose(small.project(points)[0], expected)
     assert working_camera(big, 1920) is big
     wide = FISHEYE.unrolled()
-    assert working_camera(wide, 300).is_cylinder
+    assert working_camera(wide, 300).is_sphere
     expected = (wide.project(points)[0] + 0.5) * [300 / wide.width, round(wide.height * 300 / wide.width) / wide.height] - 0.5
     assert np.allclose(working_camera(wide, 300).project(points)[0], expected)
 

@@ -191,7 +191,7 @@ def test_names_of_other_tools():
         ("division", [0.1] * 4, "1 or 2 or 3 distortion coefficients, got 4"),
         ("omnidir", [0.5, 0.1], "1 or 5"),
         ("equidistant", [0.1] * 9, "4 or 5 or 6 or 7 or 8"),
-        ("cylinder", [0.1], "no distortion coefficients"),
+        ("sphere", [0.1], "no distortion coefficients"),
     ],
 )
 def test_coefficients_that_are_no_lens_are_refused(model, D, says):

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
-from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.image.enhance import to_gray
@@ -175,7 +174,7 @@ def tracked_points(frames: Sequence[Frame], runs: Sequence[Run], extract: Featur
             firsts.append(start)
             seconds.append(end)
     table = np.array(moments, float).reshape(-1, 3)
-    first, second = (bearings(camera, np.concatenate(uv)) for uv in (firsts, seconds))
+    first, second = (camera.unproject(np.concatenate(uv)) for uv in (firsts, seconds))
     pixel = 1 / float(camera.K[0, 0])
     return Tracks(np.concatenate(numbers), first, second, table[:, 0], table[:, 1], table[:, 2].astype(np.intp), pixel)
 
@@ -231,10 +230,3 @@ def track(pictures: Sequence[Gray], mask: Gray | None = None) -> tuple[Matrix, M
         if not len(here):
             break
     return start[:, 0].astype(float), here[:, 0].astype(float)
-
-
-def bearings(camera: Camera, uv: Matrix) -> Matrix:
-    """Unit vectors (n, 3) in the camera's frame of pixels (n, 2) of a pinhole or a cylinder."""
-    x, y = ((uv - camera.K[:2, 2]) / [camera.K[0, 0], camera.K[1, 1]]).T
-    rays = np.stack([np.sin(x), y, np.cos(x)] if camera.is_cylinder else [x, y, np.ones_like(x)], axis=1)
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -48,7 +48,7 @@ class Intrinsic(NuisanceParameter):
         return score.with_intrinsics(*self._of_all(value)), se3.exp([down, -across, 0.0, 0.0, 0.0, 0.0]) @ T
 
     def observable_in(self, score: PointScore) -> bool:
-        return not score.camera.is_cylinder
+        return not score.camera.is_sphere
 
     def refusal(self, value: float, deviations: float) -> Refusal:
         return wrong_intrinsics(*self._of_all(value * self.unit), deviations)

@@ -207,7 +207,7 @@ def joint_optimum(
     halves at T. extrinsic: its covariance (6, 6) if the intrinsics are right. search: values far off are tried as well. given:
     the camera that was stated, where `camera` corrects it already.
     """
-    parameters = () if score.camera.is_cylinder else lens_parameters(config, camera, score.camera)
+    parameters = () if score.camera.is_sphere else lens_parameters(config, camera, score.camera)
     if not parameters or not limits.open_axes.any():
         return None
     part = score.subset(POINTS if given is None else FINE_POINTS, np.random.default_rng(0))

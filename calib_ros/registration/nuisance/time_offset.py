@@ -109,8 +109,10 @@ class TimeOffset:
         return known and abs(self.seconds) > LEAST_S and self.observable(config)
 
     def suspected(self, config: MotionConfig) -> bool:
-        """True if other clocks match better, but by no offset that is known."""
-        return self.gain > SIGNIFICANT_Z and self.probability > 0.5 and not self.observable(config)
+        """True if other clocks match better, but by no offset that is known. Beyond the range that is searched, what is hardly
+        observable may drift to any value."""
+        better = self.gain > SIGNIFICANT_Z and self.probability > 0.5
+        return better and abs(self.seconds) <= MAX_OFFSET_S and not self.observable(config)
 
     @property
     def probability(self) -> float:

@@ -15,6 +15,8 @@
 #define MIN_DEPTH 0.5f /* m, as in sampler.py */
 #define FAR 1e9f       /* m; depth given to points behind the camera */
 #define OUTSIDE -9.0f  /* px; where they are put */
+#define BEHIND -0.95f  /* cosine of the angle from the axis of a sphere beyond which no lens sees */
+#define NO_RADIUS 1e-6f /* m; nearer to the axis an angle divided by it is noise */
 #define BLOCK 256
 #define LANES 8
 
@@ -49,12 +51,13 @@ typedef struct {
     float width, height;  /* of a tile */
     float step;           /* px; half the distance over which the maps' slopes are taken */
     float unit;           /* of the image */
-    int cylinder;         /* the picture is unrolled from a cylinder, else a pinhole camera's */
+    int sphere;           /* the picture's radius is the angle from the axis, else a pinhole camera's */
 } View;
 
 typedef struct {
     float X[BLOCK], Y[BLOCK], Z[BLOCK]; /* in the camera frame */
-    float depth[BLOCK];                 /* along the optical axis; of a cylinder the distance from its axis */
+    float depth[BLOCK];                 /* along the optical axis; of a sphere the distance */
+    float stretch[BLOCK];               /* of a sphere: angle from the optical axis / distance from it, rad/m */
     float u[BLOCK], v[BLOCK];           /* px */
     const float *left, *top;            /* px; corner of the point's tile */
 } Projected;
@@ -105,20 +108,22 @@ INLINE void project(const View *view, const float *T, ptrdiff_t first, int m, Pr
         p->Y[k] = T[4] * x[k] + T[5] * y[k] + T[6] * z[k] + T[7];
         p->Z[k] = T[8] * x[k] + T[9] * y[k] + T[10] * z[k] + T[11];
     }
-    if (view->cylinder) {
+    if (view->sphere) {
         for (int k = 0; k < m; k++) {
-            p->depth[k] = sqrtf(p->X[k] * p->X[k] + p->Z[k] * p->Z[k]);
-            p->u[k] = angle_from_axis(p->X[k], p->Z[k]);
+            const float square = p->X[k] * p->X[k] + p->Y[k] * p->Y[k], r = sqrtf(square);
+            const float distance = sqrtf(square + p->Z[k] * p->Z[k]);
+            const int seen = (distance >= MIN_DEPTH) & (p->Z[k] >= BEHIND * distance);
+            p->stretch[k] = r > NO_RADIUS ? angle_from_axis(r, p->Z[k]) / r : 1 / (distance >= MIN_DEPTH ? distance : FAR);
+            p->depth[k] = seen ? distance : FAR;
+            p->u[k] = seen ? p->X[k] * p->stretch[k] * view->fx + view->cx : OUTSIDE;
+            p->v[k] = p->Y[k] * p->stretch[k] * view->fy + view->cy;
         }
-    } else {
-        for (int k = 0; k < m; k++) {
-            p->depth[k] = p->Z[k];
-            p->u[k] = p->X[k] / (p->Z[k] >= MIN_DEPTH ? p->Z[k] : FAR);
-        }
+        return;
     }
     for (int k = 0; k < m; k++) {
-        const int seen = p->depth[k] >= MIN_DEPTH;
-        p->depth[k] = seen ? p->depth[k] : FAR;
+        const int seen = p->Z[k] >= MIN_DEPTH;
+        p->depth[k] = seen ? p->Z[k] : FAR;
+        p->u[k] = p->X[k] / p->depth[k];
         p->u[k] = seen ? p->u[k] * view->fx + view->cx : OUTSIDE;
         p->v[k] = p->Y[k] / p->depth[k] * view->fy + view->cy;
     }
@@ -163,12 +168,17 @@ INLINE void slopes(const View *view, int m, const Projected *p, float J[6][BLOCK
         const int inside = (u >= 0) & (u <= view->width - 1) & (v >= 0) & (v <= view->height - 1);
         const float per_depth = inside ? 1 / p->depth[k] : 0;
         float jx = (right[k] - left[k]) * per_depth * across;
-        const float jy = (below[k] - above[k]) * per_depth * down;
+        float jy = (below[k] - above[k]) * per_depth * down;
         float jz;
-        if (view->cylinder) {
-            const float sine = X * per_depth, cosine = Z * per_depth, upward = jy * (Y * per_depth);
-            jz = -jx * sine - upward * cosine;
-            jx = jx * cosine - upward * sine;
+        if (view->sphere) {
+            /* jx and jy are divided by the distance: along the radius the picture moves by the angle, around the axis by
+             * the angle over the distance from it. */
+            const float r = sqrtf(X * X + Y * Y), x = r > NO_RADIUS ? X / r : 1, y = r > NO_RADIUS ? Y / r : 0;
+            const float outward = jx * x + jy * y, sine = r * per_depth, cosine = Z * per_depth;
+            const float around = inside ? (jy * x - jx * y) * p->depth[k] * p->stretch[k] : 0;
+            jx = outward * cosine * x - around * y;
+            jz = -outward * sine;
+            jy = outward * cosine * y + around * x;
         } else {
             jz = -(jx * X + jy * Y) * per_depth;
         }

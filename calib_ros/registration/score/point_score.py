@@ -14,6 +14,7 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
+from calib_ros.lens import angles_of_rays
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.progress import Observer
@@ -73,11 +74,11 @@ def nearest_per_pixel(pixels: Pixels, points: Pixels, size: int) -> tuple[Pixels
 def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera, margin: float) -> Pixels:
     """Indices of the points (n, 3) that project into the image or within margin * width around it, in front of the camera."""
     P = xyz @ T[:3, :3].T + T[:3, 3]
-    depth = np.hypot(P[:, 0], P[:, 2]) if camera.is_cylinder else P[:, 2]
+    depth = np.linalg.norm(P, axis=1) if camera.is_sphere else P[:, 2]
     in_front = np.flatnonzero(depth > MIN_DEPTH)  # of a full turn most are not
-    P, z, K, border = P[in_front], depth[in_front], camera.K, margin * camera.width
-    across = np.arctan2(P[:, 0], P[:, 2]) if camera.is_cylinder else P[:, 0] / z
-    u, v = K[0, 0] * across + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2]
+    P, K, border = P[in_front], camera.K, margin * camera.width
+    x, y = (angles_of_rays(P) if camera.is_sphere else P[:, :2] / depth[in_front, None]).T
+    u, v = K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]
     inside = (u > -border) & (u < camera.width + border) & (v > -border) & (v < camera.height + border)
     return np.asarray(in_front[inside])
 

@@ -38,7 +38,7 @@ class _View(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("x", "y", "z", "weight", "left", "top")),
         ("count", ctypes.c_ssize_t),
         *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "step", "unit")),
-        ("cylinder", ctypes.c_int),
+        ("sphere", ctypes.c_int),
     )
 
 
@@ -105,7 +105,7 @@ class Sampler:
             x=points, y=points + row, z=points + 2 * row, weight=self._weights.ctypes.data,
             left=left.ctypes.data, top=top.ctypes.data, count=self._n,
             fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], width=own.width, height=own.height, step=slope_step(own),
-            unit=UNIT, cylinder=self._atlas.camera.is_cylinder,
+            unit=UNIT, sphere=self._atlas.camera.is_sphere,
         )  # fmt: skip
         view.corners = left, top  # which live as long as the view
         return view

@@ -188,7 +188,7 @@ def test_of_models_without_a_radial_coefficient_focal_length_and_centre_are_refi
 
 
 def test_unrolled_pictures_show_no_intrinsics(scene):
-    calibrator = Calibrator(scene.camera, update(REFINE, {"image": {"projection": "cylinder"}}))
+    calibrator = Calibrator(scene.camera, update(REFINE, {"image": {"projection": "sphere"}}))
     with pytest.raises(BadInputError, match="not observable"):
         calibrator.calibrate(scene.frames, scene.truth)
     score = calibrator.objectives([calibrator.extract(f) for f in scene.frames[:1]], scene.truth, scene.truth).edges.score

@@ -21,7 +21,7 @@ from calib_ros.registration.score.sampler import Sampler, load_kernel
 WIDTH, HEIGHT, FRAMES = 320, 160, 3
 SCALES = ((4, 8.0), (2, 4.0), (1, 1.5))
 K = np.array([[150.0, 0, 158], [0, 145, 83], [0, 0, 1]])
-PINHOLE, CYLINDER = Camera(K, WIDTH, HEIGHT), Camera(K, WIDTH, HEIGHT, "cylinder")
+PINHOLE, SPHERE = Camera(K, WIDTH, HEIGHT), Camera(K, WIDTH, HEIGHT, "sphere")
 
 
 def atlas(camera: Camera) -> Atlas:
@@ -61,7 +61,7 @@ def transforms(n: int = 40) -> np.ndarray:
     return se3.exp_many(xi)
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
+@pytest.mark.parametrize("camera", [PINHOLE, SPHERE], ids=["pinhole", "sphere"])
 @pytest.mark.parametrize("n", [1, 8, 257, 1111])
 def test_both_give_the_same(camera, n):
     compiled, reference = samplers(camera, n)
@@ -85,7 +85,7 @@ def test_both_give_the_same(camera, n):
             assert np.array_equal(sampler.gradients(T, level), sampler.linearise(T, level)[0])
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
+@pytest.mark.parametrize("camera", [PINHOLE, SPHERE], ids=["pinhole", "sphere"])
 def test_one_pose_alone_gives_the_same_bits_as_among_others(camera):
     compiled, _ = samplers(camera)
     T = transforms(9)
@@ -99,7 +99,7 @@ def test_one_pose_alone_gives_the_same_bits_as_among_others(camera):
 
 
 @pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e30])
-@pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
+@pytest.mark.parametrize("camera", [PINHOLE, SPHERE], ids=["pinhole", "sphere"])
 def test_a_pose_that_is_no_pose_reads_nothing_outside_the_maps(camera, bad):
     compiled, _ = samplers(camera)
     T = np.eye(4)

@@ -1,4 +1,4 @@
-"""Lenses that no pinhole can show: their images are unrolled onto a cylinder, and scored there."""
+"""Lenses that no pinhole can show: their images are unrolled onto a sphere, and scored there."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib_ros import Calibrator, se3
-from calib_ros.camera import CYLINDER, Camera
+from calib_ros.camera import SPHERE, Camera
 from calib_ros.config import Config, ImageConfig, RefineConfig, ScoreConfig, SemanticsConfig
 from calib_ros.datasets.open import open_dataset
 from calib_ros.errors import ConfigError
@@ -21,7 +21,7 @@ from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.point_score import FastScore
 
 WIDTH, HEIGHT = 340, 160
-CAMERA = Camera(np.array([[100.0, 0, 168.2], [0, 105, 81.3], [0, 0, 1]]), WIDTH, HEIGHT, CYLINDER)  # 194 deg wide
+CAMERA = Camera(np.array([[100.0, 0, 168.2], [0, 105, 81.3], [0, 0, 1]]), WIDTH, HEIGHT, SPHERE)  # 194 deg wide
 T = se3.exp([0.02, 0.1, -0.05, 0.1, 0.2, -0.1]) @ nominal()
 
 
@@ -49,10 +49,10 @@ def seen(border: float, nearest: float) -> tuple[FrameFeatures, FastScore, np.nd
     P = se3.transform(T, score.points.T.astype(float))
     uv, inside = CAMERA.project(P)
     within = (np.abs(uv - [WIDTH / 2, HEIGHT / 2]) < [WIDTH / 2 - border, HEIGHT / 2 - border]).all(axis=1)
-    return f, score, P, uv, inside & within & (np.hypot(P[:, 0], P[:, 2]) > nearest)
+    return f, score, P, uv, inside & within & (np.linalg.norm(P, axis=1) > nearest)
 
 
-def test_points_are_sampled_where_the_cylinder_projects_them():
+def test_points_are_sampled_where_the_sphere_projects_them():
     f, score, P, uv, inside = seen(4, 0.5)
     assert (inside & (P[:, 2] < 0)).sum() > 10  # some are behind the image plane
     kept = f.points.xyz[:, None] == score.points.T[None]
@@ -69,7 +69,7 @@ def test_points_are_sampled_where_the_cylinder_projects_them():
         )
 
 
-def test_the_slope_on_a_cylinder_is_the_difference():
+def test_the_slope_on_a_sphere_is_the_difference():
     _, score, _, _, inside = seen(12, 1.0)
     assert inside.sum() > 200
     J = score.jacobian(T, 1)
@@ -86,13 +86,13 @@ def test_only_the_widest_lenses_are_unrolled():
     fisheye = Camera(K, 800, 600, "equidistant", np.array([0.01, 0, 0, 0]))
     narrow = Camera(2 * K * [[1, 1, 0.5], [1, 1, 0.5], [1, 1, 0.5]], 800, 600, "equidistant", np.array([0.01, 0, 0, 0]))
     thesis = Config(refine=RefineConfig(objective="thesis"))
-    pinhole, cylinder = (Config(image=ImageConfig(projection=name)) for name in ("pinhole", "cylinder"))
-    unrolled = [(fisheye, Config()), (narrow, cylinder)]
+    pinhole, sphere = (Config(image=ImageConfig(projection=name)) for name in ("pinhole", "sphere"))
+    unrolled = [(fisheye, Config()), (narrow, sphere)]
     flat = [(narrow, Config()), (fisheye, pinhole), (fisheye, thesis)]
-    assert all(rectified_camera(*given).is_cylinder for given in unrolled)
+    assert all(rectified_camera(*given).is_sphere for given in unrolled)
     assert all(rectified_camera(*given).is_pinhole for given in flat)
-    with pytest.raises(ConfigError, match="cylinder does not go with"):
-        replace(thesis, image=ImageConfig(projection="cylinder"))
+    with pytest.raises(ConfigError, match="sphere does not go with"):
+        replace(thesis, image=ImageConfig(projection="sphere"))
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def fisheye() -> Frame:
 def test_a_fisheye_is_used_beyond_its_image_plane_and_finds_the_extrinsic(fisheye):
     config = Config(semantics=SemanticsConfig(image_classes="", cloud_classes=""))
     extract = FeatureExtractor(fisheye.camera, config)
-    assert extract.camera.is_cylinder
+    assert extract.camera.is_sphere
     assert extract.camera.width / extract.camera.K[0, 0] > np.deg2rad(185)
     assert 0.9 < extract.used.mean() < 1
     start = se3.exp([0.015, -0.02, 0.01, 0.06, -0.05, 0.08]) @ fisheye.reference
