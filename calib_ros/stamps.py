@@ -25,6 +25,20 @@ TIME_SCALES = {37: "TAI and UTC", 18: "GPS time and UTC", 19: "TAI and GPS time"
 SAME_DIFFERENCE = 0.3  # s, by which latencies may blur one of these
 
 
+LONGEST_QUEUE_S = 60.0  # that messages wait in; stamps of the same moment that differ by more are of other clocks
+LONG_AGO_S = 1e7
+
+
+def cause_of_difference(seconds: float) -> str:
+    """The likely cause of clocks that are so far apart."""
+    scale = time_scales(seconds)
+    if scale is not None:
+        return f"the difference of {scale[1]}, of which one sensor is synchronised to each"
+    if abs(seconds) > LONG_AGO_S:
+        return "one of them counts from another epoch, such as when it was switched on"
+    return "their clocks are not synchronised"
+
+
 def time_scales(seconds: float) -> tuple[int, str] | None:
     """The two time scales that are so far apart, with their exact difference, s; None if no two are."""
     return next((own for own in TIME_SCALES.items() if abs(abs(seconds) - own[0]) <= SAME_DIFFERENCE), None)

@@ -16,15 +16,13 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import decode_camera_info
 from calib_ros.messages.video import VIDEO, packet_of
-from calib_ros.stamps import Stamps, nearest_index, time_scales
+from calib_ros.stamps import LONGEST_QUEUE_S, Stamps, cause_of_difference, nearest_index, time_scales
 
 Span = tuple[int, int]  # [start, stop) of recording times, ns
 MAX_KEPT = 256 * 2**20  # bytes of messages held in memory: thirty frames of 2 Mpx in colour with their clouds
 AUTO, HEADER, RECORDING = CLOCKS = "auto", "header", "recording"
 MAX_LATENCY = NANOSECONDS  # usually, from a sensor to the recorder
 QUICKEST = 0.9
-LONGEST_QUEUE = 60 * NANOSECONDS  # that messages wait in; what differs by more are clocks
-LONG_AGO_S = 1e7
 # Where static transforms are repeated more often than this, those at the bag's beginning and before the windows are enough.
 FEW_TRANSFORMS, BEGINNING = 100, 5 * NANOSECONDS
 
@@ -222,7 +220,7 @@ def clock_difference(image: TopicIndex, cloud: TopicIndex) -> tuple[int, bool]:
     if abs(ahead) <= MAX_LATENCY:
         return 0, False
     # Only a clock stamps messages before they come, and no queue is that long.
-    return ahead, max(of_clouds, of_images) > abs(ahead) / 2 or abs(ahead) > LONGEST_QUEUE
+    return ahead, max(of_clouds, of_images) > abs(ahead) / 2 or abs(ahead) > LONGEST_QUEUE_S * NANOSECONDS
 
 
 def difference_in_words(ahead: int, of_clocks: bool) -> str:
@@ -235,14 +233,8 @@ def difference_in_words(ahead: int, of_clocks: bool) -> str:
         return (
             f"{found}: messages waited that long, or clocks differ; paired by the stamps. Pair as recorded by --clock recording"
         )
-    if scale is not None:
-        cause = f"the difference of {scale[1]}, of which one sensor is synchronised to each"
-    elif seconds > LONG_AGO_S:
-        cause = "one of them counts from another epoch, such as when it was switched on"
-    else:
-        cause = "their clocks are not synchronised"
     exact = "" if scale else "; it is known as well as messages arrive, to some 0.1 s, see motion.max_time_offset_s"
-    return f"{found}: {cause}; paired as recorded{exact}. --clock header pairs by the stamps as they are"
+    return f"{found}: {cause_of_difference(seconds)}; paired as recorded{exact}. --clock header pairs by the stamps as they are"
 
 
 def _references(transforms: list[tuple[int, Any]], camera_frame: str, lidar_frame: str) -> list[tuple[int, Matrix]]:

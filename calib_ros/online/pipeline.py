@@ -108,6 +108,11 @@ class Pipeline:
         """What pairs the messages."""
         return self._pairing.synchronizer
 
+    @property
+    def clock_difference(self) -> str:
+        """What is said of clocks of other epochs, whose difference is taken out of the clouds' stamps; "" if there is none."""
+        return self._pairing.clocks.describe()
+
     def _hand_over(self, found: list[Intake]) -> None:
         """With the lock held: to the ingest worker."""
         for intake in found:
@@ -115,11 +120,14 @@ class Pipeline:
 
     def _add(self, take: Callable[[int, Any], list[Intake]], stamp: int, message: Any) -> None:
         with self._lock:
-            jumps = self.synchronizer.counts.jumps_back
+            jumps, ahead = self.synchronizer.counts.jumps_back, self._pairing.clocks.ahead
             self._hand_over(take(stamp, message))
             jumped = self.synchronizer.counts.jumps_back > jumps
+            clocks = self.clock_difference if self._pairing.clocks.ahead != ahead else ""
         if jumped:
             self._announcer.tell(Problem(JUMPED_BACK))
+        if clocks:
+            self._announcer.tell(Problem(clocks))
 
     # ---- requests -----------------------------------------------------------------------------------------------------
 
@@ -257,6 +265,8 @@ class Pipeline:
             self._announcer.other_sensors(names, *frame_ids)
             return
         frame = self._inputs.decode(*pair, recalibrator.camera)
+        if (ahead := self._pairing.clocks.ahead) and frame.cloud_stamp is not None:
+            frame = replace(frame, cloud_stamp=frame.cloud_stamp - ahead)
         try:
             is_keyframe = recalibrator.ingest(
                 frame, lambda since: self._scan_before(frame, since), lambda: self._allows_keyframe(meter)

@@ -246,7 +246,7 @@ class Diagnostics:
             return level, text
         if (silent := self._silence(watched, images, clouds, pairs)) is not None:
             return silent
-        input_problems = [*self._health.losses.values(), *filter(None, [unpaired])]
+        input_problems = [*self._health.losses.values(), *filter(None, [unpaired, self._pipeline.clock_difference])]
         if level == WARN or input_problems:
             return WARN, "; ".join([text, *input_problems])
         problem, at = self._health.last_error

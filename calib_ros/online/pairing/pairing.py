@@ -11,6 +11,7 @@ from typing import Any
 
 from calib_ros.config import Config
 from calib_ros.lidar.sweep import SweepOffset
+from calib_ros.online.pairing.epochs import ClockDifference
 from calib_ros.online.pairing.synchronizer import Synchronizer
 
 # Cloud messages kept: the one before a keyframe's is needed for the vehicle's motion, and the keyframe's own may wait for its
@@ -37,7 +38,7 @@ class Pairing:
     def __init__(self, config: Config, clouds_are_decoded: bool) -> None:
         online = config.online
         self.synchronizer = Synchronizer(online.pair_tolerance_s, online.pair_queue, None if clouds_are_decoded else 0)
-        self.sweep = SweepOffset(config.motion)
+        self.sweep, self.clocks = SweepOffset(config.motion), ClockDifference()
         self._newest_image: Any = None  # messages to find out from when scans sweep the view, while that is not known
         self._newest_cloud: Any = None
         self._clouds: deque[tuple[int, Any]] = deque(maxlen=CLOUDS_KEPT)  # the newest messages, with their stamps
@@ -50,14 +51,24 @@ class Pairing:
 
     def add_image(self, stamp: int, message: Any) -> list[Intake]:
         """An image message, stamp in ns."""
+        if self.clocks.add_image(stamp):
+            self._begin_anew()
         self._newest_image = message
         return self._to_take_in(self.synchronizer.add_image(stamp, message))
 
     def add_cloud(self, stamp: int, message: Any) -> list[Intake]:
-        """A cloud message, stamp in ns."""
+        """A cloud message, stamp in ns, from which the difference of the clocks is taken out."""
+        if self.clocks.add_cloud(stamp):
+            self._begin_anew()
+        stamp -= self.clocks.ahead
         self._clouds.append((stamp, message))
         self._newest_cloud = message
         return self._to_take_in(self.synchronizer.add_cloud(stamp, message))
+
+    def _begin_anew(self) -> None:
+        """What waits is stamped by other clocks than what comes."""
+        self.synchronizer.clear()
+        self._clouds.clear()
 
     def use_sweep(self) -> list[Intake]:
         """Pair by what is known of the sweep. Of pairs that become final by it, the newest is to be taken in."""

@@ -18,6 +18,7 @@ from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.lidar.sweep import SweepOffset
 from calib_ros.messages.point_fields import seconds_from_stamp
 from calib_ros.online.events import Event, FrameIngested, Inputs, Problem
+from calib_ros.online.pairing.epochs import ClockDifference
 from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.online.pipeline import Pipeline
@@ -274,6 +275,78 @@ def test_different_rates_and_a_looping_recording_are_no_problem(camera_hz, scan_
 )
 def test_why_no_partner_is_found(watched, streams, said):
     assert re.search(said, Watched(**watched).feed(**{"images": ticks(10), "clouds": ticks(10, seed=1), **streams})[-1])
+
+
+# ---- clocks of other epochs --------------------------------------------------------------------------------------------------
+
+
+def difference(ahead_s: float, camera_hz: float = 10, scan_hz: float = 10, delay_ms: float = 0.0) -> ClockDifference:
+    """After 20 s, of which the first stamps are of images alone."""
+    clocks = ClockDifference()
+    times = [(t + delay_ms, False, t) for t in ticks(camera_hz)] + [(t + 500, True, t + 500) for t in ticks(scan_hz, seed=1)]
+    changes = 0
+    for _, is_cloud, t in sorted(times):
+        stamp = T0 + round(t * MS)
+        changes += clocks.add_cloud(stamp + round(ahead_s * NANOSECONDS)) if is_cloud else clocks.add_image(stamp)
+    assert changes == (clocks.ahead != 0)
+    return clocks
+
+
+@pytest.mark.parametrize("ahead_s", [37.0, -37.0, 18.0, -19.0])
+@pytest.mark.parametrize(("camera_hz", "scan_hz"), [(10, 10), (30, 10), (5, 20)])
+def test_time_scales_are_told_apart_exactly(ahead_s, camera_hz, scan_hz):
+    clocks = difference(ahead_s, camera_hz, scan_hz, delay_ms=60.0)
+    assert clocks.ahead == ahead_s * NANOSECONDS
+    assert f"stamped {abs(ahead_s):.0f} s {'after' if ahead_s > 0 else 'before'} images" in clocks.describe()
+
+
+@pytest.mark.parametrize("ahead_s", [3600.0, -1.6e9, 250.4])
+def test_other_epochs_are_known_as_well_as_messages_arrive(ahead_s):
+    assert difference(ahead_s).ahead / NANOSECONDS == pytest.approx(ahead_s, abs=0.1)
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 0.05, -0.8, 5.0, -40.0])
+def test_what_may_be_messages_that_wait_is_left_alone(ahead_s):
+    clocks = difference(ahead_s)
+    assert (clocks.ahead, clocks.describe()) == (0, "")
+
+
+def test_clocks_that_are_set_right_later_are_noticed():
+    clocks = difference(37.0)
+    changed = [
+        clocks.add_image(T0 + 30 * NANOSECONDS + k * 100 * MS) or clocks.add_cloud(T0 + 30 * NANOSECONDS + k * 100 * MS)
+        for k in range(40)
+    ]
+    assert (clocks.ahead, sum(changed)) == (0, 1)
+
+
+def test_a_pipeline_pairs_what_is_received_together(street: list[Frame]) -> None:
+    """Until the difference is known nothing belongs together; then each scan goes with its image."""
+    ahead, frames, problems = 37 * NANOSECONDS, [], []
+
+    def decode(image: Frame, cloud: Frame, camera: Camera) -> Frame:
+        return replace(image, cloud=cloud.cloud, cloud_stamp=cloud.moment_of_cloud + ahead)
+
+    def sink(event: Event) -> None:
+        frames.extend([event.frame] if isinstance(event, FrameIngested) else [])
+        problems.extend([event.message] if isinstance(event, Problem) else [])
+
+    start = Result(street[0].reference, INITIAL)
+    inputs = Inputs(decode, lambda *_: ("camera", "lidar"), lambda *_: start, lambda cloud: cloud.cloud)
+    pipeline = Pipeline(config(mode="manual"), inputs, sink)
+    pipeline.set_camera(street[0].camera)
+    for k in range(24):
+        frame = street[k % len(street)]
+        shift = k * 100 * MS - (frame.stamp - street[0].stamp)
+        sent = replace(frame, stamp=frame.stamp + shift, cloud_stamp=frame.moment_of_cloud + shift)
+        pipeline.add_image(sent.stamp, sent)
+        pipeline.add_cloud(sent.moment_of_cloud + ahead, sent)
+        assert pipeline.wait_idle(60)
+    assert pipeline.stop()
+    assert len(frames) > 8
+    assert max(abs(frame.moment_of_cloud - frame.stamp) for frame in frames) < 100 * MS
+    assert problems == [pipeline.clock_difference]
+    assert "TAI and UTC" in problems[0]
 
 
 # ---- the same recording, stamped in other ways ------------------------------------------------------------------------------

@@ -1,0 +1,63 @@
+"""Do the clocks of camera and LiDAR count from the same time? By the stamps of what is received at the same time."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from calib_ros.frame import NANOSECONDS
+from calib_ros.stamps import LONGEST_QUEUE_S, cause_of_difference, time_scales
+
+SEEN = 20  # messages of both streams together, before anything is concluded
+STEADY_S = 1.0  # within which leads of one pair of clocks stay, messages of a camera at 1 Hz included
+
+
+class ClockDifference:
+    """ahead: ns by which clouds are stamped ahead of images that are received at the same time, if that is the difference of two
+    time scales, which is exact, or more than messages can wait, which is known as they arrive, to some 0.1 s; else 0."""
+
+    def __init__(self) -> None:
+        self.ahead = 0
+        self._image: int | None = None  # the newest stamps, ns
+        self._cloud: int | None = None
+        self._leads: deque[int] = deque(maxlen=SEEN)
+
+    def add_image(self, stamp: int) -> bool:
+        """An image's stamp, ns; True if it changes what is taken out."""
+        self._image = stamp
+        return self._look()
+
+    def add_cloud(self, stamp: int) -> bool:
+        """The same of a cloud, as its driver has stamped it."""
+        self._cloud = stamp
+        return self._look()
+
+    def describe(self) -> str:
+        """For people; "" if there is no difference."""
+        if not self.ahead:
+            return ""
+        seconds = abs(self.ahead) / NANOSECONDS
+        side = "after" if self.ahead > 0 else "before"
+        return (
+            f"clouds are stamped {seconds:.0f} s {side} images received at the same time: {cause_of_difference(seconds)}; "
+            "paired as received; synchronise the clocks (PTP, chrony)"
+        )
+
+    def _look(self) -> bool:
+        if self._image is None or self._cloud is None:
+            return False
+        self._leads.append(self._cloud - self._image)
+        leads = np.array(self._leads)
+        if len(leads) < SEEN or np.ptp(leads) > STEADY_S * NANOSECONDS:
+            return False
+        found = int(np.median(leads))
+        scale = time_scales(found / NANOSECONDS)
+        if scale is not None:
+            found = int(np.copysign(scale[0], found)) * NANOSECONDS
+        elif abs(found) <= LONGEST_QUEUE_S * NANOSECONDS:
+            found = 0
+        if abs(found - self.ahead) <= STEADY_S * NANOSECONDS:
+            return False
+        self.ahead = found
+        return True
