@@ -183,7 +183,7 @@ class Camera:
     def unrolled(self) -> Camera:
         """The camera of the image on a sphere about the camera, of all that the lens sees, at its own focal length."""
         # 60 deg from the axis a pinhole stretches the image four times: one blur is not the same angle everywhere.
-        around, angle = np.meshgrid(np.linspace(0, 2 * np.pi, 361), np.linspace(0, WIDEST, 561))
+        around, angle = np.meshgrid(np.linspace(0, 2 * np.pi, 181), np.linspace(0, WIDEST, 281))
         at = np.stack([angle * np.cos(around), angle * np.sin(around)], axis=-1).reshape(-1, 2)
         u, v = self._lens_pixels(rays_of_angles(at)).T
         with np.errstate(invalid="ignore"):

@@ -180,7 +180,7 @@ def _from_rings(
 
 def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Ring numbers (n,) in any order -> row from the top (n,) and the median elevation of each row, rad."""
-    short = ring.astype(np.int16) if np.abs(ring).max() < 2**15 else ring  # 16 bits sort in linear time
+    short = ring.astype(np.int16) if ring.min() >= -(2**15) and ring.max() < 2**15 else ring  # 16 bits sort in linear time
     order = np.argsort(short, kind="stable")
     names, first = np.unique(ring[order], return_index=True)
     medians = np.array([np.median(part) for part in np.split(elevation[order], first[1:])])

@@ -84,14 +84,15 @@ class _Worker:
     def __init__(self) -> None:
         self._executor = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _prepare_process)
         self.submit = self._executor.submit
-        known, before = multiprocessing.active_children(), {name: os.environ.get(name) for name in ONE_THREAD}
+        before = {name: os.environ.get(name) for name in ONE_THREAD}
         resource_tracker.ensure_running()  # or the first start does it, and lets Ctrl-C through
         # It starts here: with one thread, and with Ctrl-C blocked until it ignores it.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         os.environ.update(ONE_THREAD)
         try:
             self.started: Future[Any] = self.submit(int)
-            (self._process,) = (process for process in multiprocessing.active_children() if process not in known)
+            # No list of the children that live: one that has ended at its start would be missing.
+            (self._process,) = dict(self._executor._processes).values()
         finally:
             for name, value in before.items():
                 os.environ.pop(name) if value is None else os.environ.update({name: value})

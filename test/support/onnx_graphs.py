@@ -145,8 +145,8 @@ def segmentation(
     return g.save(path, [(given, inputs, kind)], made, metadata)
 
 
-def endless(path: Path, turns: int = 10**7, above: float = 0.0, size: tuple = (64, 64)) -> Path:
-    """A network for classes of pixels that takes minutes where its highest value is above a level (a loop), else no time."""
+def endless(path: Path, turns: int = 10**12, above: float = 0.0, size: tuple = (64, 64)) -> Path:
+    """A network for classes of pixels that does not end where its highest value is above a level (a loop), else no time."""
     turn = [helper.make_node("Identity", ["go"], ["go_on"]), helper.make_node("Tanh", ["x"], ["y"])]
     given = [value("i", [], Type.INT64), value("go", [], Type.BOOL), value("x", None)]
     body = helper.make_graph(turn, "body", given, [value("go_on", [], Type.BOOL), value("y", None)])

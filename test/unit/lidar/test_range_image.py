@@ -11,7 +11,7 @@ from helpers import GROUND, Box, Plane, Spinner
 from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.range_image import cell_size, range_image
+from calib_ros.lidar.range_image import _rows_from_top, cell_size, range_image
 from calib_ros.lidar.rings import ring_of_points
 
 WALLS = [Plane((1, 0, 0), 25), Plane((-1, 0, 0), 12), Plane((0, 1, 0), 9), Plane((0, -1, 0), 15)]
@@ -206,3 +206,10 @@ def test_a_dense_scan_of_a_narrow_field_has_the_cells_of_its_density() -> None:
     assert max(sizes) <= 1.15 * min(sizes)
     few = cell_size(np.deg2rad(rng.uniform(-7, 7, 30_000)), np.deg2rad(rng.uniform(-7, 7, 30_000)))
     assert few > 1.3 * max(sizes)
+
+
+def test_ring_numbers_of_any_size_are_sorted_from_the_top():
+    ring = np.array([-(2**31), 5, 5, 2**31 - 1, -(2**31)], np.int32)
+    rows, elevation = _rows_from_top(ring, np.array([0.1, 0.3, 0.3, -0.2, 0.1]))
+    assert rows.tolist() == [1, 0, 0, 2, 1]
+    assert elevation == pytest.approx([0.3, 0.1, -0.2])

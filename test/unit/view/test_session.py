@@ -9,6 +9,7 @@ import pytest
 from waiting import until
 
 from calib_ros import Config, result, se3
+from calib_ros.config import update
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros_check.outcome import CheckVerdict
@@ -119,6 +120,7 @@ def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
 
 
 def test_work_is_stopped_and_one_at_a_time(session):
+    session.config = update(session.config, {"search": {"starts": 1 << 20}})  # until it is stopped
     jobs = SessionJobs(session)
     with pytest.raises(BadInputError, match="not known"):
         jobs.start("dance")
