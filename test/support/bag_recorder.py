@@ -8,7 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from ros_messages import TYPES, Messages
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
@@ -43,6 +45,16 @@ def frame(i: int, grey: bool = False, camera: Camera = PINHOLE, points: int = 60
         reference=T_CAMERA_LIDAR,
     )
     return replace(made, **changes)
+
+
+def as_ros1(bag: Path, path: Path) -> None:
+    """A bag of ROS 2 as one of ROS 1."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    with Reader(bag) as reader, Ros1Writer(path) as writer:
+        topics = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections}
+        for connection, time, data in reader.messages():
+            writer.write(topics[connection.topic], time, TYPES.cdr_to_ros1(data, connection.msgtype))
 
 
 def assert_same(a: Frame, b: Frame) -> None:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bag_recorder import as_ros1
 from compressed_bags import compressed_bag
 from fuzzing import STAMP, K
 
 from calib_ros.camera import Camera
-from calib_ros.datasets.bag_parts import typestore
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.registration.initial_guess import nominal
@@ -129,18 +129,9 @@ def plain_otherwise(folder: Path) -> None:
 
 def ros1(folder: Path) -> None:
     """A bag of ROS 1 of the same frames."""
-    from rosbags.rosbag1 import Writer
-    from rosbags.rosbag2 import Reader
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
     path = write_bag(Listed(frames()), folder.parent / "to_convert")
     folder.mkdir()
-    with Reader(path) as reader, Writer(folder / "drive.bag") as writer:
-        topics = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections}
-        for connection, time, data in reader.messages():
-            writer.write(topics[connection.topic], time, typestore().cdr_to_ros1(data, connection.msgtype))
+    as_ros1(path, folder / "drive.bag")
     shutil.rmtree(path)
 
 

@@ -6,11 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_recorder import MS, START, STORAGES, A, Recorder, assert_same, frame
-from ros_messages import TYPES
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionMode, Reader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from bag_recorder import MS, START, STORAGES, A, Recorder, as_ros1, assert_same, frame
+from rosbags.rosbag2 import CompressionMode
 from sample_sources import Listed
 
 from calib_ros.datasets import open_dataset
@@ -120,12 +117,8 @@ def test_bags_of_ros_1(tmp_path):
         for i in range(3):
             record.trio(START + i * 100 * MS, value=i)
         record.static(START, ("cam", "lidar", A))
-    expected, ros1 = BagSource(tmp_path / "bag"), get_typestore(Stores.ROS1_NOETIC)
-    ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    with Reader(tmp_path / "bag") as reader, Ros1Writer(path) as writer:
-        own = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=ros1) for c in reader.connections}
-        for connection, time, data in reader.messages():
-            writer.write(own[connection.topic], time, TYPES.cdr_to_ros1(data, connection.msgtype))
+    expected = BagSource(tmp_path / "bag")
+    as_ros1(tmp_path / "bag", path)
     bag = open_dataset(path)
     assert (len(bag), bag.describe()["kind"], bag.camera_frame) == (3, "ROS 1 bag", "cam")
     assert np.abs(bag.reference - A).max() < 1e-9

@@ -1,4 +1,4 @@
-"""`calib-ros calibrate` of bags of video and compressed clouds."""
+"""`calib-ros calibrate` of bags of video and compressed clouds, and of ROS 1."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from bag_recorder import as_ros1
 from compressed_bags import FFMPEG, FOXGLOVE, compressed_bag
 
 from calib_ros.cli.main import main
@@ -25,7 +26,15 @@ KINDS = [(FOXGLOVE, "h264"), (FFMPEG, "hevc_nvenc;yuv420p;bgr8;bgr8"), (FOXGLOVE
 def test_calibration_from_video_converges(kind: str, layout: str, search: list[str], street_bag: Path, tmp_path: Path) -> None:
     pytest.importorskip("av", reason="PyAV is not installed")
     codec = "h265" if "hevc" in layout else layout.rpartition("-")[2]
-    bag, result = compressed_bag(street_bag, tmp_path / "bag", kind, layout, codec), tmp_path / "result.json"
+    assert_converges(compressed_bag(street_bag, tmp_path / "bag", kind, layout, codec), tmp_path / "result.json", search)
+
+
+def test_calibration_from_a_bag_of_ros_1_converges(street_bag: Path, tmp_path: Path) -> None:
+    as_ros1(street_bag, tmp_path / "street.bag")
+    assert_converges(tmp_path / "street.bag", tmp_path / "result.json", NARROW)
+
+
+def assert_converges(bag: Path, result: Path, search: list[str]) -> None:
     frames = ["--frames", "0:6"] if search else []
     assert main(["calibrate", str(bag), *frames, *search, "--initial", "reference", "--json", str(result)]) == 0
     found = json.loads(result.read_text())
