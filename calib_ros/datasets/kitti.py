@@ -1,7 +1,8 @@
-"""KITTI raw drives, odometry sequences and object folders as sequences of frames."""
+"""KITTI raw drives, odometry sequences and object folders, and drives of KITTI-360, as sequences of frames."""
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,18 +29,21 @@ from calib_ros.frame import NANOSECONDS, Frame
 
 # As kitti2bag names them.
 CAMERA_FRAMES = ("camera_gray_left", "camera_gray_right", "camera_color_left", "camera_color_right")
-LIDAR_FRAME = "velo_link"
+LIDAR_FRAME, KITTI_360 = "velo_link", "360"
 PERIOD_NS = NANOSECONDS // 10  # KITTI's cameras and scanner run at 10 Hz
 EXPECTED_FOLDERS = (
     "velodyne_points/data and image_0N/data (KITTI raw), velodyne, image_N and calib.txt (KITTI odometry), "
-    "velodyne, image_N and calib/ (KITTI object)"
+    "velodyne, image_N and calib/ (KITTI object), image_0N/data_rect (KITTI-360: a drive of data_2d_raw)"
 )
 # Names of folders that hold drives: drives are found from above without searching a whole disk.
-_PARENT_FOLDER = re.compile(r"\d{4}_\d\d_\d\d|sequences|dataset|raw|odometry|object|training|testing|\d\d", re.IGNORECASE)
+_PARENT_FOLDER = re.compile(
+    r"\d{4}_\d\d_\d\d|data_2d_raw|sequences|dataset|raw|odometry|object|training|testing|\d\d", re.IGNORECASE
+)
 
 
 class KittiSource:
-    """Frames of a KITTI raw drive, odometry sequence or object folder, for one of the cameras 0 to 3.
+    """Frames of a KITTI raw drive, odometry sequence or object folder, for one of the cameras 0 to 3 (by default 2), or of a
+    drive of KITTI-360, for its perspective camera 0 or 1.
 
     A frame is a number with an image and a scan; files are read on access. Frames of raw drives have point times, the exposure of
     the image as stamp and, with oxts, the LiDAR's twist. In the object layout each frame has its own calibration.
@@ -47,21 +51,23 @@ class KittiSource:
     Raises BadInputError, with the path and what to do, for another folder, a missing camera, missing or damaged files.
     """
 
-    def __init__(self, path: str | Path, camera: int = 2) -> None:
+    def __init__(self, path: str | Path, camera: int | None = None) -> None:
         root = find_drive(Path(path))
         if root is None:
             raise BadInputError(f"{path} is not a KITTI folder; looked for {EXPECTED_FOLDERS}")
+        of_360 = _kind(root) == KITTI_360
+        camera = (0 if of_360 else 2) if camera is None else camera
         self._layout = layout_of(root, camera)
         self.path = root
         self.name = root.resolve().name
-        self.camera_frame = CAMERA_FRAMES[camera]
+        self.camera_frame = f"image_0{camera}" if of_360 else CAMERA_FRAMES[camera]
         self.lidar_frame = LIDAR_FRAME
         self._camera_number = camera
         self._images = numbered_files(self._layout.images[camera], IMAGE_SUFFIXES)
         self._scans = numbered_files(self._layout.scans, (".bin",))
         self.numbers = sorted(self._images.keys() & self._scans.keys())
         if not self.numbers:
-            pictures, scans = (self._layout.images[camera].relative_to(root), self._layout.scans.relative_to(root))
+            pictures, scans = (os.path.relpath(part, root) for part in (self._layout.images[camera], self._layout.scans))
             raise BadInputError(
                 f"{root}: no number has both a picture ({len(self._images)} in {pictures}) and a scan "
                 f"({len(self._scans)} in {scans}); download both of this drive"
@@ -142,8 +148,8 @@ class DriveLayout:
     images: dict[int, Path]
     scans: Path
     calibrate: Callable[[int], tuple[Matrix, Matrix]]
-    stamps: Callable[[int], tuple[int, int | None]]
-    stamps_from: str
+    stamps: Callable[[int], tuple[int, int | None]] = lambda number: (number * PERIOD_NS, None)
+    stamps_from: str = ""
     motion: ScanMotion | None = None
     compensated: bool = False
 
@@ -160,7 +166,10 @@ class DriveLayout:
 def layout_of(root: Path, camera: int) -> DriveLayout:
     """The layout of a drive for one of its cameras (0, 1 grey; 2, 3 colour). BadInputError if something is missing."""
     kind = _kind(root)
-    pattern, scans = ("image_0{}/data", "velodyne_points/data") if kind == "raw" else ("image_{}", "velodyne")
+    pattern, scans = {
+        "raw": ("image_0{}/data", "velodyne_points/data"),
+        KITTI_360: ("image_0{}/data_rect", f"../../data_3d_raw/{root.absolute().name}/velodyne_points/data"),
+    }.get(kind, ("image_{}", "velodyne"))
     images = {number: root / pattern.format(number) for number in range(4) if (root / pattern.format(number)).is_dir()}
     if not (root / scans).is_dir():
         raise BadInputError(f"{root} looks like KITTI {kind}, but has no folder {scans}; download the laser scans too")
@@ -169,12 +178,14 @@ def layout_of(root: Path, camera: int) -> DriveLayout:
         raise BadInputError(
             f"{root} has no images of camera {camera} ({pattern.format(camera)}), {has}; choose another camera or download them"
         )
-    builder = {"raw": _raw, "odometry": _odometry, "object": _object}[kind]
+    builder = {"raw": _raw, "odometry": _odometry, "object": _object, KITTI_360: _kitti_360}[kind]
     return builder(root, camera, images, root / scans)
 
 
 def _kind(root: Path) -> str:
     """Layout of a folder by its content, even if incomplete; "" if it is not KITTI."""
+    if any((root / f"image_0{n}" / "data_rect").is_dir() for n in range(2)):
+        return KITTI_360
     if (root / "velodyne_points").is_dir() or any((root / f"image_0{n}" / "data").is_dir() for n in range(4)):
         return "raw"
     if (root / "velodyne").is_dir() or any((root / f"image_{n}").is_dir() for n in range(4)):
@@ -200,18 +211,37 @@ def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Drive
     P = cameras.matrix(f"P_rect_0{camera}", 3, 4)
     Tr = np.c_[velodyne.matrix("R", 3, 3), velodyne.matrix("T", 3, 1)]
     T = _extrinsic(P, cameras.matrix("R_rect_00", 3, 3), Tr, velodyne.path)
-    of_images = Timestamps.if_present(images[camera].parent / "timestamps.txt")
-    of_scans = Timestamps.if_present(scans.parent / "timestamps.txt")
+    return _timed(DriveLayout("raw", images, scans, lambda _: (P, T)), camera, ScanMotion(root, date), image_moment)
+
+
+def _kitti_360(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
+    calibration = root.absolute().parents[1] / "calibration"
+    cameras, velodyne = CalibrationFile(calibration / "perspective.txt"), CalibrationFile(calibration / "calib_cam_to_velo.txt")
+    P = cameras.matrix(f"P_rect_0{camera}", 3, 4)
+    T_velo_camera = se3.as_transform(np.vstack([velodyne.matrix("", 3, 4), [0, 0, 0, 1]]), f"the extrinsic of {velodyne.path}")
+    T = _extrinsic(P, cameras.matrix("R_rect_00", 3, 3), se3.inverse(T_velo_camera)[:3], velodyne.path)
+    # How its cameras are triggered is not KITTI's: their stamps are taken as they are.
+    layout = DriveLayout(KITTI_360, images, scans, lambda _: (P, T))
+    return _timed(layout, camera, ScanMotion(scans.parents[1], calibration), lambda image, scan: (image, scan))
+
+
+def _timed(
+    layout: DriveLayout, camera: int, motion: ScanMotion, moments: Callable[[int, int], tuple[int, int | None]]
+) -> DriveLayout:
+    """A layout with the stamps of the files timestamps.txt beside images and scans. moments: of the exposure and of the scan, by
+    their stamps."""
+    of_images = Timestamps.if_present(layout.images[camera].parent / "timestamps.txt")
+    of_scans = Timestamps.if_present(layout.scans.parent / "timestamps.txt")
 
     def stamps(number: int) -> tuple[int, int | None]:
         if of_images is None:
             return number * PERIOD_NS, None
-        return (of_images.ns(number), None) if of_scans is None else image_moment(of_images.ns(number), of_scans.ns(number))
+        return (of_images.ns(number), None) if of_scans is None else moments(of_images.ns(number), of_scans.ns(number))
 
     stamps_from = "10 Hz assumed" if of_images is None else "timestamps.txt"
     # Point times relative to the image need the stamps of both sensors.
-    motion = None if of_images is None or of_scans is None else ScanMotion(root, date)
-    return DriveLayout("raw", images, scans, lambda _: (P, T), stamps, stamps_from, motion)
+    known = None if of_images is None or of_scans is None else motion
+    return replace(layout, stamps=stamps, stamps_from=stamps_from, motion=known)
 
 
 def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:

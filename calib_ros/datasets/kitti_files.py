@@ -94,7 +94,7 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
 
 
 class CalibrationFile:
-    """A text file of lines "key: numbers"."""
+    """A text file of lines "key: numbers", or of numbers alone, whose key is ""."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -106,7 +106,8 @@ class CalibrationFile:
             ) from None
         except OSError as error:
             raise BadInputError(f"calibration {path} cannot be read ({error.strerror}); check the file") from error
-        self._lines = {key.strip(): values for key, colon, values in (line.partition(":") for line in text.splitlines()) if colon}
+        lines = (line.partition(":") for line in text.splitlines() if line.strip())
+        self._lines = {key.strip() if colon else "": values if colon else key for key, colon, values in lines}
 
     def matrix(self, key: str, rows: int, columns: int) -> Matrix:
         """The numbers of a key as (rows, columns). BadInputError if missing or of another size."""

@@ -28,8 +28,8 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         calibration.yaml (see `FolderSource`), or of nuScenes (``"ROOT#scene-0061"``, by default the first scene; see
         `NuScenesSource`). Or ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as
         ``"synthetic[:name=value,...]"``, the simulated drive.
-    camera : of a KITTI folder, 0 to 3 (default 2), of nuScenes, its channel or number (default CAM_FRONT), or of a plain folder,
-        a name or number in its calibration (default the first).
+    camera : of a KITTI folder, 0 to 3 (default 2; of KITTI-360 0 or 1), of nuScenes, its channel or number (default CAM_FRONT),
+        or of a plain folder, a name or number in its calibration (default the first).
     **options : of a bag, see `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion,
         T_camera_lidar, windows; None = default.
 
@@ -66,7 +66,7 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         _refuse(options, text)
         if isinstance(camera, str):
             raise BadInputError(f"{text} has no camera {camera}; KITTI's are numbers from 0 to 3")
-        return KittiSource(folder, 2 if camera is None else camera)
+        return KittiSource(folder, camera)
     if path.is_file():
         raise BadInputError(f"{text} is not a dataset; give a .mcap, .db3 or .bag file, a bag folder or a KITTI folder")
     names = sorted(child.name for child in path.iterdir())

@@ -28,6 +28,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "KITTI": (
         "datasets/test_kitti.py::test_raw_frames_are_those_with_picture_and_scan",
         "datasets/test_kitti.py::test_odometry",
+        "datasets/test_kitti.py::test_drives_of_kitti_360",
         "datasets/test_kitti.py::test_object_frames_have_their_own_calibration",
     ),
     "nuScenes": ("datasets/test_nuscenes.py::test_key_frames_of_the_first_scene",),

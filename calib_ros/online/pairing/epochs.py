@@ -9,7 +9,9 @@ import numpy as np
 from calib_ros.frame import NANOSECONDS
 from calib_ros.stamps import LONGEST_QUEUE_S, cause_of_difference, time_scales
 
-SEEN = 20  # messages of both streams together, before anything is concluded
+# Messages of both streams together that agree, before anything is concluded; more where pairs were found before, since a clock
+# that jumps usually comes back.
+SEEN, SEEN_LATER = 20, 200
 STEADY_S = 1.0  # within which leads of one pair of clocks stay, messages of a camera at 1 Hz included
 
 
@@ -21,17 +23,17 @@ class ClockDifference:
         self.ahead = 0
         self._image: int | None = None  # the newest stamps, ns
         self._cloud: int | None = None
-        self._leads: deque[int] = deque(maxlen=SEEN)
+        self._leads: deque[int] = deque(maxlen=SEEN_LATER)
 
-    def add_image(self, stamp: int) -> bool:
-        """An image's stamp, ns; True if it changes what is taken out."""
+    def add_image(self, stamp: int, paired: bool = False) -> bool:
+        """An image's stamp, ns; True if it changes what is taken out. paired: whether there were pairs so far."""
         self._image = stamp
-        return self._look()
+        return self._look(paired)
 
-    def add_cloud(self, stamp: int) -> bool:
+    def add_cloud(self, stamp: int, paired: bool = False) -> bool:
         """The same of a cloud, as its driver has stamped it."""
         self._cloud = stamp
-        return self._look()
+        return self._look(paired)
 
     def describe(self) -> str:
         """For people; "" if there is no difference."""
@@ -44,20 +46,23 @@ class ClockDifference:
             "paired as received; synchronise the clocks (PTP, chrony)"
         )
 
-    def _look(self) -> bool:
+    def _look(self, paired: bool) -> bool:
         if self._image is None or self._cloud is None:
             return False
         self._leads.append(self._cloud - self._image)
-        leads = np.array(self._leads)
-        if len(leads) < SEEN or np.ptp(leads) > STEADY_S * NANOSECONDS:
+        agrees = abs(self._cloud - self._image - self.ahead) <= STEADY_S * NANOSECONDS
+        if agrees or len(self._leads) < SEEN:
             return False
-        found = int(np.median(leads))
+        leads = np.array(self._leads)
+        found = int(np.median(leads[-SEEN:]))
         scale = time_scales(found / NANOSECONDS)
         if scale is not None:
             found = int(np.copysign(scale[0], found)) * NANOSECONDS
         elif abs(found) <= LONGEST_QUEUE_S * NANOSECONDS:
             found = 0
-        if abs(found - self.ahead) <= STEADY_S * NANOSECONDS:
+        wanted = SEEN_LATER if paired and found else SEEN
+        steady = len(leads) >= wanted and np.ptp(leads[-wanted:]) <= STEADY_S * NANOSECONDS
+        if not steady or abs(found - self.ahead) <= STEADY_S * NANOSECONDS:
             return False
         self.ahead = found
         return True

@@ -166,6 +166,39 @@ def test_object_frames_have_their_own_calibration(objects):
     assert len(open_dataset(objects.parent)) == 2
 
 
+@pytest.mark.parametrize("camera", [0, 1])
+def test_drives_of_kitti_360(tmp_path, camera):
+    """Pictures, scans and calibration in three folders; the calibration leads from the camera to the scanner."""
+    name = "2013_05_28_drive_0000_sync"
+    drive, velodyne = tmp_path / "data_2d_raw" / name, tmp_path / "data_3d_raw" / name / "velodyne_points"
+    for number in (0, 2, 7):
+        for own in (0, 1):
+            write_image(drive / f"image_0{own}/data_rect" / f"{number:010d}.png", number + own)
+    for number in (2, 7):
+        points = write_scan(velodyne / "data" / f"{number:010d}.bin", number)
+    (drive / f"image_0{camera}/timestamps.txt").write_text(date_lines(9))
+    (velodyne / "timestamps.txt").write_text(date_lines(9, -20_000_000))
+    calibration = tmp_path / "calibration"
+    calibration.mkdir()
+    text = "".join(line(f"P_rect_0{c}", projection(c)) for c in (0, 1)) + line("R_rect_00", TILT)
+    (calibration / "perspective.txt").write_text(text)
+    to_velo = np.c_[TR_ROTATION.T, -TR_ROTATION.T @ TR_TRANSLATION]
+    (calibration / "calib_cam_to_velo.txt").write_text(line("", to_velo).removeprefix(": "))
+    for path in (drive, tmp_path):
+        source = open_dataset(path, camera)
+        assert np.abs(source.reference - expected_extrinsic(camera)).max() < 1e-9
+        assert [(source[k].stamp, source[k].cloud_stamp) for k in range(2)] == [
+            (stamp_of(n), stamp_of(n, -20_000_000)) for n in (2, 7)
+        ]
+        assert np.array_equal(source[1].cloud.xyz, points[:, :3])
+        assert source[1].cloud.time is not None
+        assert source.camera_frame == f"image_0{camera}"
+    assert open_dataset(drive).camera_frame == "image_00"
+    refused(drive, "no images of camera 2", camera=2)
+    (calibration / "calib_cam_to_velo.txt").write_text("1 2 3")
+    refused(drive, "calib_cam_to_velo.txt: .* must have 12 numbers")
+
+
 def refused(source: Path | str, says: str, **options) -> None:
     """A source that cannot be opened, or read to its end."""
     with pytest.raises(BadInputError, match=says) as caught:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import threading
 from dataclasses import dataclass, replace
@@ -318,6 +319,18 @@ def test_clocks_that_are_set_right_later_are_noticed():
         for k in range(40)
     ]
     assert (clocks.ahead, sum(changed)) == (0, 1)
+
+
+def test_a_clock_that_jumps_between_pairs_has_time_to_come_back():
+    clocks, jump, time = ClockDifference(), 3600 * NANOSECONDS, itertools.count(T0, 100 * MS)
+
+    def changed(seconds: float, ahead: int) -> int:
+        stamps = list(itertools.islice(time, round(10 * seconds)))
+        return sum(clocks.add_image(stamp, True) + clocks.add_cloud(stamp + ahead, True) for stamp in stamps)
+
+    assert changed(5, 0) + changed(5, jump) + changed(5, 0) + changed(9, jump) == 0
+    assert (changed(2, jump), clocks.ahead) == (1, jump)
+    assert (changed(2, 0), clocks.ahead) == (1, 0)
 
 
 def test_a_pipeline_pairs_what_is_received_together(street: list[Frame]) -> None:
