@@ -329,7 +329,7 @@ def test_a_clock_that_jumps_between_pairs_has_time_to_come_back():
         return sum(clocks.add_image(stamp, True) + clocks.add_cloud(stamp + ahead, True) for stamp in stamps)
 
     assert changed(5, 0) + changed(5, jump) + changed(5, 0) + changed(9, jump) == 0
-    assert (changed(2, jump), clocks.ahead) == (1, jump)
+    assert (changed(2, jump), clocks.ahead) == (1, pytest.approx(jump, abs=100 * MS))
     assert (changed(2, 0), clocks.ahead) == (1, 0)
 
 
