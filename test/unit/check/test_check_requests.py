@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from driven import Driven, config
+from waiting import LIMIT_S
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
@@ -19,7 +20,7 @@ from calib_ros_check.node.requests import CheckRequest, request_check
 from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
 from calib_ros_synthetic.drive import SyntheticDrive
 
-SOON = 60.0  # s; far longer than any of this takes
+SOON = LIMIT_S
 
 
 def test_other_questions_are_others_and_what_cannot_be_checked_is_bad_input() -> None:

@@ -7,6 +7,7 @@ from concurrent.futures import CancelledError, Future
 
 import pytest
 from driven import Driven, config
+from waiting import LIMIT_S, until
 
 from calib_ros.config import update
 from calib_ros.errors import CalibrationError
@@ -16,8 +17,8 @@ from calib_ros.online.worker import Cancelled
 from calib_ros.result import INITIAL, Extrinsic, Result
 from calib_ros_synthetic.drive import SyntheticDrive
 
-SOON = 30.0  # s; far longer than any of this takes
-LONG_SEARCH = {"search": {"rotation_deg": 3.0, "translation_m": 0.3, "starts": 1 << 20}}  # minutes
+SOON = LIMIT_S
+LONG_SEARCH = {"search": {"rotation_deg": 3.0, "translation_m": 0.3, "starts": 1 << 20}}
 
 
 @pytest.fixture
@@ -96,12 +97,19 @@ def test_refused_requests_fail_at_once_with_the_reason() -> None:
 
 
 def searching(driven: Driven) -> Future[Extrinsic]:
-    """A request whose search has begun, and takes minutes."""
+    """A request whose search has begun, and does not end before the request does."""
     driven.pipeline.configure(update(driven.settings, LONG_SEARCH))
-    began = threading.Event()
-    request = driven.pipeline.request_estimate(lambda *_: began.set())
+    began, asked, requests = threading.Event(), threading.Event(), list[Future[Extrinsic]]()
+
+    def hold(*_: object) -> None:
+        began.set()
+        assert asked.wait(SOON)
+        until(requests[0].done, "the end of the request")
+
+    requests.append(driven.pipeline.request_estimate(hold))
+    asked.set()
     assert began.wait(SOON)
-    return request
+    return requests[0]
 
 
 def test_a_cancelled_estimate_leaves_the_pipeline_as_it_was(street: list[Frame], drive: SyntheticDrive) -> None:

@@ -6,10 +6,11 @@ import threading
 from collections.abc import Callable, Iterator
 
 import pytest
+from waiting import LIMIT_S
 
 from calib_ros.online.worker import Cancelled, Worker
 
-SOON = 10.0  # s; far longer than any of this takes
+SOON = LIMIT_S
 
 
 class Recorder:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from waiting import until
+from waiting import LIMIT_S, until
 
 from calib_ros import Config, result, se3
-from calib_ros.config import update
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros_check.outcome import CheckVerdict
@@ -119,8 +119,14 @@ def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
     assert session.result().frames_used == 3
 
 
-def test_work_is_stopped_and_one_at_a_time(session):
-    session.config = update(session.config, {"search": {"starts": 1 << 20}})  # until it is stopped
+def test_work_is_stopped_and_one_at_a_time(session, monkeypatch):
+    go_on, features = threading.Event(), session.features
+
+    def held(state):
+        assert go_on.wait(LIMIT_S)
+        return features(state)
+
+    monkeypatch.setattr(session, "features", held)
     jobs = SessionJobs(session)
     with pytest.raises(BadInputError, match="not known"):
         jobs.start("dance")
@@ -129,6 +135,7 @@ def test_work_is_stopped_and_one_at_a_time(session):
     with pytest.raises(BadInputError, match="already"):
         jobs.start(REFINE)
     jobs.stop()
+    go_on.set()
     until(lambda: not jobs.busy, "the end")
     assert (job.failed, job.message) == (False, "stopped; nothing has changed")
     assert session.state is before
