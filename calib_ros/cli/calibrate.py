@@ -117,10 +117,11 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
         require_classes(config, initial)
         config = update(config, {"initial": {"method": initial}})
         start = nominal_start(yaw_deg)
-    recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
-    # The recalibrator estimates motion from the previous cloud; where frames are skipped, that one is read for it.
+    # The recalibrator estimates motion from the clouds before, and puts them together; where frames are skipped, they are read.
     if any(b != a + 1 for a, b in pairwise(positions)):
         source = WithMotion(source, config.motion, note, config.lidar.accumulate_s)
+        config = update(config, {"lidar": {"accumulate_s": 0.0}})
+    recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
     status = recalibrator.current.result.status
     with progress_bar("replaying") as step:
         for k, i in enumerate(positions):

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from calib_ros import Calibrator, se3
+from calib_ros.cli.calibrate import replay
 from calib_ros.config import Config, MotionConfig, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import WithMotion
@@ -17,6 +18,7 @@ from calib_ros.lidar.accumulation import Accumulator
 from calib_ros.lidar.deskew import moved
 from calib_ros.online.keyframes import EgoMotion
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_synthetic.drive import SyntheticDrive
 
@@ -127,6 +129,25 @@ def test_the_recalibrator_accumulates_what_it_keeps(drive, frames):
             recalibrator.ingest(frame)
         sizes.append(len(recalibrator.newest().points))
     assert sizes[1] > 2 * sizes[0]
+
+
+@pytest.mark.parametrize("chosen", ["3:8", "3:8:2"])
+def test_a_replay_puts_each_scan_in_once_whether_or_not_frames_are_skipped(drive, frames, chosen, monkeypatch):
+    sizes, extract = [], FeatureExtractor.__call__
+
+    def seen(self, frame, *args, **options):
+        sizes.append((frame.stamp, len(frame.cloud)))
+        return extract(self, frame, *args, **options)
+
+    monkeypatch.setattr(FeatureExtractor, "__call__", seen)
+    changed = {"semantics": {"image_classes": "", "cloud_classes": ""}, "lidar": {"accumulate_s": SECONDS}}
+    list(replay(drive, chosen, "reference", 0.0, update(Config(), changed)))
+    stamps = [frame.stamp for frame in frames]
+    for stamp, size in sizes:
+        k = stamps.index(stamp)
+        first = 3 if chosen == "3:8" else 0  # of a whole drive only what was replayed is known
+        assert size == sum(len(frame.cloud) for frame in frames[max(k - 4, first) : k + 1])
+    assert len(sizes) > 0
 
 
 @pytest.mark.slow

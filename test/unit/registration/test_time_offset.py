@@ -142,6 +142,17 @@ def test_an_extrinsic_at_clocks_that_nobody_is_told_of_is_refused(scene, applied
     assert wrong is None or wrong.figures["seconds"] == applied_s
 
 
+@pytest.mark.parametrize(
+    ("seconds", "sigma_s", "gain", "suspected"),
+    [(0.3, 0.1, 4.0, True), (0.3, 0.1, 2.0, False), (0.3, 0.005, 4.0, False), (0.95, 0.1, 4.0, False)],
+)
+def test_other_clocks_are_suspected_only_within_the_range_that_is_searched(scene, seconds, sigma_s, gain, suspected):
+    effect = Effect(np.zeros(6), 1 / sigma_s**2)
+    offset = TimeOffset(seconds, scene.truth, sigma_s, gain, effect, 0.3, 1.0, 0.1)
+    wrong = Acceptance(Config(), 640, None)._check_offset(Optimised([], None, scene.truth, None, offset, 0.0))
+    assert (wrong is not None) == suspected
+
+
 # --- taken for granted ----------------------------------------------------------------------------------------------------
 
 

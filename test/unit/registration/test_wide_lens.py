@@ -13,8 +13,8 @@ from calib_ros.camera import SPHERE, Camera
 from calib_ros.config import Config, ImageConfig, RefineConfig, ScoreConfig, SemanticsConfig
 from calib_ros.datasets.open import open_dataset
 from calib_ros.errors import ConfigError
-from calib_ros.frame import Frame
-from calib_ros.image.edges import EdgeLevel
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.image.edges import EdgeLevel, edge_levels, oriented_edges
 from calib_ros.lidar.edges import UPWARD, EdgePoints
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, rectified_camera
 from calib_ros.registration.initial_guess import nominal
@@ -31,6 +31,12 @@ def all_around(n: int = 800) -> EdgePoints:
     distance[: n // 20] *= 0.05
     xyz = np.c_[distance * np.cos(azimuth), distance * np.sin(azimuth), distance * rng.uniform(-0.7, 0.7, n)]
     return EdgePoints(xyz.astype(np.float32), np.ones(n, np.float32), rng.integers(0, 5, n).astype(np.uint8))
+
+
+def all_around_cloud() -> PointCloud:
+    azimuth, elevation = np.meshgrid(np.linspace(-np.pi, np.pi, 360, endpoint=False), np.linspace(-0.3, 0.3, 16))
+    xyz = 10 * np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    return PointCloud(xyz.reshape(-1, 3).astype(np.float32))
 
 
 def features() -> FrameFeatures:
@@ -93,6 +99,27 @@ def test_only_the_widest_lenses_are_unrolled():
     assert all(rectified_camera(*given).is_pinhole for given in flat)
     with pytest.raises(ConfigError, match="sphere does not go with"):
         replace(thesis, image=ImageConfig(projection="sphere"))
+
+
+def test_lines_parallel_to_the_cameras_y_axis_are_edges_of_one_kind_everywhere():
+    """Stripes of azimuth on the sphere: the first map has them all, where along the rows alone it would not."""
+    lens = Camera(np.array([[100.0, 0, 200], [0, 100, 150], [0, 0, 1]]), 400, 300, "equidistant", np.array([0.02, 0, 0, 0]))
+    extract = FeatureExtractor(lens, Config(image=ImageConfig(filter="none", equalization="none")))
+    rays = lens.unproject(np.stack(np.meshgrid(np.arange(400), np.arange(300)), axis=-1)).reshape(300, 400, 3)
+    stripes = np.where(np.floor(np.arctan2(rays[..., 0], rays[..., 2]) / 0.2) % 2, 190, 60).astype(np.uint8)
+    stripes[~(np.abs(rays[..., 1]) < 0.85)] = 125  # near the poles stripes are narrower than a pixel
+    across = extract.across
+    gray = extract.working_image(stripes)
+    shares = [
+        first.sum() / (first + second).sum()
+        for first, second in (oriented_edges(gray, extract.config.image, None, a) for a in (across, None))
+    ]
+    assert shares[0] > shares[1] + 0.1
+    assert shares[0] > 0.85
+    frame = Frame(stripes, all_around_cloud(), lens, 0)
+    expected = edge_levels(gray, float(extract.camera.K[0, 0]), extract.config.image, used=extract.used, across=across)
+    assert all(np.array_equal(a.packed, b.packed) for a, b in zip(extract(frame).levels, expected, strict=True))
+    assert FeatureExtractor(Camera(np.diag([300.0, 300, 1]), 400, 300)).across is None
 
 
 @pytest.fixture(scope="module")
