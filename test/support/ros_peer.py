@@ -67,10 +67,9 @@ def start_parameters(T: np.ndarray) -> dict[str, Any]:
 class Goal:
     """A goal of ~/calibrate. accepted: by the node; feedback: so far."""
 
-    def __init__(self, node: Any, until: Callable[..., Any]) -> None:
+    def __init__(self, client: ActionClient, until: Callable[..., Any]) -> None:
         """until: waits for a condition while the node's executor turns."""
         self._until, self.feedback = until, []
-        client = ActionClient(node, Calibrate, "/calib_ros/calibrate")
         assert client.wait_for_server(LIMIT_S)
         sent = client.send_goal_async(Calibrate.Goal(), feedback_callback=lambda said: self.feedback.append(said.feedback))
         until(sent.done, "an answer to the goal")
@@ -125,6 +124,8 @@ class Peer:
         self._triggers = {
             name: self.peer.create_client(Trigger, f"/calib_ros/{name}") for name in ("calibrate", "reset", "save", "capture")
         }
+        # Before its node spins: rclpy shows an action client to the executor before it has made its lock.
+        self._calibrate = ActionClient(self.peer, Calibrate, "/calib_ros/calibrate")
         self._executors = [self._spin(self.node), self._spin(self.peer)]
         if self.calibration is not None:
             self.await_subscriptions()
@@ -246,7 +247,7 @@ class Peer:
 
     def goal(self) -> Goal:
         """A goal of ~/calibrate that the node has answered."""
-        return Goal(self.peer, self.until)
+        return Goal(self._calibrate, self.until)
 
     def get_extrinsic(self) -> GetExtrinsic.Response:
         return self.call(self._get, GetExtrinsic.Request())

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calib_ros_msgs.action import Calibrate
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.action import ActionClient
 from ros_peer import Goal
 from waiting import LIMIT_S, until
 
@@ -85,6 +87,7 @@ class Observer(ExtrinsicClient):
         super().__init__()
         self.values: dict[str, str] = {}
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
+        self._calibrate = ActionClient(self._node, Calibrate, "/calib_ros/calibrate")
 
     def _take(self, msg: DiagnosticArray) -> None:
         self.values = {v.key: v.value for v in msg.status[0].values}
@@ -98,7 +101,7 @@ class Observer(ExtrinsicClient):
 
     def goal(self) -> Goal:
         """A goal of ~/calibrate that the node has answered."""
-        return Goal(self._node, self.until)
+        return Goal(self._calibrate, self.until)
 
     def new_values(self) -> dict[str, str]:
         """Values that come after this call."""
