@@ -41,10 +41,7 @@ def axis_values(text: str) -> list[tuple[str, float]]:
 
 def milliseconds(text: str) -> float:
     """'-4' -> seconds."""
-    value = _finite(text, text) / 1000
-    if abs(value) > 0.5:
-        raise ArgumentTypeError(f"{text} is out of range [-500, 500]")
-    return value
+    return _finite(text, text) / 1000
 
 
 def time_offset(text: str) -> str | float:

@@ -15,7 +15,7 @@ from calib_ros import result
 from calib_ros.cli.arguments import AXES, Three
 from calib_ros.cli.output import note
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, preset, update
-from calib_ros.config.sensors import MAX_OFFSET_S
+from calib_ros.config.sensors import FARTHEST_OFFSET_S
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.open import is_bag
 from calib_ros.datasets.source import Source
@@ -74,10 +74,9 @@ class ConstraintOptions:
         if isinstance(self.time_offset, str):
             motion["time_offset"] = self.time_offset
         elif self.time_offset is not None:
-            if not -MAX_OFFSET_S <= self.time_offset <= MAX_OFFSET_S:
-                raise BadInputError(
-                    f"--time-offset {self.time_offset:g} is out of range [{-MAX_OFFSET_S:g}, {MAX_OFFSET_S:g}] s; give seconds"
-                )
+            if not abs(self.time_offset) <= FARTHEST_OFFSET_S:
+                within = f"[{-FARTHEST_OFFSET_S:g}, {FARTHEST_OFFSET_S:g}]"
+                raise BadInputError(f"--time-offset {self.time_offset:g} is out of range {within} s; give seconds")
             motion |= {"time_offset": "fixed", "time_offset_s": self.time_offset}
         return update(config, {"constraints": values, "motion": motion})
 

@@ -9,7 +9,8 @@ from calib_ros.errors import ConfigError
 
 ESTIMATE = "estimate"  # of motion.time_offset
 GIVEN, REFINE = "given", "refine"  # of camera.intrinsics
-MAX_OFFSET_S = 0.5  # of motion.time_offset_s
+MAX_OFFSET_S = 0.5  # to either side of motion.time_offset_s, in which offsets are searched
+FARTHEST_OFFSET_S = 60.0  # of motion.time_offset_s: messages wait no longer, and other epochs are found
 
 
 @dataclass(frozen=True)
@@ -161,8 +162,8 @@ class MotionConfig(Stage):
         0.0,
         "added to the time of every point relative to the image, s; positive = the points were measured later, or the "
         "image was exposed earlier, than the stamps say",
-        low=-MAX_OFFSET_S,
-        high=MAX_OFFSET_S,
+        low=-FARTHEST_OFFSET_S,
+        high=FARTHEST_OFFSET_S,
     )
     time_offset_sigma_s: float = option(
         0.003,

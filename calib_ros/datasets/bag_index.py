@@ -231,7 +231,8 @@ def difference_in_words(ahead: int, of_clocks: bool) -> str:
     found = f"clouds are stamped {size} {'after' if ahead > 0 else 'before'} images recorded at the same time"
     if not of_clocks:
         return (
-            f"{found}: messages waited that long, or clocks differ; paired by the stamps. Pair as recorded by --clock recording"
+            f"{found}: messages waited that long, or clocks differ; paired by the stamps. Pair as recorded by --clock recording, "
+            f"or set motion.time_offset_s to {-ahead / NANOSECONDS:.2f}"
         )
     exact = "" if scale else "; it is known as well as messages arrive, to some 0.1 s, see motion.max_time_offset_s"
     return f"{found}: {cause_of_difference(seconds)}; paired as recorded{exact}. --clock header pairs by the stamps as they are"

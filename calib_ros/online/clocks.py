@@ -8,7 +8,7 @@ import numpy as np
 
 from calib_ros.arrays import Covariance
 from calib_ros.config import Config, MotionConfig
-from calib_ros.config.sensors import MAX_OFFSET_S
+from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.joint import clocks_are_estimated
@@ -36,7 +36,7 @@ def with_clocks(config: Config, known: Result) -> Config:
         return config
     if known.stamping is not None:
         motion = at_stamping(motion, known.stamping)
-    offset = float(np.clip(known.time_offset_s, -MAX_OFFSET_S, MAX_OFFSET_S))
+    offset = float(np.clip(known.time_offset_s, -FARTHEST_OFFSET_S, FARTHEST_OFFSET_S))
     sigma = motion.time_offset_sigma_s if known.time_offset_sigma_s is None else min(known.time_offset_sigma_s, MAX_OFFSET_S)
     return replace(config, motion=replace(motion, time_offset_s=offset, time_offset_sigma_s=sigma))
 

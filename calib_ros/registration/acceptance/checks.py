@@ -14,7 +14,7 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config
-from calib_ros.config.sensors import MAX_OFFSET_S
+from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
 from calib_ros.registration.acceptance.refusal import (
     Refusal,
     objectives_disagree,
@@ -122,7 +122,8 @@ class Acceptance:
         offset, motion = optimised.offset, self.config.motion
         if offset is None:
             return None
-        too_far = abs(motion.time_offset_s + optimised.seconds) > MAX_OFFSET_S
+        farthest = abs(motion.time_offset_s + optimised.seconds)
+        too_far = abs(optimised.seconds) > MAX_OFFSET_S or farthest > FARTHEST_OFFSET_S
         # Nobody is told of an offset that is not observable: the extrinsic would be that of other clocks.
         unobservable = optimised.seconds != 0 and not offset.observable(motion)
         if too_far or unobservable or offset.suspected(motion):

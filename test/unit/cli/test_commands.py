@@ -175,7 +175,7 @@ def test_not_converged_is_exit_code_1(bag: Path, quick: list[str], tmp_path: Pat
         (["calibrate", "{bag}", "--search-deg", "5,5"], "holds 2 numbers"),
         (["calibrate", "{bag}", "--fix", "rx,ry,rz,tx,ty,tz"], "nothing is left to estimate"),
         (["calibrate", "{bag}", "--bound", "rx=181"], "--bound rx=181 is out of range"),
-        (["replay", "{bag}", "--time-offset-ms", "-900"], "-900 is out of range [-500, 500]"),
+        (["replay", "{bag}", "--time-offset-ms", "-90000"], "-90 is out of range [-60, 60]"),
         (["calibrate", "{bag}", "--time-offset", "guess"], "'guess' is no number; give estimate, fixed or seconds"),
         (["replay", "{bag}", "--rotation-only", "--bound", "tx=1"], "--bound tx=1 contradicts --rotation-only"),
         (["calibrate", "{bag}", "--objective", "magic"], "--objective"),

@@ -259,6 +259,19 @@ def test_clocks_that_differ_are_told_from_messages_that_come_late(tmp_path, ahea
         BagSource(tmp_path / "bag", clock="sensor")
 
 
+def test_a_camera_that_lags_by_seconds_is_paired_by_a_time_offset_that_is_given(tmp_path):
+    """Pictures that are stamped 2.5 s after their exposure, when they are sent: nothing but the scenes shows it."""
+    with Recorder(tmp_path / "bag") as record:
+        for i in range(60):
+            at = START + i * 100 * MS
+            record.image(at, value=i, time=at + 20 * MS)
+            record.info(at)
+            record.cloud(at + 2500 * MS, value=i, time=at + 2520 * MS)
+    assert int(BagSource(tmp_path / "bag")[0].cloud.xyz[0, 0]) == 0
+    bag = BagSource(tmp_path / "bag", motion=MotionConfig(time_offset_s=-2.5))
+    assert [int(bag[i].cloud.xyz[0, 0]) - int(bag[i].image[0, 0]) for i in (0, 20, 34, -1)] == [0, 0, 0, 0]
+
+
 def test_recorders_that_do_not_keep_to_real_time_move_no_clock(tmp_path):
     """Messages that were written again later, one topic after the other or at another rate, with their stamps as they were."""
     for name, image_at, cloud_at in (

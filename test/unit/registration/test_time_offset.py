@@ -82,9 +82,9 @@ def test_clocks_that_agree_stay_as_they_are(scene):
 
 
 def test_the_offset_counts_from_the_configured_one_and_must_be_one_that_an_option_can_hold(scene):
-    result = estimated(scene, DIFFERENT, 0.06, motion={"time_offset_s": 0.2})
-    assert result.time_offset_s == pytest.approx(0.26, abs=0.003)
-    assert estimated(scene, DIFFERENT, 0.06, motion={"time_offset_s": 0.48}).refusal is RefusalCode.WRONG_TIMES
+    result = estimated(scene, DIFFERENT, 0.06, motion={"time_offset_s": 2.0})
+    assert result.time_offset_s == pytest.approx(2.06, abs=0.003)
+    assert estimated(scene, DIFFERENT, 0.06, motion={"time_offset_s": 59.98}).refusal is RefusalCode.WRONG_TIMES
 
 
 @pytest.mark.parametrize("twists", [ALIKE, [np.zeros(6)] * 4], ids=["constant motion", "standing still"])
