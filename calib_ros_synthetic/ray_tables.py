@@ -124,3 +124,26 @@ def vls128() -> Table:
     ]  # fmt: skip
     azimuth = np.tile([-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354], 16)
     return np.array(elevation), azimuth, 2.665 * (np.arange(128.0) // 8)
+
+
+def rs_m1() -> Table:
+    """A micromirror sweeps five lasers, 24 deg apart, to and fro over fields of 25 by 25 deg: lines that bend, no two alike."""
+    lines, along = 126, 125
+    line, k = np.divmod(np.arange(lines * along), along)
+    fast = np.where(line % 2 == 0, 1, -1) * (2 * (k + 0.5) / along - 1)  # of half a field
+    slow = 1 - 2 * (line + (k + 0.5) / along) / lines
+    channel = np.arange(5.0)[None] - 2
+    roll = np.deg2rad(0.8 * channel)
+    a, e = 12.5 * fast[:, None], 12.5 * slow[:, None] + 0.7 * np.square(fast[:, None]) * channel / 2
+    azimuth, elevation = a * np.cos(roll) - e * np.sin(roll) - 24 * channel, a * np.sin(roll) + e * np.cos(roll)
+    delay = np.broadcast_to(np.linspace(0, 1e5, lines * along)[:, None], (*a.shape[:1], 5))
+    return elevation.ravel(), azimuth.ravel(), delay.ravel()
+
+
+def ft120() -> Table:
+    """A flash: 160 by 120 pixels behind a lens, 100 by 75 deg; lines bend as in wide pictures. A row after the other."""
+    y, z = np.meshgrid(np.linspace(50, -50, 160), np.linspace(37.5, -37.5, 120))
+    r = np.deg2rad(np.hypot(y, z))  # equidistant
+    x, side = np.cos(r), np.sin(r) / np.maximum(np.hypot(y, z), 1e-9)
+    azimuth, elevation = np.arctan2(y * side, x), np.arcsin(z * side)
+    return np.rad2deg(elevation).ravel(), np.rad2deg(azimuth).ravel(), np.linspace(0, 1000.0, 160 * 120)

@@ -217,4 +217,12 @@ RIGS: dict[str, Rig] = {
         "128 rings in eight columns, 0.11 deg apart around the horizon, 245 m far, and an 80 deg camera",
         "vls128", Mount(0.0, 0.0, 2.0), VGA, Mount(0.3, -0.2, 1.72, pitch=2.0), vehicle="car",
     ),
+    "rs_m1_grille": Rig(
+        "A solid-state scanner in the grille, five fields of lines that bend, and a 60 deg camera behind the windshield",
+        "rs_m1", Mount(2.1, 0.0, 0.65), WINDSHIELD, Mount(0.55, 0.05, 1.38, pitch=1.0),
+    ),
+    "ft120_side": Rig(
+        "A flash scanner for the blind spot, 160 by 120 points at once, below a 90 deg camera",
+        "ft120", Mount(0.6, 0.0, 0.95), Lens(90.0, 800, 600, D=(-0.30, 0.10, 5e-4, -4e-4, -0.016)), Mount(0.62, 0.04, 1.1),
+    ),
 }  # fmt: skip

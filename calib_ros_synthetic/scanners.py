@@ -41,8 +41,8 @@ class Order(Enum):
 class ScannerModel:
     """A scanner's data sheet.
 
-    table: of its lasers. firings: per turn at RATE. noise: of the range, m (1 sigma). near, far: m. reach: m, at which a surface
-    of 10 % reflectivity is just seen.
+    table: of its lasers, or of all rays of a scan if firings is 1. firings: per turn at RATE. noise: of the range, m (1 sigma).
+    near, far: m. reach: m, at which a surface of 10 % reflectivity is just seen.
     """
 
     name: str
@@ -72,6 +72,8 @@ MODELS = {
     "os1_64": ScannerModel("Ouster OS1-64", tables.os1_64, 1024, 0.015, 0.8, 120.0, 40.0, Rings.FROM_TOP, Order.ROWS),
     "os1_128": ScannerModel("Ouster OS1-128", tables.os1_128, 1024, 0.010, 0.3, 120.0, 45.0, Rings.FROM_TOP, Order.ROWS),
     "mid360": ScannerModel("Livox Mid-360", None, 20_000, 0.020, 0.1, 100.0, 40.0, Rings.NONE, Order.FIRING),
+    "rs_m1": ScannerModel("RoboSense M1", tables.rs_m1, 1, 0.020, 0.5, 200.0, 150.0, Rings.NONE, Order.FIRING),
+    "ft120": ScannerModel("Hesai FT120", tables.ft120, 1, 0.020, 0.1, 100.0, 22.0, Rings.NONE, Order.FIRING),
 }  # fmt: skip
 
 
@@ -185,6 +187,24 @@ class RosetteScanner(SpinningScanner):
         return f"{self.model.name}, no rings, {self.firings} points per scan of {1 / self.rate:g} s, all around"
 
 
+@dataclass(frozen=True, eq=False)
+class GridScanner(RosetteScanner):
+    """A scanner that looks ahead along the same bent lines in every scan."""
+
+    def beams(self) -> tuple[Float32, Floats]:
+        """As of a rosette: (3, 1, points) by azimuth, and (1, points) s."""
+        assert self.model.table is not None
+        elevation, azimuth, delay = self.model.table()
+        order = np.argsort(azimuth, kind="stable")
+        a, e = np.deg2rad(azimuth[order]), np.deg2rad(elevation[order])
+        c, time = np.cos(e), (delay[order] - delay.mean()) * MICROSECOND
+        return np.stack([c * np.cos(a), c * np.sin(a), np.sin(e)])[:, None].astype(np.float32), time[None]
+
+    def describe(self) -> str:
+        """For people."""
+        return f"{self.model.name}, no rings, a grid of {len(self.beams()[1][0])} points"
+
+
 # The plain drive's, by rings from the top, after the OS1-128, HDL-64E, HDL-32E and VLP-16; 0: without any, by two prisms.
 PLAIN: dict[int, ScannerModel] = {
     rings: ScannerModel("", table, firings, 0.02, 0.9, 100.0, 91.28709291752769, Rings.FROM_TOP, Order.ROWS)
@@ -264,7 +284,8 @@ def plain_scanner(rings: int) -> SpinningScanner:
 def scanner(name: str, rate: float = RATE) -> SpinningScanner:
     """The scanner of a name in MODELS, turning at `rate` Hz."""
     model = MODELS[name]
-    return (RosetteScanner if model.table is None else SpinningScanner)(model, rate)
+    kind = RosetteScanner if model.table is None else GridScanner if model.firings == 1 else SpinningScanner
+    return kind(model, rate)
 
 
 def in_frame(twist: Floats, T: Floats) -> Floats:

@@ -24,7 +24,7 @@ from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Solids
 from calib_ros_synthetic.wide import WideView
 
-SPINNING = [name for name, model in MODELS.items() if model.table is not None]
+SPINNING = [name for name, model in MODELS.items() if model.firings > 1 and model.table is not None]
 
 
 def agreement(drive: SyntheticDrive, T: np.ndarray) -> float:
@@ -53,6 +53,26 @@ def test_a_scanner_follows_its_data_sheet(name: str) -> None:
     # What is left of the azimuth after the head's turn is the column the laser stands in.
     left = np.rad2deg(np.mod(azimuth[:, 0] + 2 * np.pi * 10 * time[:, 0] + np.pi, 2 * np.pi) - np.pi)
     np.testing.assert_allclose(left, offset[np.argsort(-elevation, kind="stable")], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "channels", "points", "field_deg", "step_deg"),
+    [("rs_m1", 5, 78_750, (120.0, 25.0), 0.2), ("ft120", 1, 19_200, (100.0, 75.0), 0.63)],
+)
+def test_a_solid_state_scanner_looks_ahead_along_lines(name, channels, points, field_deg, step_deg) -> None:
+    beams, time = scanner(name).beams()
+    order = scanner(name).order(time)
+    x, y, z = beams[:, 0, order].astype(float)
+    assert len(x) == points
+    assert x.min() > 0
+    level, middle = np.abs(z) < 0.02, np.abs(y) < 0.02  # along the axes: pictures of a lens are no boxes
+    assert np.ptp(np.rad2deg(np.arctan2(y, x)[level])) == pytest.approx(field_deg[0], rel=0.06)
+    assert np.ptp(np.rad2deg(np.arcsin(z[middle]))) == pytest.approx(field_deg[1], rel=0.06)
+    channel = np.stack([x, y, z], axis=1).reshape(-1, channels, 3)
+    step = np.rad2deg(np.arccos((channel[1:] * channel[:-1]).sum(axis=2).clip(-1, 1)))
+    assert np.median(step) == pytest.approx(step_deg, rel=0.1)
+    assert time.max() - time.min() <= 0.1
+    assert (np.diff(time[0, order]) >= 0).all()
 
 
 @pytest.mark.parametrize("name", ["vlp16_narrow", "os1_64_robot"])
