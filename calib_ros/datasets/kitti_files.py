@@ -37,11 +37,11 @@ TRIGGER_TO_IMAGE_NS = 4_000_000
 MAX_IMAGE_DELAY_NS = 50_000_000  # images stamped later were not triggered by this scan
 
 
-def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+def numbered_files(folder: Path, suffixes: tuple[str, ...], digits: int = DIGITS) -> dict[int, Path]:
     """Files named by frame number: number -> path, ascending. Empty without the folder."""
     if not folder.is_dir():
         return {}
-    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal() and len(p.stem) <= DIGITS]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal() and len(p.stem) <= digits]
     return {int(p.stem): p for p in sorted(files, key=lambda p: int(p.stem))}
 
 

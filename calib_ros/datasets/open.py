@@ -9,6 +9,7 @@ from typing import Any
 from calib_ros.datasets.folder import EXPECTED_FOLDER, FolderSource, is_folder_dataset
 from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
 from calib_ros.datasets.nuscenes import EXPECTED_NUSCENES, NuScenesSource, split_scene, tables_folder
+from calib_ros.datasets.once import EXPECTED_ONCE, OnceSource, is_once
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.extensions import SOURCES, source_of
@@ -20,7 +21,7 @@ __all__ = ["Source", "open_dataset", "open_source"]
 
 
 def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **options: Any) -> Source:
-    """Open a bag, KITTI, nuScenes or a plain folder, distinguished by content, or by its name what another package brings.
+    """Open a bag, KITTI, nuScenes, ONCE or a plain folder, distinguished by content, or by its name what another package brings.
 
     Parameters
     ----------
@@ -29,7 +30,7 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         `NuScenesSource`). Or ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as
         ``"synthetic[:name=value,...]"``, the simulated drive.
     camera : of a KITTI folder, 0 to 3 (default 2; of KITTI-360 0 or 1), of nuScenes, its channel or number (default CAM_FRONT),
-        or of a plain folder, a name or number in its calibration (default the first).
+        of ONCE or a plain folder, a name or number in its calibration (default the first).
     **options : of a bag, see `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion,
         T_camera_lidar, windows; None = default.
 
@@ -61,6 +62,14 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     if is_folder_dataset(path):
         _refuse(options, text)
         return FolderSource(path, camera)
+    if is_once(path):
+        _refuse(options, text)
+        return OnceSource(path, camera)
+    if any(path.glob("lidar/*.pkl*")):
+        raise BadInputError(
+            f"{text}: PandaSet's scans are pickles, which run code where they are read; write x, y, z, i of pandas.read_pickle, "
+            f"in the LiDAR's frame by the inverse of lidar/poses.json, to .npz files of {EXPECTED_FOLDER}"
+        )
     folder = find_drive(path) if path.is_dir() else None
     if folder is not None:
         _refuse(options, text)
@@ -73,7 +82,7 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "nothing"
     raise BadInputError(
         f"{text} is not a dataset; looked for metadata.yaml, *.mcap, *.db3 or *.bag (bag), {EXPECTED_FOLDERS}, "
-        f"{EXPECTED_NUSCENES}, {EXPECTED_FOLDER}; found {found}"
+        f"{EXPECTED_NUSCENES}, {EXPECTED_ONCE}, {EXPECTED_FOLDER}; found {found}"
     )
 
 
@@ -92,8 +101,8 @@ def is_bag(path: Path) -> bool:
 
 
 def is_single(path: Path) -> bool:
-    """Whether a path is one source: a bag, nuScenes or a plain folder. KITTI drives are found from above, see `drives_in`."""
-    return is_bag(path) or is_folder_dataset(path) or is_nuscenes(path)
+    """Whether a path is one source. KITTI drives are found from above, see `drives_in`."""
+    return is_bag(path) or is_folder_dataset(path) or is_nuscenes(path) or is_once(path)
 
 
 def is_nuscenes(path: Path) -> bool:

@@ -31,6 +31,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         "datasets/test_kitti.py::test_drives_of_kitti_360",
         "datasets/test_kitti.py::test_object_frames_have_their_own_calibration",
     ),
+    "ONCE": ("datasets/test_once.py::test_frames_have_a_picture_and_a_scan_of_the_same_time",),
     "nuScenes": ("datasets/test_nuscenes.py::test_key_frames_of_the_first_scene",),
     "Image": (
         "messages/test_messages.py::test_colour_encodings_give_bgr",
