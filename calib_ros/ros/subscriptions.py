@@ -19,6 +19,9 @@ from std_msgs.msg import Header
 
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.messages import decode_camera_info, stamp_ns
+from calib_ros.messages.compressed_points import COMPRESSED_POINTS
+from calib_ros.messages.point_fields import LIVOX
+from calib_ros.messages.video import VIDEO
 from calib_ros.online.pairing.health import MISSING_SHARE
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros.dds import profile_for_sender
@@ -31,6 +34,14 @@ HANDOVER_S = 1.0  # the old subscription stays so long: the new one has to be di
 LOSS_CHECKS = 11  # checks, at one a second, over which lost messages count: 10 s
 MIN_LOSSES = 5  # messages in that time; fewer are those of the discovery
 MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
+# What to do about topics of other types, by what is wanted.
+IMAGE_ADVICE = {
+    "sensor_msgs/msg/CompressedImage": "set image_transport: compressed",
+    "sensor_msgs/msg/Image": "set image_transport: raw",
+} | dict.fromkeys(VIDEO, "republish it as raw images (image_transport republish)")
+POINTS_ADVICE = {
+    COMPRESSED_POINTS: "republish it (point_cloud_transport republish)",
+} | dict.fromkeys(LIVOX, "set xfer_format to 0 in the driver's launch file")
 
 
 def type_name(kind: type[Any]) -> str:
@@ -230,12 +241,8 @@ class AdaptiveSubscription:
     def _problem(self, types: list[str], publishers: list[QoSProfile]) -> str:
         others = sorted(set(types) - {type_name(self.kind)})
         if others:
-            advice = {
-                "sensor_msgs/msg/CompressedImage": "set image_transport: compressed",
-                "sensor_msgs/msg/Image": "set image_transport: raw",
-            }
-            what = advice.get(others[0], "check the remapping") if "Image" in self.kind.__name__ else "check the remapping"
-            return f"{self.topic} is published as {', '.join(others)}, but {type_name(self.kind)} is wanted; {what}"
+            text = f"{', '.join(others)}, but {type_name(self.kind)} is wanted"
+            return f"{self.topic} is published as {text}; {advice(others[0], self.kind)}"
         if self.reliable and any(p.reliability == BEST_EFFORT for p in publishers):
             return f"a publisher of {self.topic} offers best effort only and cannot be received; set reliability: auto"
         return ""
@@ -263,6 +270,12 @@ class AdaptiveSubscription:
             self._received += 1
             self.largest = max(self.largest, len(getattr(msg, "data", ())))
             self._callback(stamp, msg)
+
+
+def advice(published: str, wanted: type[Any]) -> str:
+    """What to do where a topic is published as another type than is wanted."""
+    known = {Image: IMAGE_ADVICE, CompressedImage: IMAGE_ADVICE, PointCloud2: POINTS_ADVICE}.get(wanted, {})
+    return known.get(published, "check the remapping")
 
 
 def _advice(subscription: AdaptiveSubscription) -> str:

@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from vehicle import Vehicle
 from waiting import until
 
-from calib_ros.ros.subscriptions import AdaptiveSubscription
+from calib_ros.ros.subscriptions import AdaptiveSubscription, advice
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -163,6 +163,20 @@ def test_a_topic_of_another_type_is_named(across_processes, topic, wanted, publi
         topic.until(lambda: subscription.check())
         assert subscription.check() == f"/info is published as sensor_msgs/msg/{text}"
     assert not subscription.reliable  # a publisher of another type is not followed
+
+
+@pytest.mark.parametrize(
+    ("wanted", "published", "text"),
+    [
+        (PointCloud2, "livox_ros_driver2/msg/CustomMsg", "xfer_format to 0"),
+        (PointCloud2, "point_cloud_interfaces/msg/CompressedPointCloud2", "point_cloud_transport republish"),
+        (Image, "foxglove_msgs/msg/CompressedVideo", "image_transport republish"),
+        (CompressedImage, "ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "image_transport republish"),
+        (CameraInfo, "sensor_msgs/msg/Image", "check the remapping"),
+    ],
+)
+def test_what_drivers_publish_else_has_its_own_advice(wanted, published, text):
+    assert text in advice(published, wanted)
 
 
 def test_latched_messages_are_received(topic):
