@@ -17,7 +17,7 @@ from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError
 
 N = TypeVar("N", float, Matrix)
-MAX_TRANSLATION_M = 100.0  # per axis, between sensors of one vehicle: what is further is in millimetres, or of a map
+MAX_TRANSLATION_M = 30.0  # per axis, longer than vehicles: what is further is in millimetres, or of a map
 # Optical axes (x right, y down, z forward) in terms of a body's (x forward, y left, z up), as in REP 103.
 OPTICAL_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
@@ -184,7 +184,9 @@ def as_transform(value: ArrayLike, what: str = "transform") -> Matrix:
         raise BadInputError(f"{what} is not a rigid transform: its 3x3 part must be a rotation and its last row 0 0 0 1")
     if np.abs(T[:3, 3]).max() > MAX_TRANSLATION_M:
         length = np.abs(T[:3, 3]).max()
-        raise BadInputError(f"{what} has a translation of {length:.4g}; give metres, at most {MAX_TRANSLATION_M:g} per axis")
+        raise BadInputError(
+            f"{what} has a translation of {length:.4g}, as if in millimetres; give metres, at most {MAX_TRANSLATION_M:g} per axis"
+        )
     u, _, vt = np.linalg.svd(R)
     T[:3, :3] = u @ vt
     return T

@@ -188,11 +188,11 @@ def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> No
     ("text", "words"),
     [
         ("set,frame\npos,0\n", "no column x_m"),
-        (",".join(COLUMNS) + "\npos,0,0,0,zero,0,0,0\n", "line 2: z_m is zero; give a number of at most 100"),
+        (",".join(COLUMNS) + "\npos,0,0,0,zero,0,0,0\n", "line 2: z_m is zero; give a number of at most 30"),
         (",".join(COLUMNS) + "\npos,0,0,0\n", "line 2: 4 values in 8 columns; the line is cut off"),
         (",".join(COLUMNS) + "\npos,0,0,,0,0,0,0\n", "line 2: y_m is missing; give a number"),
         (",".join(COLUMNS) + "\npos,0,0,0,0,0,0,nan\n", "line 2: rz_deg is nan; give a number of at most 360"),
-        (",".join(COLUMNS) + "\npos,0,1e300,0,0,0,0,0\n", "line 2: x_m is 1e300; give a number of at most 100"),
+        (",".join(COLUMNS) + "\npos,0,1e300,0,0,0,0,0\n", "line 2: x_m is 1e300; give a number of at most 30"),
         (",".join(COLUMNS) + "\n", "has no rows; give the table"),
     ],
 )

@@ -146,6 +146,8 @@ def test_invalid_transforms_and_quaternions_are_refused():
     for value in REFUSED.values():
         with pytest.raises(BadInputError, match="the thing"):
             se3.as_transform(value, "the thing")
+    with pytest.raises(BadInputError, match="translation of 45, as if in millimetres; give metres"):
+        se3.as_transform(se3.from_parts(np.eye(3), [0, -45, 12]))
 
 
 @pytest.mark.parametrize(("yaw", "seen"), [(0, [1, 0, 0]), (90, [0, 1, 0]), (180, [-1, 0, 0]), (-30, [np.sqrt(0.75), -0.5, 0])])
