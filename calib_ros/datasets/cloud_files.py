@@ -10,8 +10,9 @@ import struct
 import warnings
 from collections.abc import Callable
 from io import BufferedReader, BytesIO
+from itertools import islice, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ Columns = dict[str, NDArray[Any]]
 NEEDS_PCD = "PCD files are read with pypcd4, which is missing: python3 -m pip install pypcd4"
 NEEDS_PLY = "PLY files are read with trimesh, which is missing: python3 -m pip install trimesh"
 NEEDS_LAS = "LAS and LAZ files are read with laspy, which is missing: python3 -m pip install 'laspy[lazrs]'"
+PCD_HEADER, MOST_PACKED = 10, 256  # lines at most; bytes that LZF makes of one at most
 UNNAMED = "#$%&~~"  # what pypcd4 calls PCD's padding fields, "_"
 PCD_DATA = re.compile(rb"^DATA[ \t]+(\w+)[^\n]*\n", re.MULTILINE)
 PCD_LINES = [re.compile(rb"^%s[ \t]+([^\n]*)" % name, re.MULTILINE) for name in (b"FIELDS", b"SIZE", b"TYPE", b"COUNT")]
@@ -43,7 +45,8 @@ FOREIGN = {
     ".fls": "Faro's; export it as PLY",
     ".drc": "Draco's; decode it as PLY: draco_decoder -i FILE.drc",
 }
-LAS_HEADER = 247  # bytes up to the number of extended records, since version 1.4
+LAS_HEADER = 255  # bytes up to the number of points, since version 1.4
+LAZ, LAZ_RATIO = 0x80, 500  # bit of the format of points that are compressed, of scans to a tenth, and to no less than this part
 CLOUD_COMPARE = "scalar_"  # before the names of fields in PLY files that CloudCompare writes
 
 
@@ -75,10 +78,17 @@ def read_cloud(path: Path, stamp: int = 0) -> PointCloud:
 def _read_pcd(path: Path) -> Columns:
     """PCD 0.7, ascii, binary or binary_compressed: columns by field; of an array field the first element."""
     try:
+        from pypcd4 import MetaData
         from pypcd4 import PointCloud as PcdFile
     except ImportError:
         raise MissingDependencyError(NEEDS_PCD) from None
-    file = PcdFile.from_fileobj(BufferedReader(BytesIO(_tidy_pcd(path.read_bytes()))))
+    whole = _tidy_pcd(path.read_bytes())
+    lines = (line.decode().strip() for line in BytesIO(whole))
+    header = takewhile(lambda line: not line.startswith("DATA"), (line for line in lines if line and not line.startswith("#")))
+    declared = MetaData.parse_header([*islice(header, PCD_HEADER), "DATA ascii"])
+    if sum(declared.count) > len(whole) or declared.points > MOST_PACKED * len(whole):  # pypcd4 makes room for all of it
+        raise BadInputError(f"cloud {path} declares more than its {len(whole)} bytes can hold; copy it again")
+    file = PcdFile.from_fileobj(BufferedReader(BytesIO(whole)))
     data = np.atleast_1d(file.pc_data)
     _require_all(path, len(data), file.points)
     names = [name for name in data.dtype.names or () if not name.startswith(UNNAMED)]
@@ -125,13 +135,37 @@ def _read_las(path: Path) -> Columns:
 
 
 def _check_las(path: Path) -> None:
-    """BadInputError for a header of more records than the file can hold, which laspy would read one by one."""
+    """BadInputError for a header of more records, points or chunks than the file can hold: laspy reads records one by one, and
+    lazrs ends the process where memory does not suffice."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(LAS_HEADER).ljust(LAS_HEADER, b"\0")
-    (records,), (extended,) = struct.unpack_from("<I", head, 100), struct.unpack_from("<I", head, 243)
-    if records * 54 > size or (head[25] >= 4 and extended * 60 > size):
-        raise BadInputError(f"cloud {path} is damaged: its header speaks of {records} records; copy it again")
+        chunks = _laz_chunks(file, struct.unpack_from("<I", head, 96)[0], size) if head[104] & LAZ else 0
+    records, length, points = (struct.unpack_from(kind, head, at)[0] for kind, at in (("<I", 100), ("<H", 105), ("<I", 107)))
+    extended = 0
+    if head[25] >= 4:
+        extended, points = struct.unpack_from("<IQ", head, 243)
+    held = LAZ_RATIO * size if head[104] & LAZ else size
+    for what, count, most in (
+        ("records", records, size // 54),
+        ("extended records", extended, size // 60),
+        ("points", points, held // max(length, 20)),
+        ("chunks", chunks, size),
+    ):
+        if count > most:
+            raise BadInputError(f"cloud {path} is damaged or truncated: its header speaks of {count} {what}; copy it again")
+
+
+def _laz_chunks(file: BinaryIO, begin: int, size: int) -> int:
+    """Number of chunks of a LAZ file, by its table, whose place is where the points begin, or at the end."""
+    at = size
+    for place in (begin, size - 8):
+        file.seek(max(place, 0))
+        (at,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
+        if at != -1:
+            break
+    file.seek(min(max(at, 0), size))
+    return int(struct.unpack("<II", file.read(8).ljust(8, b"\0"))[1])
 
 
 def _read_text(path: Path) -> Columns:

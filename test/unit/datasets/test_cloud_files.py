@@ -230,6 +230,34 @@ def test_padding_in_pcd_and_prefixes_in_ply(tmp_path, padded):
             assert np.array_equal(values, expected)
 
 
+@pytest.mark.parametrize(("line", "more"), [("COUNT 1", "COUNT 4294967295"), ("POINTS 50", "POINTS 4294967295")])
+def test_a_pcd_that_declares_more_than_it_holds_costs_nothing(tmp_path, line, more):
+    written(tmp_path / "a.compressed.pcd", cloud(3))
+    data = (tmp_path / "a.compressed.pcd").read_bytes()
+    (tmp_path / "a.compressed.pcd").write_bytes(data.replace(line.encode(), more.encode(), 1))
+    with pytest.raises(BadInputError, match="declares more than its"):
+        read_cloud(tmp_path / "a.compressed.pcd")
+
+
+@pytest.mark.parametrize("at", [100, 107, 243, 247, "chunks"])
+def test_a_laz_that_declares_more_than_it_holds_costs_nothing(tmp_path, at):
+    """Reading on, lazrs would end the process."""
+    pytest.importorskip("laspy")
+    path = tmp_path / "a.laz"
+    written(path, cloud(3))
+    data = bytearray(path.read_bytes())
+    if at == "chunks":
+        (begin,) = struct.unpack_from("<I", data, 96)
+        at = struct.unpack_from("<q", data, begin)[0] + 4
+    data[at : at + 4] = b"\xff\xff\xff\x5f"
+    path.write_bytes(data)
+    if at == 107:  # of files before version 1.4
+        assert len(read_cloud(path)) == 50
+        return
+    with pytest.raises(BadInputError, match="its header speaks of"):
+        read_cloud(path)
+
+
 def test_truncation_is_noticed_also_between_points(tmp_path):
     for name in ("a.compressed.pcd", "a.binary.ply", "a.columns.npz"):
         written(tmp_path / name, cloud(3))
