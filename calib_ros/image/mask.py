@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,13 +38,26 @@ def used_pixels(config: ImageConfig, width: int, height: int) -> Mask | None:
     return used
 
 
-def _read(path: Path, width: int, height: int) -> Mask:
+def check_mask(config: ImageConfig, size: tuple[int, int] | None) -> None:
+    """BadInputError as of `used_pixels` for images of a size, width x height px; None = not known yet."""
+    if size is not None:
+        used_pixels(config, *size)
+    elif config.mask:
+        _picture(Path(config.mask))
+
+
+def _picture(path: Path) -> NDArray[Any]:
     try:
         picture = decode_picture(np.frombuffer(path.read_bytes(), np.uint8))
     except OSError as error:
         raise BadInputError(f"cannot read image.mask {path}: {error.strerror}") from None
     if picture is None:
         raise BadInputError(f"image.mask {path} is no complete PNG, JPEG or BMP picture")
+    return picture
+
+
+def _read(path: Path, width: int, height: int) -> Mask:
+    picture = _picture(path)
     if picture.shape[:2] != (height, width):
         raise BadInputError(
             f"image.mask {path} is {picture.shape[1]}x{picture.shape[0]}, the camera's image is {width}x{height}; "

@@ -18,7 +18,7 @@ class CalibLifecycleNode(LifecycleNode):
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("calib_ros", **kwargs)
+        super().__init__("calib_ros", allow_undeclared_parameters=True, **kwargs)
         self.calibration: RosInterface | None = None
         self._ended = True  # all threads of calibrations that are gone
         self.get_logger().info("waiting to be configured and activated")

@@ -185,7 +185,9 @@ class RosInterface:
 
     def _on_parameters(self, changed: list[Any]) -> SetParametersResult:
         """Constants of the stages take effect at once; what costs more to change waits for the next _every_second()."""
-        answer, new = parameters.on_change(self.parameters, changed)
+        camera = self.pipeline.camera
+        size = None if camera is None else (camera.width, camera.height)
+        answer, new = parameters.on_change(self.parameters, changed, size)
         if answer.successful and new["publish_tf"] and self.tf.missing:
             return SetParametersResult(successful=False, reason=self.tf.missing)
         self.parameters = new
@@ -224,7 +226,7 @@ class CalibNode(Node):
     """The node that is active from its start to its end."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("calib_ros", **kwargs)
+        super().__init__("calib_ros", allow_undeclared_parameters=True, **kwargs)  # which are refused, with the nearest name
         self.calibration = RosInterface(self)
         self.calibration.activate()
 

@@ -22,6 +22,7 @@ from calib_ros.config.options import checked, option
 from calib_ros.config.removed import REMOVED, notices
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.extensions import PRESETS, names
+from calib_ros.image.mask import check_mask
 from calib_ros.result import INITIAL, InitialSource, Result
 
 # Prefixes of the parameters that every ROS node has.
@@ -181,6 +182,7 @@ def declare(node: Node) -> Parameters:
     }
     parameters = Parameters(settings, update(Config(), values))
     parameters.check()  # a bad one is refused now, not with the first image
+    check_mask(parameters.config.image, None)
     return parameters
 
 
@@ -213,11 +215,16 @@ def replaced(name: str, config: Config, given: Iterable[str]) -> list[str]:
     return [f"the preset {name} is changed by the parameters given: {', '.join(other)}"] if name and other else []
 
 
-def on_change(parameters: Parameters, changed: list[Parameter]) -> tuple[SetParametersResult, Parameters]:
-    """Check a run-time change as a whole -> the answer to the caller, and all parameters from now on."""
+def on_change(
+    parameters: Parameters, changed: list[Parameter], image_size: tuple[int, int] | None
+) -> tuple[SetParametersResult, Parameters]:
+    """Check a run-time change as a whole -> the answer to the caller, and all parameters from now on. image_size: of the camera,
+    px, where it is known."""
     new: dict[str, dict[str, Any]] = {}
     known, settings = stages(), dict(parameters.settings)
     try:
+        for line in misspelt({p.name: p.value for p in changed}, parameters.to_dict()):
+            raise ConfigError(line.replace("its value is used", "set that"))
         for p in changed:
             stage, dot, name = p.name.partition(".")
             if dot and stage in known:
@@ -226,6 +233,8 @@ def on_change(parameters: Parameters, changed: list[Parameter]) -> tuple[SetPara
                 settings[p.name] = checked(p.name, _plain(p.value), SETTINGS[p.name])
         config = update(parameters.config, new) if new else parameters.config
         Parameters(settings, config).check()
+        if config.image != parameters.config.image:
+            check_mask(config.image, image_size)
     except CalibrationError as error:
         return SetParametersResult(successful=False, reason=str(error)), parameters
     return SetParametersResult(successful=True), Parameters(settings, config)

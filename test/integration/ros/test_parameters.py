@@ -6,6 +6,7 @@ import dataclasses
 import json
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParameters
@@ -133,7 +134,7 @@ BAD_VALUES: list[tuple[str, Any, str]] = [
     ("online.min_keyframes", 150, "online.min_keyframes"),
     ("camera_frame", "other", "camera_frame"),
     ("tf_parent", "map", "tf_child must name its child"),
-    ("search.nothing", 1, "undeclared"),
+    ("serch.starts", 1, "did you mean 'search.starts'?"),
 ]
 
 
@@ -180,6 +181,29 @@ def test_rapid_changes_while_data_flow(vehicle, monkeypatch):
         assert np.all(np.array(held(name)) == np.array(peer.node.get_parameter(name).value))
     peer.until(lambda: peer.peer.count_publishers("/tf_static") == 0, "the end of TF")
     vehicle.assert_recovers()
+    vehicle.assert_kept()
+
+
+def test_a_mask_that_cannot_be_used_is_refused_at_run_time_and_nothing_is_lost(vehicle, tmp_path):
+    peer, frame = vehicle.peer, vehicle.frame()
+    client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
+    height, width = frame.image.shape[:2]
+    pictures = {
+        "no.png": (None, "No such file"),
+        "text.png": (b"text", "no complete PNG"),
+        "small.png": (np.full((9, 9), 255, np.uint8), f"is 9x9, the camera's image is {width}x{height}"),
+        "black.png": (np.zeros((height, width), np.uint8), "leave 0.0 % of the image"),
+    }
+    for name, (content, text) in pictures.items():
+        path = tmp_path / name
+        if content is not None:
+            path.write_bytes(content if isinstance(content, bytes) else cv2.imencode(".png", content)[1].tobytes())
+        wrong = Parameter("image.mask", value=str(path)).to_parameter_msg()
+        answer = peer.call(client, SetParameters.Request(parameters=[wrong])).results[0]
+        assert not answer.successful, name
+        assert text in answer.reason
+        assert "\n" not in answer.reason
+    assert peer.pipeline.config.image.mask == ""
     vehicle.assert_kept()
 
 

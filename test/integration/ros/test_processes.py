@@ -231,6 +231,7 @@ sys.exit({entry_point}() + 3)
         (["-p", "search.rotation_deg:=-5.0"], "search.rotation_deg"),
         (["--params-file", "{bad}"], "bad.yaml"),
         (["--params-file", "/nowhere.yaml"], "nowhere.yaml"),
+        (["-p", "image.mask:=/nowhere.png"], "cannot read image.mask /nowhere.png"),
     ],
 )
 def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path, arguments, text):
