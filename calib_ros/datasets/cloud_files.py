@@ -47,6 +47,7 @@ FOREIGN = {
 }
 LAS_HEADER = 255  # bytes up to the number of points, since version 1.4
 LAZ, LAZ_RATIO = 0x80, 500  # bit of the format of points that are compressed, of scans to a tenth, and to no less than this part
+PANIC = "PanicException"  # of lazrs, which is no Exception
 CLOUD_COMPARE = "scalar_"  # before the names of fields in PLY files that CloudCompare writes
 
 
@@ -128,6 +129,10 @@ def _read_las(path: Path) -> Columns:
         if "backend" in str(error).lower():
             raise MissingDependencyError(NEEDS_LAS) from None
         raise
+    except BaseException as error:
+        if type(error).__name__ != PANIC:
+            raise
+        raise BadInputError(f"cloud {path} is damaged ({error}); copy it again") from None
     _require_all(path, len(file.points), file.header.point_count)
     names = {"intensity": "intensity", "gps_time": "time"}
     columns = {name: np.asarray(file[own]) for own, name in names.items() if own in file.point_format.dimension_names}

@@ -258,6 +258,20 @@ def test_a_laz_that_declares_more_than_it_holds_costs_nothing(tmp_path, at):
         read_cloud(path)
 
 
+def test_a_laz_over_which_its_library_panics_is_refused(tmp_path):
+    pytest.importorskip("laspy")
+    path = tmp_path / "a.laz"
+    written(path, cloud(3))
+    data = bytearray(path.read_bytes())
+    at = data.index(b"laszip encoded") - 2 + 54
+    (items,) = struct.unpack_from("<H", data, at + 32)
+    for k in range(items):
+        struct.pack_into("<H", data, at + 34 + 6 * k + 2, 0)  # its size
+    path.write_bytes(data)
+    with pytest.raises(BadInputError, match="is damaged"):
+        read_cloud(path)
+
+
 def test_truncation_is_noticed_also_between_points(tmp_path):
     for name in ("a.compressed.pcd", "a.binary.ply", "a.columns.npz"):
         written(tmp_path / name, cloud(3))
