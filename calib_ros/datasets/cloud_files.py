@@ -124,7 +124,8 @@ def _read_las(path: Path) -> Columns:
         raise MissingDependencyError(NEEDS_LAS) from None
     _check_las(path)
     try:
-        file = laspy.read(path)
+        # Not its parallel one, which makes room for chunks of any size.
+        file = laspy.read(path, laz_backend=laspy.LazBackend.Lazrs)
     except laspy.errors.LaspyException as error:
         if "backend" in str(error).lower():
             raise MissingDependencyError(NEEDS_LAS) from None
