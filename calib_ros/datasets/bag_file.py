@@ -21,6 +21,7 @@ from calib_ros.frame import NANOSECONDS
 from calib_ros.messages.compressed_points import COMPRESSED_POINTS, REPUBLISH
 from calib_ros.messages.point_fields import LIVOX, decode_livox
 from calib_ros.messages.video import VIDEO
+from calib_ros.messages.wire import shown
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -34,6 +35,7 @@ REMEDIES = {
     "CompressedPointCloud2": REPUBLISH,  # of other packages
     "LaserScan": "a scan of one plane has no edges to calibrate by; record a 3-D LiDAR",
 }
+MOST_NAMED = 40  # topics that an error names
 DEPTH = "/compressedDepth"  # how image_transport names the topics of depth images
 YAML_MERGE, YAML_ALIAS, MAX_ALIASES = re.compile(rb"<<\s*:"), re.compile(rb"[\s\[{,:]\*\w"), 10  # no recorder writes either
 
@@ -235,20 +237,24 @@ def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: st
         for own in (name, name[1:]):  # topics of ROS 1 may have no slash
             if own in candidates:
                 return own
-        has = f"it has {', '.join(candidates)}" if candidates else "it has none"
+        has = f"it has {_named(candidates)}" if candidates else "it has none"
         raise BadInputError(f"bag {bag.path} has no {kind} messages on topic {name}; {has}; set {option} accordingly")
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
         raise BadInputError(
-            f"bag {bag.path} has {len(candidates)} topics of type {kind}: {', '.join(candidates)}; choose one with {option}"
+            f"bag {bag.path} has {len(candidates)} topics of type {kind}: {_named(candidates)}; choose one with {option}"
         )
-    others = ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics.values()) or "nothing at all"
+    others = _named([f"{topic.name} ({topic.type})" for topic in bag.topics.values()]) or "nothing at all"
     names = dict.fromkeys(topic.type.rpartition("/")[2] for topic in bag.topics.values() if topic.messages)
-    depth = [f"{topic} is a depth image, no camera picture" for topic in bag.topics if topic.endswith(DEPTH)]
+    depth = [f"{shown(topic)} is a depth image, no camera picture" for topic in bag.topics if topic.endswith(DEPTH)]
     known = [f"{name}: {REMEDIES[name]}" for name in names if name in REMEDIES]
     advice = "; ".join([*(depth if option == "image_topic" else []), *known]) or "record that topic too"
     raise BadInputError(f"bag {bag.path} has no {kind} messages, only {others}; {advice}")
+
+
+def _named(topics: list[str]) -> str:
+    return ", ".join([*(" ".join(topic.split()) for topic in topics[:MOST_NAMED]), *["..."] * (len(topics) > MOST_NAMED)])
 
 
 def _with_type(bag: BagFile, *types: str) -> list[str]:

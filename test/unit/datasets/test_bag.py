@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
+from calib_ros.datasets.bag_file import Topic, choose_points
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
@@ -321,6 +323,15 @@ def test_several_topics_of_a_type_need_a_choice(tmp_path):
     assert bag.camera.K[0, 0] == 5
     with pytest.raises(BadInputError, match="no PointCloud2 messages on topic /front; it has /points, /rear/points"):
         BagSource(tmp_path / "bag", "/cam/image_raw", "/front")
+
+
+def test_topics_of_a_damaged_bag_are_named_in_one_line(tmp_path):
+    bag = SimpleNamespace(path=tmp_path, topics={f"/{k}\n": Topic(f"/{k}\n", "a/msg/B\nC", 1) for k in range(99)})
+    with pytest.raises(BadInputError) as error:
+        choose_points(bag, None)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 1200
+    assert "..." in str(error.value)
 
 
 def test_missing_types_and_pairs_are_named(tmp_path):
