@@ -1,7 +1,9 @@
-"""Ray tables of real spinning scanners, from their makers' data sheets and calibration files: one row per laser.
+"""Ray tables of real scanners, from their makers' data sheets and calibration files: one row per laser of a spinning one, per ray
+of a solid-state one.
 
 Sources: Velodyne's user manuals (VLP-16, VLP-32C, HDL-32E, HDL-64E S2, VLS-128) and the calibration files of its ROS driver,
-whose HDL-64E is that of one unit; Hesai's user manuals of the Pandar40P and Pandar64; Ouster's software manual.
+whose HDL-64E is that of one unit; Hesai's user manuals of the Pandar40P and Pandar64; Ouster's software manual. The lines of the
+M1 and the FT120 are not published: their number, field and steps are those of the data sheets.
 """
 
 from __future__ import annotations

@@ -159,11 +159,15 @@ class RosetteScanner(SpinningScanner):
         elevation = middle + laser * STEP_ELEVATION + reach * np.sin(2 * np.pi * MIRROR * times)
         return np.mod(2 * np.pi * HEAD * times + laser * STEP_AZIMUTH, 2 * np.pi) - np.pi, elevation
 
-    def beams(self) -> tuple[Float32, Floats]:
-        """(3, 1, points) unit vectors in the LiDAR frame by azimuth, and the time of each (1, points), s."""
+    def _points(self) -> tuple[Floats, Floats, Floats]:
+        """Azimuth, elevation (n,) rad and time (n,) s of the points of the scan, in the order of time."""
         n, period = self.firings, 1 / self.rate
         time = ((np.arange(n) + 0.5) / n - 0.5) * period
-        azimuth, elevation = self.pattern(time + (self.number + 0.5) * period)
+        return *self.pattern(time + (self.number + 0.5) * period), time
+
+    def beams(self) -> tuple[Float32, Floats]:
+        """(3, 1, points) unit vectors in the LiDAR frame by azimuth, and the time of each (1, points), s."""
+        azimuth, elevation, time = self._points()
         order = np.argsort(azimuth, kind="stable")
         a, e = azimuth[order], elevation[order]
         c = np.cos(e)
@@ -191,18 +195,15 @@ class RosetteScanner(SpinningScanner):
 class GridScanner(RosetteScanner):
     """A scanner that looks ahead along the same bent lines in every scan."""
 
-    def beams(self) -> tuple[Float32, Floats]:
-        """As of a rosette: (3, 1, points) by azimuth, and (1, points) s."""
+    def _points(self) -> tuple[Floats, Floats, Floats]:
+        """As of a rosette."""
         assert self.model.table is not None
         elevation, azimuth, delay = self.model.table()
-        order = np.argsort(azimuth, kind="stable")
-        a, e = np.deg2rad(azimuth[order]), np.deg2rad(elevation[order])
-        c, time = np.cos(e), (delay[order] - delay.mean()) * MICROSECOND
-        return np.stack([c * np.cos(a), c * np.sin(a), np.sin(e)])[:, None].astype(np.float32), time[None]
+        return np.deg2rad(azimuth), np.deg2rad(elevation), (delay - delay.mean()) * MICROSECOND
 
     def describe(self) -> str:
         """For people."""
-        return f"{self.model.name}, no rings, a grid of {len(self.beams()[1][0])} points"
+        return f"{self.model.name}, no rings, a grid of {len(self._points()[0])} points"
 
 
 # The plain drive's, by rings from the top, after the OS1-128, HDL-64E, HDL-32E and VLP-16; 0: without any, by two prisms.
