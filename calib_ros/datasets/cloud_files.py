@@ -46,7 +46,7 @@ FOREIGN = {
     ".drc": "Draco's; decode it as PLY: draco_decoder -i FILE.drc",
 }
 LAS_HEADER = 255  # bytes up to the number of points, since version 1.4
-LAZ, LAZ_RATIO = 0x80, 500  # bit of the format of points that are compressed, of scans to a tenth, and to no less than this part
+LAZ, LAZ_RATIO = 0x80, 500  # bit of the format of compressed points; bytes that a compressed one stands for at most, usually 10
 PANIC = "PanicException"  # of lazrs, which is no Exception
 CLOUD_COMPARE = "scalar_"  # before the names of fields in PLY files that CloudCompare writes
 
@@ -163,15 +163,15 @@ def _check_las(path: Path) -> None:
 
 
 def _laz_chunks(file: BinaryIO, begin: int, size: int) -> int:
-    """Number of chunks of a LAZ file, by its table, whose place is where the points begin, or at the end."""
-    at = size
-    for place in (begin, size - 8):
-        file.seek(max(place, 0))
-        (at,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
-        if at != -1:
-            break
-    file.seek(min(max(at, 0), size))
-    return int(struct.unpack("<II", file.read(8).ljust(8, b"\0"))[1])
+    """Number of chunks of a LAZ file of so many bytes, by its table. Where that is stands where the points begin, or, if a stream
+    was written, -1 there and the place at the end."""
+
+    def number(kind: str, at: int) -> int:
+        file.seek(min(max(at, 0), size))
+        return int(struct.unpack(kind, file.read(struct.calcsize(kind)).ljust(struct.calcsize(kind), b"\0"))[0])
+
+    table = number("<q", begin)
+    return number("<I", (number("<q", size - 8) if table == -1 else table) + 4)
 
 
 def _read_text(path: Path) -> Columns:

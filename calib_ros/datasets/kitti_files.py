@@ -38,7 +38,7 @@ MAX_IMAGE_DELAY_NS = 50_000_000  # images stamped later were not triggered by th
 
 
 def numbered_files(folder: Path, suffixes: tuple[str, ...], digits: int = DIGITS) -> dict[int, Path]:
-    """Files named by frame number: number -> path, ascending. Empty without the folder."""
+    """Files named by frame number of at most so many digits: number -> path, ascending. Empty without the folder."""
     if not folder.is_dir():
         return {}
     files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal() and len(p.stem) <= digits]

@@ -186,10 +186,10 @@ def declare(node: Node) -> Parameters:
     return parameters
 
 
-def misspelt(given: Mapping[str, Any], declared: Iterable[str]) -> list[str]:
+def misspelt(given: Mapping[str, Any], declared: Iterable[str], former_is: str = "its value is used") -> list[str]:
     """One line for each name given that no parameter has, with the nearest that there is; one for all that have been removed.
 
-    given: name -> value.
+    given: name -> value. former_is: what becomes of a value given under a former name.
     """
     known, former = sorted(declared), former_names()
     lines = notices({name: _plain(value) for name, value in given.items() if name in REMOVED})
@@ -197,7 +197,7 @@ def misspelt(given: Mapping[str, Any], declared: Iterable[str]) -> list[str]:
         if name.startswith(OF_EVERY_NODE):
             continue
         if name in former:
-            lines.append(f"parameter '{name}' is now called '{former[name]}'; its value is used")
+            lines.append(f"parameter '{name}' is now called '{former[name]}'; {former_is}")
             continue
         near = difflib.get_close_matches(name, known, 1)
         lines.append(
@@ -223,8 +223,9 @@ def on_change(
     new: dict[str, dict[str, Any]] = {}
     known, settings = stages(), dict(parameters.settings)
     try:
-        for line in misspelt({p.name: p.value for p in changed}, parameters.to_dict()):
-            raise ConfigError(line.replace("its value is used", "set that"))
+        unknown = misspelt({p.name: p.value for p in changed}, parameters.to_dict(), "set that")
+        if unknown:
+            raise ConfigError("; ".join(unknown))
         for p in changed:
             stage, dot, name = p.name.partition(".")
             if dot and stage in known:

@@ -122,8 +122,8 @@ class Acceptance:
         offset, motion = optimised.offset, self.config.motion
         if offset is None:
             return None
-        farthest = abs(motion.time_offset_s + optimised.seconds)
-        too_far = abs(optimised.seconds) > MAX_OFFSET_S or farthest > FARTHEST_OFFSET_S
+        in_all = motion.time_offset_s + optimised.seconds
+        too_far = abs(optimised.seconds) > MAX_OFFSET_S or abs(in_all) > FARTHEST_OFFSET_S
         # Nobody is told of an offset that is not observable: the extrinsic would be that of other clocks.
         unobservable = optimised.seconds != 0 and not offset.observable(motion)
         if too_far or unobservable or offset.suspected(motion):

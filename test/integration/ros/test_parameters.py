@@ -47,6 +47,8 @@ def test_misspelt_former_and_removed_names_are_logged_once_at_the_start(capfd):
         assert (config.tracker.process_noise_deg, config.tracker.process_noise_m) == (0.2, 0.02)
         assert peer.node.get_parameter("tracker.process_noise_deg").value == 0.2
         assert config.search.starts == SearchConfig().starts
+        refused = peer.set(tracker__drift_deg=0.3)
+        assert refused == "parameter 'tracker.drift_deg' is now called 'tracker.process_noise_deg'; set that"
         assert not any(map(peer.node.has_parameter, ("tracker.drift_deg", "search.distinct")))
     lines = capfd.readouterr().err.splitlines()
     assert ["did you mean 'search.rotation_deg'?" in line for line in lines if "is unknown" in line] == [True]
