@@ -26,7 +26,7 @@ STAMPS = VENV / "stamps"
 PIP_INSTALL = [PYTHON, "-m", "pip", "install", "-q", "--no-input", "--disable-pip-version-check"]
 PIP_RUNNING = VENV / "pip-is-running"
 KERNELS = ["calib_ros/registration/score/kernel.c", "calib_ros_thesis/kernel.c"]
-MESSAGE_PACKAGES = ["tools/pip_only/tf2_msgs", "calib_ros_msgs"]
+MESSAGE_PACKAGES = ["tools/pip_only/tf2_msgs", "tools/pip_only/livox_ros_driver2", "calib_ros_msgs"]
 SHARE = {
     "config": "calib_ros/config",
     "launch": "calib_ros/launch",

@@ -15,7 +15,8 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
-from calib_ros.datasets.bag_parts import METADATA, BagParts, layout_of, storage_files, storage_of, typestore
+from calib_ros.datasets.bag_parts import METADATA, BagParts, storage_files, storage_of
+from calib_ros.datasets.bag_types import layout_of, typestore
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages.compressed_points import COMPRESSED_POINTS, REPUBLISH

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import heapq
 import os
 import struct
 from collections.abc import Collection, Iterator
 from typing import Any
 
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_bytes, read_uint32
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+from calib_ros.datasets.bag_types import begins_with_header, cdr_of_ros1
 
 ZSTD = b"\x28\xb5\x2f\xfd"  # begins what is compressed; a message begins with 0 and its byte order
 HEAD = 512  # bytes: a stamp and a name of a frame
@@ -20,15 +25,15 @@ CHUNK_HEAD = 40  # bytes before the name of its compression, which is empty: tim
 
 
 def storages_with_heads(reader: Any) -> list[Any] | None:
-    """The files of a reader of rosbags, None if their messages have to be read as a whole: of ROS 1, or in compressed chunks."""
-    if not isinstance(reader, Reader):
-        return None
-    storage: Any = reader.storage
+    """The files of a reader of rosbags, None if their messages have to be read as a whole, since chunks are compressed."""
+    storage: Any = reader.storage if isinstance(reader, Reader) else reader
     storages = getattr(storage, "storages", [storage])
     return storages if all(_has_heads(one) for one in storages) else None
 
 
 def _has_heads(storage: Any) -> bool:
+    if isinstance(storage, Ros1Reader):
+        return all(chunk.decompressor is decompressors["none"] for chunk in storage.chunks.values())
     if isinstance(storage, McapReader):
         return bool(storage.chunks) and all(not c.compression and c.message_index_offsets for c in storage.chunks)
     return isinstance(storage, Sqlite3Reader)
@@ -36,7 +41,9 @@ def _has_heads(storage: Any) -> bool:
 
 def heads(storage: Any, topics: Collection[str], whole: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
     """(topic, time of recording in ns, bytes) of messages, in about their order: all bytes of topics in `whole`
-    and of what is compressed, of others the beginning."""
+    and of what is compressed, of others the beginning. As CDR, also where a bag of ROS 1 has them otherwise."""
+    if isinstance(storage, Ros1Reader):
+        return _of_ros1(storage, topics, whole)
     wanted = {c.id: (c.topic, c.topic in whole) for c in storage.connections if c.topic in topics}
     return _of_mcap(storage, wanted) if isinstance(storage, McapReader) else _of_sqlite(storage, wanted)
 
@@ -77,3 +84,27 @@ def _of_sqlite(storage: Any, wanted: dict[int, tuple[str, bool]]) -> Iterator[tu
         with storage.dbconn.blob_open("main", "messages", "data", row, False) as blob:
             data = blob.read(HEAD)
             yield topic, time, data + blob.read() if is_whole or data[:4] == ZSTD else data
+
+
+def _of_ros1(reader: Ros1Reader, topics: Collection[str], whole: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+    wanted = {c.id: c for c in reader.connections if c.topic in topics}
+    file = reader.bio
+    assert file is not None
+    for entry in heapq.merge(*(reader.indexes[i] for i in wanted)):
+        file.seek(reader.chunks[entry.chunk_pos].datapos + entry.offset)
+        record = Header.read(file)
+        while record.get_uint8("op") == RecordType.CONNECTION:  # a description of the topic, before its first message
+            file.seek(read_uint32(file), os.SEEK_CUR)
+            record = Header.read(file)
+        if record.get_uint8("op") != RecordType.MSGDATA or record.get_uint32("conn") not in wanted:
+            raise ValueError("an index of messages is damaged")
+        connection, size = wanted[record.get_uint32("conn")], read_uint32(file)
+        is_whole = connection.topic in whole or not begins_with_header(connection)
+        data = read_bytes(file, size if is_whole else min(size, HEAD))
+        yield connection.topic, entry.time, cdr_of_ros1(data, connection) if is_whole else _header_as_cdr(data)
+
+
+def _header_as_cdr(data: bytes) -> bytes:
+    """The std_msgs/Header that begins a message of ROS 1: without its number, and with a frame's name that ends by a zero."""
+    seconds, nanoseconds, length = struct.unpack_from("<III", data, 4)
+    return b"\0\1\0\0" + struct.pack("<III", seconds, nanoseconds, length + 1) + data[16 : 16 + length] + b"\0"

@@ -6,7 +6,6 @@ import shutil
 import sys
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
-from functools import cache
 from itertools import pairwise
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -15,16 +14,12 @@ from typing import Any
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.rosbag2.storage_mcap import McapReader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from calib_ros import io
 from calib_ros.datasets.bag_heads import ZSTD, heads, storages_with_heads
+from calib_ros.datasets.bag_types import cdr_of_ros1
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
-from calib_ros.messages.compressed_points import CLOUD_DEFINITION, COMPRESSED_POINTS
-from calib_ros.messages.point_fields import CUSTOM_MSG, CUSTOM_POINT, LIVOX
-from calib_ros.messages.video import FORMER_DEFINITION, FORMER_PACKET, VIDEO
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -35,25 +30,6 @@ METADATA, COMPRESSED = "metadata.yaml", ".zstd"
 STORAGE = {".mcap": "mcap", ".db3": "sqlite3", ".bag": "ROS 1"}
 # ns, between parts of one recording: a recorder opens the next file where it closes the last one.
 MAX_OVERLAP, MAX_PAUSE = NANOSECONDS, 60 * NANOSECONDS
-
-
-@cache
-def typestore() -> Typestore:
-    """The message types of ROS 2, the same in every release: a bag's own definitions, maybe broken, are not needed."""
-    store = get_typestore(Stores.ROS2_KILTED)
-    for name in LIVOX:
-        package = name.partition("/")[0]
-        store.register(get_types_from_msg(CUSTOM_POINT, f"{package}/msg/CustomPoint"))
-        store.register(get_types_from_msg(CUSTOM_MSG, name))
-    for name, definition in {**VIDEO, FORMER_PACKET: FORMER_DEFINITION, COMPRESSED_POINTS: CLOUD_DEFINITION}.items():
-        store.register(get_types_from_msg(definition, name))
-    return store
-
-
-def layout_of(connection: Any) -> str:
-    """The type of `typestore` by which a connection's messages are decoded: of a name that has had two, by its definition."""
-    former = connection.msgtype.endswith("/FFMPEGPacket") and "img_width" in connection.msgdef.data
-    return FORMER_PACKET if former else str(connection.msgtype)
 
 
 def storage_files(folder: Path) -> list[Path]:
@@ -178,7 +154,7 @@ def _messages(reader: Any, topics: Collection[str], start: int | None, stop: int
     is_ros1 = isinstance(reader, Ros1Reader)
     for connection, time, data in reader.messages(connections, start, stop):
         if is_ros1:
-            data = bytes(typestore().ros1_to_cdr(data, layout_of(connection)))
+            data = cdr_of_ros1(data, connection)
         elif data[:4] == ZSTD:
             data = zstd.decompress(data)
         yield connection.topic, time, data

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets.bag_parts import typestore
+from calib_ros.datasets.bag_types import typestore
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud

@@ -12,7 +12,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,13 +41,24 @@ RELATIVE_NS = 2e9  # times within this of zero count from the header stamp, othe
 SAME_CLOCK_NS = 5e9  # an absolute time farther than this from the header stamp comes from another clock
 # Datatypes of sensor_msgs/PointField as numpy's; 9-11 exist since ROS 2 Lyrical.
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8", 11: "u1"}
-# Livox's own message, of its drivers for ROS 2 and 1.
-LIVOX = ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg")
+# Livox's own message, of its drivers: for ROS 2, its first units in ROS 2, ROS 1.
+LIVOX = ("livox_ros_driver2/msg/CustomMsg", "livox_interfaces/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg")
 CUSTOM_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
 CUSTOM_MSG = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 # A point of it in CDR: 19 bytes, of which the next one begins at a multiple of four. Times are ns from the header's stamp.
-LIVOX_FIELDS = {"time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
+LIVOX_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
 LIVOX_OFFSETS, LIVOX_SIZE, LIVOX_STRIDE = (0, 4, 8, 12, 16, 17, 18), 19, 20
+
+
+class LivoxScan(NamedTuple):
+    """A CustomMsg: its header, and `width` points of LIVOX_STRIDE bytes each with LIVOX_FIELDS at LIVOX_OFFSETS."""
+
+    seconds: int
+    nanoseconds: int
+    frame_id: str
+    big_endian: bool
+    width: int
+    points: bytes
 
 
 def decode_cloud(msg: Any) -> PointCloud:
@@ -66,23 +77,30 @@ def decode_cloud(msg: Any) -> PointCloud:
     return _cloud({name: column.ravel() for name, column in columns.items() if column is not None}, stamp_ns(msg.header.stamp))
 
 
-def decode_livox(data: bytes) -> PointCloud:
-    """CDR bytes of a CustomMsg -> PointCloud with times, lines and reflectivity. Raises BadInputError for a truncated message."""
+def livox_scan(data: bytes) -> LivoxScan:
+    """CDR bytes of a CustomMsg -> its parts. Raises BadInputError for a truncated message."""
     try:
         order = "<" if data[1] & 1 else ">"
         seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
+        name = bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
         at = -(-(12 + length) // 8) * 8  # the time base is aligned; offsets count from behind the first four bytes
         (count,) = struct.unpack_from(order + "I", data, 4 + at + 16)
-        begin = 4 + at + 20
-        if begin + max(count * LIVOX_STRIDE - (LIVOX_STRIDE - LIVOX_SIZE), 0) > len(data):
-            raise BadInputError(f"CustomMsg: {len(data)} bytes are too few for {count} points; the message is truncated")
     except (struct.error, IndexError):
-        raise BadInputError(f"CustomMsg: {len(data)} bytes are no whole message; record the bag again") from None
-    kinds = [order + kind for kind in LIVOX_FIELDS.values()]
+        raise BadInputError(f"CustomMsg: {len(data)} bytes are no whole message; check the driver or the recording") from None
+    begin, size = 4 + at + 20, count * LIVOX_STRIDE
+    if begin + max(size - (LIVOX_STRIDE - LIVOX_SIZE), 0) > len(data):
+        raise BadInputError(f"CustomMsg: {len(data)} bytes are too few for {count} points; the message is truncated")
+    points = bytes(data[begin : begin + size]).ljust(size, b"\0")
+    return LivoxScan(seconds, nanoseconds, name, order == ">", count, points)
+
+
+def decode_livox(data: bytes) -> PointCloud:
+    """CDR bytes of a CustomMsg -> PointCloud with times, lines and reflectivity. Raises BadInputError for a truncated message."""
+    scan = livox_scan(data)
+    kinds = [">"[: scan.big_endian] + kind for kind in LIVOX_FIELDS.values()]
     layout = np.dtype({"names": list(LIVOX_FIELDS), "formats": kinds, "offsets": LIVOX_OFFSETS, "itemsize": LIVOX_STRIDE})
-    padded = data[begin : begin + count * LIVOX_STRIDE].ljust(count * LIVOX_STRIDE, b"\0")
-    points = np.frombuffer(padded, layout)
-    return cloud_of_columns({name: points[name] for name in LIVOX_FIELDS}, seconds * NANOSECONDS + nanoseconds)
+    points = np.frombuffer(scan.points, layout)
+    return cloud_of_columns({name: points[name] for name in LIVOX_FIELDS}, scan.seconds * NANOSECONDS + scan.nanoseconds)
 
 
 def cloud_of_columns(columns: Mapping[str, NDArray[Any]], stamp: int = 0) -> PointCloud:

@@ -35,6 +35,7 @@ from calib_ros.datasets.bag_file import BagFile, peek_header
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import stamp_ns
+from calib_ros.messages.point_fields import LIVOX
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
 from calib_ros.ros.conversions import time_message
@@ -43,11 +44,11 @@ from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import PROCESSED_KEPT
 from calib_ros.ros.subscriptions import type_name
 
-SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
+CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", *LIVOX)
+SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", *CLOUD_TYPES)
 CLOCK_PERIOD = NANOSECONDS // 100
 SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
 LINGER_S = 1.0  # after the last message, so that late joiners get latched topics and nothing in flight is lost
-CLOUD_TYPE = SENSOR_TYPES[2]
 SENT_KEPT = 10  # messages on their way to a node that says nothing
 FOLLOW_S = 60.0  # longest wait for a followed node, which may have lost messages or have ended
 
@@ -141,7 +142,7 @@ def _types() -> Any:
     """rosbags' message types, with all that writes a bag imported. MissingDependencyError without rosbags."""
     try:
         importlib.import_module("calib_ros.datasets.bag_writer")
-        from calib_ros.datasets.bag_parts import typestore
+        from calib_ros.datasets.bag_types import typestore
     except ImportError:
         raise MissingDependencyError("nothing captured: ~/capture needs rosbags; pip install rosbags") from None
     return typestore()
@@ -323,7 +324,7 @@ class Player:
         for name, stamp, data in self.bag.raw(list(self._publishers)):
             first = stamp if first is None else first
             kind, follower = self.bag.topics[name].type, self._follower
-            if follower is not None and kind == CLOUD_TYPE:
+            if follower is not None and kind in CLOUD_TYPES:
                 began = time.monotonic()
                 follower.wait(stopped)
                 started += time.monotonic() - began  # the pace of what follows stays the recorded one
@@ -342,7 +343,7 @@ class Player:
                 return
             self._publishers[name].publish(bytes(data))
             if follower is not None and kind in SENSOR_TYPES:
-                follower.add(name, *peek_header(data), kind == CLOUD_TYPE)
+                follower.add(name, *peek_header(data), kind in CLOUD_TYPES)
             self.published[name] = self.published.get(name, 0) + 1
             if self.bag.duration_s > 0:
                 progress(min((stamp - first) / NANOSECONDS / self.bag.duration_s, 1.0))

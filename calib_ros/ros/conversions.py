@@ -12,22 +12,39 @@ from builtin_interfaces.msg import Duration, Time
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, PointCloud2, PointField
 
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
+from calib_ros.messages.point_fields import LIVOX_FIELDS, LIVOX_OFFSETS, LIVOX_STRIDE, livox_scan
 from calib_ros.result import Extrinsic
 
 # ROS orders covariances of poses translation first; calib_ros has rotation first. The way back is the same.
 _ROS_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+LIVOX_DATATYPES = {"u4": PointField.UINT32, "f4": PointField.FLOAT32, "u1": PointField.UINT8}
 
 
 def frame_from_messages(image: Any, cloud: Any, camera: Camera) -> Frame:
     """Image or CompressedImage and PointCloud2 -> Frame. BadInputError if one of them cannot be decoded."""
     pixels = decode_compressed_image(image) if hasattr(image, "format") else decode_image(image)
     return Frame(pixels, decode_cloud(cloud), camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
+
+
+def cloud_of_livox(data: bytes) -> PointCloud2:
+    """CDR bytes of Livox's CustomMsg -> the same points as a PointCloud2. BadInputError for a truncated message."""
+    scan = livox_scan(data)
+    msg = PointCloud2(
+        height=1, width=scan.width, point_step=LIVOX_STRIDE, row_step=len(scan.points), is_bigendian=scan.big_endian
+    )
+    msg.header.stamp.sec, msg.header.stamp.nanosec, msg.header.frame_id = scan.seconds, scan.nanoseconds, scan.frame_id
+    msg.fields = [
+        PointField(name=name, offset=offset, datatype=LIVOX_DATATYPES[kind], count=1)
+        for (name, kind), offset in zip(LIVOX_FIELDS.items(), LIVOX_OFFSETS, strict=True)
+    ]
+    msg.data = array.array("B", scan.points)
+    return msg
 
 
 def time_message(stamp: int) -> Time:

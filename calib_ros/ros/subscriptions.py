@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from calib_ros.messages.point_fields import LIVOX
 from calib_ros.messages.video import VIDEO
 from calib_ros.online.pairing.health import MISSING_SHARE
 from calib_ros.online.pipeline import Pipeline
+from calib_ros.ros.conversions import cloud_of_livox
 from calib_ros.ros.dds import profile_for_sender
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.parameters import Parameters
@@ -41,7 +43,14 @@ IMAGE_ADVICE = {
 } | dict.fromkeys(VIDEO, "republish it as raw images (image_transport republish)")
 POINTS_ADVICE = {
     COMPRESSED_POINTS: "republish it (point_cloud_transport republish)",
-} | dict.fromkeys(LIVOX, "set xfer_format to 0 in the driver's launch file")
+} | dict.fromkeys(LIVOX, "source the driver's workspace, or set its xfer_format to 0")
+
+
+class Form(NamedTuple):
+    """A message type of a topic. decode: its serialised bytes -> the message that the callback gets; None for the type itself."""
+
+    kind: type[Any]
+    decode: Callable[[bytes], Any] | None = None
 
 
 def type_name(kind: type[Any]) -> str:
@@ -88,7 +97,7 @@ class SensorSubscriptions:
         subscribe = partial(AdaptiveSubscription, self._node, preference=parameters["reliability"], guard=self._health.guard)
         self.adaptive = (
             subscribe(self._image, "image", self._forwarding_to(pipeline.add_image)),
-            subscribe(PointCloud2, "points", self._forwarding_to(pipeline.add_cloud)),
+            subscribe(PointCloud2, "points", self._forwarding_to(pipeline.add_cloud), others=livox_forms()),
             # A camera's driver may publish once, latched, what never changes.
             subscribe(CameraInfo, "camera_info", self._on_camera_info, latched=True),
         )
@@ -162,8 +171,9 @@ class AdaptiveSubscription:
 
     callback: called with stamp, ns, and message. preference: "auto", or "best_effort" or "reliable" whatever the publishers are;
     it may be replaced at any time and holds from the next check() on. latched: receive what was published before as well, where
-    all publishers keep it. guard: context that callbacks run in. largest: bytes of data in the largest message so far. To be used
-    on the executor's thread. No message is lost or received twice in a change.
+    all publishers keep it. guard: context that callbacks run in. others: types that are received as well, one at a time, where
+    nobody publishes `kind`. largest: bytes of data in the largest message so far. To be used on the executor's thread. No message
+    is lost or received twice in a change of reliability.
     """
 
     def __init__(
@@ -175,12 +185,15 @@ class AdaptiveSubscription:
         preference: str,
         latched: bool = False,
         guard: Callable[[], AbstractContextManager[None]] = nullcontext,
+        others: Sequence[Form] = (),
     ) -> None:
         self.preference = preference
         self._guard = guard
         self._node, self._callback, self._latched = node, callback, latched
         self._topic = topic
         self.kind = kind
+        self._forms = (Form(kind), *others)
+        self._form = self._forms[0]
         self.largest = 0
         self._received = self._lost = 0
         self._history: deque[tuple[int, int]] = deque(maxlen=LOSS_CHECKS)  # received and lost so far, at every check
@@ -219,13 +232,20 @@ class AdaptiveSubscription:
             self._old.remove((subscription, since))
             self._node.destroy_subscription(subscription)
         everyone = self._node.get_publishers_info_by_topic(self.topic)
-        publishers = [p.qos_profile for p in everyone if p.topic_type == type_name(self.kind)]
+        types = [p.topic_type for p in everyone]
+        form = next((form for form in self._forms if type_name(form.kind) in types), self._form)
+        if form != self._form:  # DDS knows one type of a topic at a time
+            self.destroy()
+            self._old.clear()
+            self._form = form
+            self._current = self._subscribe()
+        publishers = [p.qos_profile for p in everyone if p.topic_type == type_name(form.kind)]
         wanted = self._wanted(publishers)
         if wanted != self._qos:
             self._qos = wanted
             self._old.append((self._current, now))
             self._current = self._subscribe()
-        return self._problem([p.topic_type for p in everyone], publishers)
+        return self._problem(types, publishers)
 
     def _wanted(self, publishers: list[QoSProfile]) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
         if not publishers:
@@ -239,9 +259,9 @@ class AdaptiveSubscription:
         return reliability, durability
 
     def _problem(self, types: list[str], publishers: list[QoSProfile]) -> str:
-        others = sorted(set(types) - {type_name(self.kind)})
+        others = sorted(set(types) - {type_name(self._form.kind)})
         if others:
-            text = f"{', '.join(others)}, but {type_name(self.kind)} is wanted"
+            text = f"{', '.join(others)}, but {type_name(self._form.kind)} is wanted"
             return f"{self.topic} is published as {text}; {advice(others[0], self.kind)}"
         if self.reliable and any(p.reliability == BEST_EFFORT for p in publishers):
             return f"a publisher of {self.topic} offers best effort only and cannot be received; set reliability: auto"
@@ -250,7 +270,8 @@ class AdaptiveSubscription:
     def _subscribe(self) -> Any:
         qos = QoSProfile(depth=DEPTH, reliability=self._qos[0], durability=self._qos[1])
         self._made += 1
-        subscribe = partial(self._node.create_subscription, self.kind, self._topic, partial(self._receive, self._made), qos)
+        receive, raw = partial(self._receive, self._made, self._form.decode), self._form.decode is not None
+        subscribe = partial(self._node.create_subscription, self._form.kind, self._topic, receive, qos, raw=raw)
         try:
             return subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
         except UnsupportedEventTypeError:  # by this middleware; gaps in the stamps remain
@@ -259,8 +280,9 @@ class AdaptiveSubscription:
     def _on_lost(self, event: Any) -> None:
         self._lost += event.total_count_change
 
-    def _receive(self, subscription: int, msg: Any) -> None:
+    def _receive(self, subscription: int, decode: Callable[[bytes], Any] | None, msg: Any) -> None:
         with self._guard():
+            msg = msg if decode is None else decode(msg)
             stamp = stamp_ns(msg.header.stamp)
             # Received through the other subscription already. Through the same one it is another message: time may stand still,
             # or not be stamped at all.
@@ -276,6 +298,15 @@ def advice(published: str, wanted: type[Any]) -> str:
     """What to do where a topic is published as another type than is wanted."""
     known = {Image: IMAGE_ADVICE, CompressedImage: IMAGE_ADVICE, PointCloud2: POINTS_ADVICE}.get(wanted, {})
     return known.get(published, "check the remapping")
+
+
+def livox_forms() -> list[Form]:
+    """Livox's own clouds, of the drivers whose messages are installed."""
+    forms = []
+    for name in LIVOX:
+        with suppress(ImportError):
+            forms.append(Form(import_module(f"{name.partition('/')[0]}.msg").CustomMsg, cloud_of_livox))
+    return forms
 
 
 def _advice(subscription: AdaptiveSubscription) -> str:

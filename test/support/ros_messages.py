@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib_ros.datasets.bag_parts import typestore, zstd
+from calib_ros.datasets.bag_parts import zstd
+from calib_ros.datasets.bag_types import typestore
 
 TYPES = typestore()
 FAMILIES = ("rosbags", "rclpy")

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
 from typing import Any
 
+import numpy as np
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from ros_peer import LATCHED, Peer
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from std_msgs.msg import Header
 from vehicle import Vehicle
 from waiting import until
 
-from calib_ros.ros.subscriptions import AdaptiveSubscription, advice
+from calib_ros.frame import NANOSECONDS
+from calib_ros.messages import decode_cloud
+from calib_ros.messages.point_fields import decode_livox
+from calib_ros.ros.subscriptions import AdaptiveSubscription, Form, advice, livox_forms
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -38,11 +45,13 @@ class Topic:
         self.got: list[int] = []
         self.sent = 0
 
-    def subscribe(self, preference: str, latched: bool = False, kind: type[Any] = CameraInfo) -> AdaptiveSubscription:
+    def subscribe(
+        self, preference: str, latched: bool = False, kind: type[Any] = CameraInfo, others: Sequence[Form] = ()
+    ) -> AdaptiveSubscription:
         def receive(stamp: int, msg: Any) -> None:
             self.got.append(msg.height)
 
-        return AdaptiveSubscription(self.listener, kind, "info", receive, preference, latched)
+        return AdaptiveSubscription(self.listener, kind, "info", receive, preference, latched, others=others)
 
     def publisher(self, qos: QoSProfile) -> Any:
         count = self.publishers()
@@ -132,13 +141,12 @@ def test_a_choice_that_cannot_work_is_named(topic):
 
 
 @contextmanager
-def stranger(kind: type[Any], topic: str) -> Iterator[None]:
+def stranger(kind: type[Any], topic: str) -> Iterator[Any]:
     """A publisher of another participant: within one, DDS refuses a second type on a topic."""
     context = Context()
     rclpy.init(context=context)
     node = rclpy.create_node("stranger", context=context)
-    node.create_publisher(kind, topic, RELIABLE)
-    yield
+    yield node.create_publisher(kind, topic, RELIABLE)
     node.destroy_node()
     rclpy.try_shutdown(context=context)
 
@@ -168,7 +176,7 @@ def test_a_topic_of_another_type_is_named(across_processes, topic, wanted, publi
 @pytest.mark.parametrize(
     ("wanted", "published", "text"),
     [
-        (PointCloud2, "livox_ros_driver2/msg/CustomMsg", "xfer_format to 0"),
+        (PointCloud2, "livox_interfaces/msg/CustomMsg", "source the driver's workspace"),
         (PointCloud2, "point_cloud_interfaces/msg/CompressedPointCloud2", "point_cloud_transport republish"),
         (Image, "foxglove_msgs/msg/CompressedVideo", "image_transport republish"),
         (CompressedImage, "ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "image_transport republish"),
@@ -177,6 +185,37 @@ def test_a_topic_of_another_type_is_named(across_processes, topic, wanted, publi
 )
 def test_what_drivers_publish_else_has_its_own_advice(wanted, published, text):
     assert text in advice(published, wanted)
+
+
+def test_clouds_of_livox_are_received_while_nobody_publishes_usual_ones(across_processes, topic):
+    messages = pytest.importorskip("livox_ros_driver2.msg", reason="livox_ros_driver2 is not installed")
+    clouds: list[tuple[int, Any]] = []
+    subscription = AdaptiveSubscription(
+        topic.listener, PointCloud2, "info", lambda stamp, msg: clouds.append((stamp, msg)), "auto", others=livox_forms()
+    )
+
+    def arrives(publisher: Any, message: Any, count: int) -> Any:
+        topic.until(lambda: subscription.check() == "" and publisher.get_subscription_count() == 1)
+        topic.until(lambda: publisher.publish(message) or (clouds and clouds[-1][1].width == count))
+        assert clouds[-1][0] == 7 * NANOSECONDS
+        return clouds[-1][1]
+
+    points = [
+        messages.CustomPoint(offset_time=5_000_000 * k, x=float(k), y=2.0, z=3.0, reflectivity=200, line=k) for k in range(3)
+    ]
+    scan = messages.CustomMsg(header=Header(stamp=Time(sec=7), frame_id="livox_frame"), point_num=3, points=points)
+    with stranger(messages.CustomMsg, "info") as publisher:
+        msg = arrives(publisher, scan, 3)
+        assert msg.header.frame_id == "livox_frame"
+        cloud, read = decode_cloud(msg), decode_livox(serialize_message(scan))
+        for name in ("xyz", "intensity", "ring", "time"):
+            assert np.array_equal(getattr(cloud, name), getattr(read, name))
+        assert np.allclose(cloud.time, [0, 0.005, 0.01])
+        assert list(cloud.ring) == [0, 1, 2]
+    with stranger(PointCloud2, "info") as publisher:  # the driver was started again, with another format
+        arrives(publisher, PointCloud2(header=scan.header), 0)
+    with stranger(messages.CustomMsg, "info") as publisher:
+        arrives(publisher, scan, 3)
 
 
 def test_latched_messages_are_received(topic):
