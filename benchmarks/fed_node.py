@@ -154,15 +154,16 @@ class Feeding:
 
 
 @contextmanager
-def fed_node(bag: Path, start: Any, folder: Path, *parameters: str) -> Iterator[Feeding]:
-    """The node, from a start T (4, 4), and publishers of a bag's messages that it has found; ended by SIGINT afterwards."""
+def fed_node(bag: Path, start: Any, folder: Path, *parameters: str, draws: bool = True) -> Iterator[Feeding]:
+    """The node, from a start T (4, 4), and publishers of a bag's messages that it has found; ended by SIGINT afterwards.
+    draws: overlays."""
     file = BagFile(bag)
     types = {topic: file.topics[topic].type for topic in (IMAGE, INFO, POINTS)}
     file.close()
     (folder / "state.json").unlink(missing_ok=True)
     node = start_node(start, folder, *parameters)
     try:
-        with ExtrinsicClient() as client:
+        with ExtrinsicClient(draws=draws) as client:
             client.get_extrinsic(60)
             feeder = Feeder(client._node, recorded(bag), types)
             if not client.spin(30, lambda: feeder.heard):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 from collections import deque
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from calib_ros.frame import NANOSECONDS
 from calib_ros.messages.compressed_points import COMPRESSED_POINTS, REPUBLISH
 from calib_ros.messages.point_fields import LIVOX, decode_livox
 from calib_ros.messages.video import VIDEO
-from calib_ros.messages.wire import shown
+from calib_ros.messages.wire import shown, wire_header
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -128,11 +127,9 @@ def _some_file(path: Path) -> Path:
 
 def peek_header(data: bytes) -> tuple[int, str]:
     """Stamp in ns and frame id of a CDR message that begins with a std_msgs/Header; the rest is not decoded."""
-    order = "<" if data[1] & 1 else ">"
-    seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
+    header = wire_header(data)
     # Some drivers keep the leading slash of tf1, which tf2 forbids.
-    frame = bytes(data[16 : 16 + length]).rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
-    return seconds * NANOSECONDS + nanoseconds, frame
+    return header.stamp, header.frame_id.lstrip("/")
 
 
 class StaticTransforms:

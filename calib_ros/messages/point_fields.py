@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud
-from calib_ros.messages.wire import payload, stamp_ns
+from calib_ros.messages.wire import WireHeader, payload, stamp_ns, wire_header
 
 REQUIRED = ("x", "y", "z")  # m in the LiDAR frame
 # Quantity of a point -> lower-case field names that drivers use, preferred first.
@@ -53,9 +53,7 @@ LIVOX_OFFSETS, LIVOX_SIZE, LIVOX_STRIDE = (0, 4, 8, 12, 16, 17, 18), 19, 20
 class LivoxScan(NamedTuple):
     """A CustomMsg: its header, and `width` points of LIVOX_STRIDE bytes each with LIVOX_FIELDS at LIVOX_OFFSETS."""
 
-    seconds: int
-    nanoseconds: int
-    frame_id: str
+    header: WireHeader
     big_endian: bool
     width: int
     points: bytes
@@ -80,9 +78,8 @@ def decode_cloud(msg: Any) -> PointCloud:
 def livox_scan(data: bytes) -> LivoxScan:
     """CDR bytes of a CustomMsg -> its parts. Raises BadInputError for a truncated message."""
     try:
-        order = "<" if data[1] & 1 else ">"
-        seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
-        name = bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
+        header, order = wire_header(data), "<" if data[1] & 1 else ">"
+        (length,) = struct.unpack_from(order + "I", data, 12)
         at = -(-(12 + length) // 8) * 8  # the time base is aligned; offsets count from behind the first four bytes
         (count,) = struct.unpack_from(order + "I", data, 4 + at + 16)
     except (struct.error, IndexError):
@@ -91,7 +88,7 @@ def livox_scan(data: bytes) -> LivoxScan:
     if begin + max(size - (LIVOX_STRIDE - LIVOX_SIZE), 0) > len(data):
         raise BadInputError(f"CustomMsg: {len(data)} bytes are too few for {count} points; the message is truncated")
     points = bytes(data[begin : begin + size]).ljust(size, b"\0")
-    return LivoxScan(seconds, nanoseconds, name, order == ">", count, points)
+    return LivoxScan(header, order == ">", count, points)
 
 
 def decode_livox(data: bytes) -> PointCloud:
@@ -100,7 +97,9 @@ def decode_livox(data: bytes) -> PointCloud:
     kinds = [">"[: scan.big_endian] + kind for kind in LIVOX_FIELDS.values()]
     layout = np.dtype({"names": list(LIVOX_FIELDS), "formats": kinds, "offsets": LIVOX_OFFSETS, "itemsize": LIVOX_STRIDE})
     points = np.frombuffer(scan.points, layout)
-    return cloud_of_columns({name: points[name] for name in LIVOX_FIELDS}, scan.seconds * NANOSECONDS + scan.nanoseconds)
+    return cloud_of_columns(
+        {name: points[name] for name in LIVOX_FIELDS}, scan.header.seconds * NANOSECONDS + scan.header.nanoseconds
+    )
 
 
 def cloud_of_columns(columns: Mapping[str, NDArray[Any]], stamp: int = 0) -> PointCloud:

@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any
+import struct
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.frame import NANOSECONDS
+
+
+class WireHeader(NamedTuple):
+    """A std_msgs/Header as it lies in a message."""
+
+    seconds: int
+    nanoseconds: int
+    frame_id: str
+
+    @property
+    def stamp(self) -> int:
+        """ns."""
+        return self.seconds * NANOSECONDS + self.nanoseconds
+
+
+def wire_header(data: bytes) -> WireHeader:
+    """The header that begins a CDR message; the rest is not decoded. struct.error for less than 16 bytes."""
+    order = "<" if data[1:2] == b"\1" else ">"
+    seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
+    return WireHeader(seconds, nanoseconds, bytes(data[16 : 16 + length]).rstrip(b"\0").decode("utf-8", "replace"))
 
 
 def stamp_ns(stamp: Any) -> int:

@@ -65,6 +65,7 @@ class Pipeline:
         self._segmentation = models_of(config.semantics)
         self._requests, self._deferred = Requests(), Deferred()
         self.dropped_pairs = 0  # that a newer one replaced before they were ingested
+        self.rested_pairs = 0  # that were left out, since there was no need to look at them
         self._lock = threading.Lock()
         self._announcer = Announcer(sink)
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
@@ -113,15 +114,18 @@ class Pipeline:
         """What is said of clocks of other epochs, whose difference is taken out of the clouds' stamps; "" if there is none."""
         return self._pairing.clocks.describe()
 
-    def _hand_over(self, found: list[Intake]) -> None:
-        """With the lock held: to the ingest worker."""
+    def _hand_over(self, found: list[Intake], stamp: int | None = None) -> None:
+        """With the lock held: to the ingest worker, unless it needs none of this stamp, ns."""
+        if found and stamp is not None and self.recalibrator is not None and not self.recalibrator.wants(stamp):
+            self.rested_pairs += len(found)
+            return
         for intake in found:
             self.dropped_pairs += sum(replaced.paired for replaced in self._ingester.put(intake))
 
     def _add(self, take: Callable[[int, Any], list[Intake]], stamp: int, message: Any) -> None:
         with self._lock:
             jumps, ahead = self.synchronizer.counts.jumps_back, self._pairing.clocks.ahead
-            self._hand_over(take(stamp, message))
+            self._hand_over(take(stamp, message), stamp)
             jumped = self.synchronizer.counts.jumps_back > jumps
             clocks = self.clock_difference if self._pairing.clocks.ahead != ahead else ""
         if jumped:

@@ -175,6 +175,12 @@ class Recalibrator:
 
     # ---- frames -------------------------------------------------------------------------------------------------------
 
+    def wants(self, stamp: int) -> bool:
+        """False if a frame of this stamp, ns, need not even be decoded: at rest, between two looks, and without any doubt."""
+        if not self.at_rest or self.config.lidar.accumulate_s > 0:
+            return True
+        return self._test_wanted or self.monitor.in_doubt or self.sensors.faulty_frames > 0 or self.glance.is_due(stamp)
+
     def ingest(
         self, frame: Frame, scan_before: ScanBefore = lambda since: None, permit: Callable[[], bool] = lambda: True
     ) -> bool:

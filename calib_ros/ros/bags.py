@@ -38,7 +38,7 @@ from calib_ros.messages import stamp_ns
 from calib_ros.messages.point_fields import LIVOX
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
-from calib_ros.ros.conversions import time_message
+from calib_ros.ros.conversions import Serialized, time_message
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import PROCESSED_KEPT
@@ -158,7 +158,7 @@ def _write_bag(path: Path, frames: list[RawKeyframe], result: Result, rectified:
     topics = ("/image_rect" if rectified else "/image", "/camera_info", "/points")
     with Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
         latched = writer.add_connection(TF_STATIC, "tf2_msgs/msg/TFMessage", typestore=types, offered_qos_profiles=[LATCHED])
-        kinds = [type_name(type(message)) for message in (frames[0].image, frames[0].camera_info, frames[0].cloud)]
+        kinds = [type_name(type(_whole(message))) for message in (frames[0].image, frames[0].camera_info, frames[0].cloud)]
         joined = [writer.add_connection(topic, kind, typestore=types) for topic, kind in zip(topics, kinds, strict=True)]
         entries = []
         for frame in frames:
@@ -174,7 +174,11 @@ def _write_bag(path: Path, frames: list[RawKeyframe], result: Result, rectified:
         tf = build.static_transform(entries[0][0], result.T_camera_lidar)
         writer.write(latched, entries[0][0], types.serialize_cdr(tf, "tf2_msgs/msg/TFMessage"))
         for stamp, role, message in entries:
-            writer.write(joined[(1, 0, 2)[role]], stamp, serialize_message(message))
+            writer.write(joined[(1, 0, 2)[role]], stamp, serialize_message(_whole(message)))
+
+
+def _whole(message: Any) -> Any:
+    return message.message() if isinstance(message, Serialized) else message
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,10 @@ def result_from_message(msg: Any) -> Result:
 class ExtrinsicClient:
     """Talks to one running node. Use as a context manager.
 
-    overlay: the newest one. overlays: how many came. frames: changes of the frame that they show.
+    overlay: the newest one. overlays: how many came. frames: changes of the frame that they show. draws: let the node draw them.
     """
 
-    def __init__(self, node_name: str = "/calib_ros", domain_id: int | None = None) -> None:
+    def __init__(self, node_name: str = "/calib_ros", domain_id: int | None = None, draws: bool = True) -> None:
         use_large_message_profile()
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain_id)
@@ -59,7 +59,8 @@ class ExtrinsicClient:
         self.overlays = 0
         self.frames = 0
         self._stamp = -1
-        self._node.create_subscription(Image, f"{self._name}/overlay", self._on_overlay, 1)
+        if draws:
+            self._node.create_subscription(Image, f"{self._name}/overlay", self._on_overlay, 1)
 
     def __enter__(self) -> ExtrinsicClient:
         return self

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,12 +14,14 @@ from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, PointCloud2, PointField
+from std_msgs.msg import Header
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
 from calib_ros.messages.point_fields import LIVOX_FIELDS, LIVOX_OFFSETS, LIVOX_STRIDE, livox_scan
+from calib_ros.messages.wire import WireHeader, wire_header
 from calib_ros.result import Extrinsic
 
 # ROS orders covariances of poses translation first; calib_ros has rotation first. The way back is the same.
@@ -26,10 +29,40 @@ _ROS_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 LIVOX_DATATYPES = {"u4": PointField.UINT32, "f4": PointField.FLOAT32, "u1": PointField.UINT8}
 
 
-def frame_from_messages(image: Any, cloud: Any, camera: Camera) -> Frame:
+def frame_from_messages(image: Serialized, cloud: Serialized, camera: Camera) -> Frame:
     """Image or CompressedImage and PointCloud2 -> Frame. BadInputError if one of them cannot be decoded."""
-    pixels = decode_compressed_image(image) if hasattr(image, "format") else decode_image(image)
-    return Frame(pixels, decode_cloud(cloud), camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
+    picture = image.message()
+    pixels = decode_compressed_image(picture) if hasattr(picture, "format") else decode_image(picture)
+    return Frame(pixels, cloud_from_message(cloud), camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
+
+
+def cloud_from_message(cloud: Serialized) -> PointCloud:
+    """PointCloud2 -> PointCloud. BadInputError if it cannot be decoded."""
+    return decode_cloud(cloud.message())
+
+
+@dataclass(frozen=True, eq=False)
+class Serialized:
+    """A message as received, of which nothing but the header has been decoded. header: std_msgs/Header. restore: `data`, its CDR
+    bytes, -> the message."""
+
+    header: Header
+    data: bytes
+    restore: Callable[[bytes], Any]
+
+    @classmethod
+    def of(cls, data: bytes, restore: Callable[[bytes], Any]) -> Serialized:
+        """From the bytes of a message that begins with a header."""
+        return cls(header_message(wire_header(data)), data, restore)
+
+    def message(self) -> Any:
+        """The message, decoded anew."""
+        return self.restore(self.data)
+
+
+def header_message(header: WireHeader) -> Header:
+    """The header of a message that is still serialised -> std_msgs/Header."""
+    return Header(stamp=Time(sec=header.seconds, nanosec=header.nanoseconds), frame_id=header.frame_id)
 
 
 def cloud_of_livox(data: bytes) -> PointCloud2:
@@ -38,7 +71,7 @@ def cloud_of_livox(data: bytes) -> PointCloud2:
     msg = PointCloud2(
         height=1, width=scan.width, point_step=LIVOX_STRIDE, row_step=len(scan.points), is_bigendian=scan.big_endian
     )
-    msg.header.stamp.sec, msg.header.stamp.nanosec, msg.header.frame_id = scan.seconds, scan.nanoseconds, scan.frame_id
+    msg.header = header_message(scan.header)
     msg.fields = [
         PointField(name=name, offset=offset, datatype=LIVOX_DATATYPES[kind], count=1)
         for (name, kind), offset in zip(LIVOX_FIELDS.items(), LIVOX_OFFSETS, strict=True)

@@ -182,6 +182,7 @@ class Diagnostics:
             **self._pairing.describe(),
             "stamps jumped back": str(counts.jumps_back),
             "pairs dropped by a busy worker": str(pipeline.dropped_pairs),
+            "pairs left out at rest": str(pipeline.rested_pairs),
             "keyframes in the buffer": str(len(recalibrator.buffer) if recalibrator else 0),
             "keyframes so far": str(recalibrator.keyframes_seen if recalibrator else 0),
             "frames too fast for a keyframe": str(gate.rejected),

@@ -13,14 +13,13 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from calib_ros.extensions import node_services
-from calib_ros.messages import decode_cloud
 from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.bags import Capture
 from calib_ros.ros.calibrate import CalibrateServers
-from calib_ros.ros.conversions import frame_from_messages, transform_message
+from calib_ros.ros.conversions import cloud_from_message, frame_from_messages, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, ProcessedPublisher
@@ -53,7 +52,7 @@ class RosInterface:
         self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
-        inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, decode_cloud, self.tf.other_frames)
+        inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, cloud_from_message, self.tf.other_frames)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
         self.pipeline.pause(INACTIVE)
         self.processed = ProcessedPublisher(node, self.pipeline)

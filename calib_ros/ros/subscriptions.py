@@ -15,6 +15,7 @@ from geometry_msgs.msg import TwistStamped
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from std_msgs.msg import Header
 
@@ -25,7 +26,7 @@ from calib_ros.messages.point_fields import LIVOX
 from calib_ros.messages.video import VIDEO
 from calib_ros.online.pairing.health import MISSING_SHARE
 from calib_ros.online.pipeline import Pipeline
-from calib_ros.ros.conversions import cloud_of_livox
+from calib_ros.ros.conversions import Serialized, cloud_of_livox
 from calib_ros.ros.dds import profile_for_sender
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.parameters import Parameters
@@ -47,10 +48,16 @@ POINTS_ADVICE = {
 
 
 class Form(NamedTuple):
-    """A message type of a topic. decode: its serialised bytes -> the message that the callback gets; None for the type itself."""
+    """A message type of a topic. restore: bytes of it -> the message, for a callback that gets it Serialized; None for one that
+    gets the message itself."""
 
     kind: type[Any]
-    decode: Callable[[bytes], Any] | None = None
+    restore: Callable[[bytes], Any] | None = None
+
+
+def serialized(kind: type[Any]) -> Form:
+    """What is large, and decoded only where it is looked at."""
+    return Form(kind, partial(deserialize_message, message_type=kind))
 
 
 def type_name(kind: type[Any]) -> str:
@@ -96,10 +103,10 @@ class SensorSubscriptions:
         pipeline = self._pipeline
         subscribe = partial(AdaptiveSubscription, self._node, preference=parameters["reliability"], guard=self._health.guard)
         self.adaptive = (
-            subscribe(self._image, "image", self._forwarding_to(pipeline.add_image)),
-            subscribe(PointCloud2, "points", self._forwarding_to(pipeline.add_cloud), others=livox_forms()),
+            subscribe([serialized(self._image)], "image", self._forwarding_to(pipeline.add_image)),
+            subscribe([serialized(PointCloud2), *livox_forms()], "points", self._forwarding_to(pipeline.add_cloud)),
             # A camera's driver may publish once, latched, what never changes.
-            subscribe(CameraInfo, "camera_info", self._on_camera_info, latched=True),
+            subscribe([Form(CameraInfo)], "camera_info", self._on_camera_info, latched=True),
         )
         if self._motion is not None:
             motion = self._motion
@@ -171,29 +178,26 @@ class AdaptiveSubscription:
 
     callback: called with stamp, ns, and message. preference: "auto", or "best_effort" or "reliable" whatever the publishers are;
     it may be replaced at any time and holds from the next check() on. latched: receive what was published before as well, where
-    all publishers keep it. guard: context that callbacks run in. others: types that are received as well, one at a time, where
-    nobody publishes `kind`. largest: bytes of data in the largest message so far. To be used on the executor's thread. No message
-    is lost or received twice in a change of reliability.
+    all publishers keep it. guard: context that callbacks run in. forms: types that are received, one at a time, the first that
+    somebody publishes. largest: bytes of data in the largest message so far. To be used on the executor's thread. No message is
+    lost or received twice in a change of reliability.
     """
 
     def __init__(
         self,
         node: Node,
-        kind: type[Any],
+        forms: Sequence[Form],
         topic: str,
         callback: Callable[[int, Any], None],
         preference: str,
         latched: bool = False,
         guard: Callable[[], AbstractContextManager[None]] = nullcontext,
-        others: Sequence[Form] = (),
     ) -> None:
         self.preference = preference
         self._guard = guard
         self._node, self._callback, self._latched = node, callback, latched
         self._topic = topic
-        self.kind = kind
-        self._forms = (Form(kind), *others)
-        self._form = self._forms[0]
+        self._forms, self._form = forms, forms[0]
         self.largest = 0
         self._received = self._lost = 0
         self._history: deque[tuple[int, int]] = deque(maxlen=LOSS_CHECKS)  # received and lost so far, at every check
@@ -207,6 +211,11 @@ class AdaptiveSubscription:
     def topic(self) -> str:
         """Full name, after remapping."""
         return str(self._current.topic_name)
+
+    @property
+    def kind(self) -> type[Any]:
+        """The type that is received."""
+        return self._form.kind
 
     @property
     def reliable(self) -> bool:
@@ -259,10 +268,10 @@ class AdaptiveSubscription:
         return reliability, durability
 
     def _problem(self, types: list[str], publishers: list[QoSProfile]) -> str:
-        others = sorted(set(types) - {type_name(self._form.kind)})
+        others = sorted(set(types) - {type_name(self.kind)})
         if others:
-            text = f"{', '.join(others)}, but {type_name(self._form.kind)} is wanted"
-            return f"{self.topic} is published as {text}; {advice(others[0], self.kind)}"
+            text = f"{', '.join(others)}, but {type_name(self.kind)} is wanted"
+            return f"{self.topic} is published as {text}; {advice(others[0], self._forms[0].kind)}"
         if self.reliable and any(p.reliability == BEST_EFFORT for p in publishers):
             return f"a publisher of {self.topic} offers best effort only and cannot be received; set reliability: auto"
         return ""
@@ -270,8 +279,9 @@ class AdaptiveSubscription:
     def _subscribe(self) -> Any:
         qos = QoSProfile(depth=DEPTH, reliability=self._qos[0], durability=self._qos[1])
         self._made += 1
-        receive, raw = partial(self._receive, self._made, self._form.decode), self._form.decode is not None
-        subscribe = partial(self._node.create_subscription, self._form.kind, self._topic, receive, qos, raw=raw)
+        kind, restore = self._form
+        receive = partial(self._receive, self._made, restore)
+        subscribe = partial(self._node.create_subscription, kind, self._topic, receive, qos, raw=restore is not None)
         try:
             return subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
         except UnsupportedEventTypeError:  # by this middleware; gaps in the stamps remain
@@ -280,9 +290,9 @@ class AdaptiveSubscription:
     def _on_lost(self, event: Any) -> None:
         self._lost += event.total_count_change
 
-    def _receive(self, subscription: int, decode: Callable[[bytes], Any] | None, msg: Any) -> None:
+    def _receive(self, subscription: int, restore: Callable[[bytes], Any] | None, msg: Any) -> None:
         with self._guard():
-            msg = msg if decode is None else decode(msg)
+            msg = msg if restore is None else Serialized.of(msg, restore)
             stamp = stamp_ns(msg.header.stamp)
             # Received through the other subscription already. Through the same one it is another message: time may stand still,
             # or not be stamped at all.

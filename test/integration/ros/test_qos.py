@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
 from typing import Any
@@ -25,7 +25,7 @@ from waiting import until
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import decode_cloud
 from calib_ros.messages.point_fields import decode_livox
-from calib_ros.ros.subscriptions import AdaptiveSubscription, Form, advice, livox_forms
+from calib_ros.ros.subscriptions import AdaptiveSubscription, Form, advice, livox_forms, serialized
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -45,13 +45,11 @@ class Topic:
         self.got: list[int] = []
         self.sent = 0
 
-    def subscribe(
-        self, preference: str, latched: bool = False, kind: type[Any] = CameraInfo, others: Sequence[Form] = ()
-    ) -> AdaptiveSubscription:
+    def subscribe(self, preference: str, latched: bool = False, kind: type[Any] = CameraInfo) -> AdaptiveSubscription:
         def receive(stamp: int, msg: Any) -> None:
             self.got.append(msg.height)
 
-        return AdaptiveSubscription(self.listener, kind, "info", receive, preference, latched, others=others)
+        return AdaptiveSubscription(self.listener, [Form(kind)], "info", receive, preference, latched)
 
     def publisher(self, qos: QoSProfile) -> Any:
         count = self.publishers()
@@ -190,8 +188,9 @@ def test_what_drivers_publish_else_has_its_own_advice(wanted, published, text):
 def test_clouds_of_livox_are_received_while_nobody_publishes_usual_ones(across_processes, topic):
     messages = pytest.importorskip("livox_ros_driver2.msg", reason="livox_ros_driver2 is not installed")
     clouds: list[tuple[int, Any]] = []
+    forms = [serialized(PointCloud2), *livox_forms()]
     subscription = AdaptiveSubscription(
-        topic.listener, PointCloud2, "info", lambda stamp, msg: clouds.append((stamp, msg)), "auto", others=livox_forms()
+        topic.listener, forms, "info", lambda stamp, msg: clouds.append((stamp, msg.message())), "auto"
     )
 
     def arrives(publisher: Any, message: Any, count: int) -> Any:
