@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -89,14 +90,17 @@ def oriented_edges(
 def smallest_magnitude(magnitude: Map, used: Mask | None = None) -> float:
     """Sobel magnitude (H, W) -> the magnitude from which on it counts as an edge: above some 98 % of the picture's own noise.
     used: (H, W), the pixels that are asked; None = all."""
-    rows, columns = (max(min(TILES, size // MIN_TILE), 1) for size in magnitude.shape)
-    scales = []
-    for band in np.array_split(np.arange(magnitude.shape[0]), rows):
-        height = slice(band[0], band[-1] + 1, 2)
-        for part in np.array_split(np.arange(magnitude.shape[1]), columns):
-            tile = height, slice(part[0], part[-1] + 1, 2)
-            if used is None or used[tile].all():
-                scales.append(_partitioned(magnitude[tile].ravel(), LOW))
+    rows, columns = (_parts(size, max(min(TILES, size // MIN_TILE), 1)) for size in magnitude.shape)
+    scales: list[float] = []
+    for (top, down, height), (left, across, width) in product(rows, columns):  # tiles of one size at once
+        block = np.s_[top : top + down * height, left : left + across * width]
+        tiles = magnitude[block].reshape(down, height, across, width)[:, ::2, :, ::2].transpose(0, 2, 1, 3)
+        values = tiles.reshape(down * across, -1)
+        if used is not None:
+            asked = used[block].reshape(down, height, across, width)[:, ::2, :, ::2].all(axis=(1, 3)).ravel()
+            values = values[asked]
+        k = _rank(values.shape[1], LOW)
+        scales += np.partition(values, k, axis=1)[:, k].tolist()
     # What is over- or underexposed has no gradients at all, nor noise.
     scale = np.array([s for s in scales if s > 0]) / np.sqrt(-2 * np.log(1 - LOW / 100))
     if not len(scale):
@@ -104,8 +108,19 @@ def smallest_magnitude(magnitude: Map, used: Mask | None = None) -> float:
     return max(MIN_MAGNITUDE, float(np.percentile(scale, FLAT_TILES)) * float(np.sqrt(-2 * np.log(NOISE_PASSED))))
 
 
+def _parts(size: int, count: int) -> list[tuple[int, int, int]]:
+    """(begin, number, size) of `count` parts of about the same size, the larger ones first."""
+    small, larger = divmod(size, count)
+    parts = [(0, larger, small + 1), (larger * (small + 1), count - larger, small)]
+    return [part for part in parts if part[1] > 0]
+
+
+def _rank(count: int, percentile: float) -> int:
+    return min(int(count * percentile / 100), count - 1)
+
+
 def _partitioned(values: Map, percentile: float) -> float:
-    k = min(int(len(values) * percentile / 100), len(values) - 1)
+    k = _rank(len(values), percentile)
     return float(np.partition(values, k)[k])
 
 

@@ -207,14 +207,14 @@ class Schedule:
         """The estimate that began last ended without a result."""
         self._estimated = self._estimated_before
 
-    def due(self, at_rest: bool = False, urgent: bool = False) -> bool:
+    def due(self, rest_s: float = 0.0, urgent: bool = False) -> bool:
         """True if new keyframes are to be estimated now; the first ones at once, as after a clock was set back.
 
-        at_rest: the extrinsic is steady and all newer keyframes fit it, for which mode continuous waits. urgent: it has moved or
+        rest_s: between estimates of mode continuous, where the extrinsic is at rest, else 0. urgent: it has moved or
         is to be confirmed, for which mode periodic does not.
         """
         if self.config.mode == CONTINUOUS:
-            return not at_rest or self._elapsed(self.config.rest_period_s)
+            return self._elapsed(rest_s)
         return self.config.mode == PERIODIC and (urgent or self._elapsed(self.config.period_s))
 
     def _elapsed(self, period_s: float) -> bool:

@@ -20,12 +20,12 @@ def seconds(s: float) -> int:
     return round(s * NANOSECONDS)
 
 
-def moments(schedule: Schedule, *times: float) -> list[bool]:
+def moments(schedule: Schedule, *times: float, rest_s: float = 0.0) -> list[bool]:
     """Whether an estimate is due at each of these times, s; where it is, it begins."""
     out = []
     for t in times:
         schedule.add_frame(seconds(t))
-        out.append(schedule.due(at_rest=True))
+        out.append(schedule.due(rest_s))
         if out[-1]:
             schedule.start_estimate()
     return out
@@ -33,22 +33,22 @@ def moments(schedule: Schedule, *times: float) -> list[bool]:
 
 @pytest.mark.parametrize(("mode", "due"), [("continuous", True), ("manual", False)])
 def test_continuous_mode_is_always_due_and_manual_never(mode: str, due: bool) -> None:
-    assert moments(Schedule(OnlineConfig(mode=mode, rest_period_s=0.0)), 0.0, 1.0, 1000.0, 0.5) == [due] * 4
+    assert moments(Schedule(OnlineConfig(mode=mode)), 0.0, 1.0, 1000.0, 0.5) == [due] * 4
 
 
 @pytest.mark.parametrize(
-    "config",
-    [OnlineConfig(mode="periodic", period_s=10.0, rest_period_s=0.0), OnlineConfig(rest_period_s=10.0)],
+    ("config", "rest_s"),
+    [(OnlineConfig(mode="periodic", period_s=10.0), 0.0), (OnlineConfig(), 10.0)],
     ids=["periodic", "rest"],
 )
-def test_periods_count_the_datas_own_stamps(config: OnlineConfig) -> None:
+def test_periods_count_the_datas_own_stamps(config: OnlineConfig, rest_s: float) -> None:
     schedule = Schedule(config)
-    assert schedule.due(at_rest=True)
-    assert moments(schedule, 100.0, 109.9, 110.0, 119.9, 500.0) == [True, False, True, False, True]
-    assert moments(schedule, 20.0, 20.0) == [True, False]  # a looping bag begins anew
+    assert schedule.due(rest_s)
+    assert moments(schedule, 100.0, 109.9, 110.0, 119.9, 500.0, rest_s=rest_s) == [True, False, True, False, True]
+    assert moments(schedule, 20.0, 20.0, rest_s=rest_s) == [True, False]  # a looping bag begins anew
     schedule.add_frame(seconds(28))
     schedule.start_estimate()  # as a request does: it starts the period anew
-    assert moments(schedule, 32.0, 38.0) == [False, True]
+    assert moments(schedule, 32.0, 38.0, rest_s=rest_s) == [False, True]
 
 
 @pytest.mark.parametrize(("mode", "estimates"), [("manual", 0), ("continuous", 7)])

@@ -94,7 +94,7 @@ def gaps(times: list[float]) -> list[float]:
 @pytest.fixture(autouse=True)
 def without_spacing(monkeypatch: pytest.MonkeyPatch) -> None:
     """At rest as many keyframes as else, unless the test says otherwise."""
-    monkeypatch.setattr(recalibrator_module, "REST_SPACING_S", 0.0)
+    monkeypatch.setattr(recalibrator_module, "REST_SPACING_S", (0.0, 0.0))
 
 
 @pytest.fixture
@@ -120,11 +120,12 @@ def test_a_steady_extrinsic_is_estimated_seldom_and_the_same_recording_gives_the
 ) -> None:
     parades = [Parade(street, start, online={"rest_period_s": 5.0}) for _ in range(2)]
     for parade in parades:
-        parade(15)
-        assert len(parade.keyframes) == 15  # each of them is tested
+        parade(30)
+        assert len(parade.keyframes) == 30  # each of them is tested
         assert parade.recalibrator.current.result.status == CONVERGED
-        assert 6 <= len(parade.estimates) <= 9  # 5 of them until it is steady
-        assert max(gaps(parade.estimates)) == 5.0
+        assert 6 <= len(parade.estimates) <= 10  # 5 of them until it is steady
+        assert max(gaps(parade.estimates[:7])) == 5.0
+        assert max(gaps(parade.estimates)) >= 10.0  # as long as it has been steady
     first, second = parades
     assert first.estimates == second.estimates
     np.testing.assert_array_equal(*(p.recalibrator.current.result.T_camera_lidar for p in parades))
@@ -133,7 +134,7 @@ def test_a_steady_extrinsic_is_estimated_seldom_and_the_same_recording_gives_the
 def test_at_rest_keyframes_are_taken_seldom_until_one_does_not_fit(
     street: list[Frame], start: np.ndarray, drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recalibrator_module, "REST_SPACING_S", 3.0)
+    monkeypatch.setattr(recalibrator_module, "REST_SPACING_S", (3.0, 3.0))
     parade = Parade(street, start)
     parade(18)
     seen, now, between = len(parade.keyframes), parade.n * GAP_S, gaps(parade.keyframes)
