@@ -72,8 +72,7 @@ class LensProjection:
     @np.errstate(all="ignore")
     def image(self, rays: Floats, reach: float = np.inf) -> Floats:
         """Rays (n, 3) of any length -> (n, 2) of the image plane; NaN beyond the limit, or beyond the angle `reach`, rad."""
-        angle = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-        seen = angle <= min(self.limit, reach)
+        seen = within(rays, min(self.limit, reach))
         out = np.full((len(rays), 2), np.nan)
         if seen.any():
             out[seen] = self.model.image(self.D, rays[seen])
@@ -107,6 +106,14 @@ class LensProjection:
         return out
 
 
+def within(rays: Floats, angle: float) -> NDArray[np.bool_]:
+    """Which rays (n, 3) are at most so far from the axis, rad."""
+    x, y, z = rays.T
+    if angle >= np.pi / 2:
+        return np.asarray(np.arctan2(np.hypot(x, y), z) <= angle)
+    return np.asarray((z > 0) & (x * x + y * y <= (z * np.tan(angle)) ** 2))
+
+
 def angles_of_rays(rays: Floats) -> Floats:
     """Rays (n, 3) of any length -> (n, 2) rad: the angle from the axis, towards x and towards y."""
     r = np.hypot(rays[:, 0], rays[:, 1])
@@ -121,6 +128,15 @@ def rays_of_angles(at: Floats) -> Floats:
 
 def _opencv(D: Floats, rays: Floats) -> Floats:
     """OpenCV's model of perspective lenses: radial, tangential, rational, thin prism, tilt."""
+    if not D[8:].any():  # ten times as fast as OpenCV's own, which also works out derivatives
+        k1, k2, p1, p2, k3, k4, k5, k6 = np.r_[D[:8], np.zeros(max(8 - len(D), 0))]
+        z = np.where(rays[:, 2] == 0, 1.0, rays[:, 2])
+        x, y = rays[:, 0] / z, rays[:, 1] / z
+        xy, r2 = 2 * x * y, x * x + y * y
+        scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        if k4 or k5 or k6:
+            scale /= 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        return np.asarray(np.c_[x * scale + p1 * xy + p2 * (r2 + 2 * x * x), y * scale + p1 * (r2 + 2 * y * y) + p2 * xy])
     zero = np.zeros(3)
     return np.asarray(cv2.projectPoints(rays[:, None], zero, zero, np.eye(3), D)[0], float).reshape(-1, 2)
 
