@@ -27,7 +27,7 @@ Matrix = NDArray[np.float64]
 
 RIGS = ("hdl64e_kitti", "os1_64_robot", "hdl32e_front", "pandar40p_roof", "vlp16_narrow", "os1_128_windshield")
 FRAMES, WIDTH, GAP_S = 100, 480, 3.0  # of a lap at 10 Hz, and s between laps
-QUIET_LAPS, LAPS = 30, 8  # of a trial
+QUIET_LAPS, LAPS, KNOCK_LAP = 30, 12, 7  # of a trial; the first lap of a knock, when the rest is deepest
 JITTER_S, LOST = 0.004, 0.01
 QUIET = "quiet"
 KNOCKS = {"0.5 deg": (0.5, 0.0), "1.5 deg": (1.5, 0.0), "5 cm": (0.0, 0.05), "15 cm": (0.0, 0.15)}
@@ -98,7 +98,7 @@ def driven(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int)
     counts, before, settled_s = {SUSPECT: 0, MOVED: 0}, "", 0.0
     kind, _, how = case.group.partition(", ")
     for n in range(QUIET_LAPS if kind == QUIET else LAPS):
-        knock_at = int(rng.integers(len(case.frames) // 2)) if kind != QUIET and n >= 1 else None
+        knock_at = int(rng.integers(len(case.frames) // 2)) if kind != QUIET and n >= KNOCK_LAP else None
         for k, frame in enumerate(lap):
             if knock_at is not None and k >= knock_at and recalibrator.current.result.status == CONVERGED:
                 return _after_knock(recalibrator, lap, frame, kind, how, case, rng)

@@ -36,6 +36,7 @@ DEPTH = 10  # half a second of a camera at 20 Hz
 HANDOVER_S = 1.0  # the old subscription stays so long: the new one has to be discovered first
 LOSS_CHECKS = 11  # checks, at one a second, over which lost messages count: 10 s
 MIN_LOSSES = 5  # messages in that time; fewer are those of the discovery
+AFTER_STAMP = 12  # bytes of a message: what comes behind is the same in nearly every CameraInfo
 MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
 # What to do about topics of other types, by what is wanted.
 IMAGE_ADVICE = {
@@ -89,7 +90,7 @@ class SensorSubscriptions:
         health: Health,
         on_received: Callable[[Header], None],
     ) -> None:
-        self.camera_info: CameraInfo | None = None
+        self.camera_info: Serialized | None = None
         self.adaptive: tuple[AdaptiveSubscription, ...] = ()
         self._node, self._pipeline, self._health = node, pipeline, health
         self._on_received = on_received
@@ -106,7 +107,7 @@ class SensorSubscriptions:
             subscribe([serialized(self._image)], "image", self._forwarding_to(pipeline.add_image)),
             subscribe([serialized(PointCloud2), *livox_forms()], "points", self._forwarding_to(pipeline.add_cloud)),
             # A camera's driver may publish once, latched, what never changes.
-            subscribe([Form(CameraInfo)], "camera_info", self._on_camera_info, latched=True),
+            subscribe([serialized(CameraInfo)], "camera_info", self._on_camera_info, latched=True),
         )
         if self._motion is not None:
             motion = self._motion
@@ -137,7 +138,7 @@ class SensorSubscriptions:
         if parameters["image_is_rectified"] != self._rectified:
             self._rectified = parameters["image_is_rectified"]
             if self.camera_info is not None:
-                self._on_camera_info(0, self.camera_info)
+                self._use_camera(self.camera_info)
 
     def _forwarding_to(self, add: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
         def on_message(stamp: int, message: Any) -> None:
@@ -163,9 +164,13 @@ class SensorSubscriptions:
                 )
         return losses
 
-    def _on_camera_info(self, stamp: int, msg: CameraInfo) -> None:
+    def _on_camera_info(self, stamp: int, msg: Serialized) -> None:
+        if self.camera_info is None or msg.data[AFTER_STAMP:] != self.camera_info.data[AFTER_STAMP:]:
+            self._use_camera(msg)
+
+    def _use_camera(self, msg: Serialized) -> None:
         try:
-            camera = decode_camera_info(msg, self._rectified)
+            camera = decode_camera_info(msg.message(), self._rectified)
         except CalibrationError as error:
             self._health.error(str(error))
             return
