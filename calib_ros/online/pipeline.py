@@ -69,6 +69,7 @@ class Pipeline:
         self._lock = threading.Lock()
         self._announcer = Announcer(sink)
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
+        self._handed = -float("inf")  # when the newest pair was handed over to be ingested
         report = self._announcer.report
         self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, report, on_idle=lambda: sink(IntakeIdle()))
         self._estimator: Worker[None] = Worker("calib_estimate", self._estimate_and_defer, report)
@@ -119,6 +120,8 @@ class Pipeline:
         if found and stamp is not None and self.recalibrator is not None and not self.recalibrator.wants(stamp):
             self.rested_pairs += len(found)
             return
+        if found:
+            self._handed = time.monotonic()
         for intake in found:
             self.dropped_pairs += sum(replaced.paired for replaced in self._ingester.put(intake))
 
@@ -241,6 +244,10 @@ class Pipeline:
     def data_age_s(self) -> float:
         """Seconds since the newest pair that could be used was ingested; inf before the first."""
         return float("inf") if self._received is None else time.monotonic() - self._received
+
+    def starved(self, within_s: float) -> bool:
+        """True if pairs have come within so many seconds, but wait: too little CPU time is left to look at them."""
+        return self.taking_in and time.monotonic() - self._handed <= within_s
 
     def busy_seconds(self) -> tuple[float, float]:
         """Seconds that the threads for ingest and estimates have worked so far, or waited for a core or each other meanwhile."""

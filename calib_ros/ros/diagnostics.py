@@ -21,6 +21,7 @@ from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
+from calib_ros.ros.publishers import STARVED
 
 REPEAT_S = 10.0  # the same problem is logged at most this often
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
@@ -291,6 +292,8 @@ class Diagnostics:
             return WARN, "; ".join(self._health.losses.values())
         if missing:
             return STALE, f"no messages on {' and '.join(missing)}; check the remapping and the publisher's QoS"
+        if self._pipeline.data_age_s > SILENCE_S and self._pipeline.starved(SILENCE_S):
+            return WARN, STARVED
         if pairs:
             return None
         if self._pairing.waiting:

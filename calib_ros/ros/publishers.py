@@ -26,6 +26,10 @@ from calib_ros.ros.parameters import Parameters
 
 PROCESSED_KEPT = 100  # headers; more are of messages that are gone before a pair is worked off
 VALID_PERIODS = 2.5  # of publishing: one message may be late, and another one lost
+# Of max_data_age_s, for which an extrinsic stays usable while sensors deliver and only CPU time is missing: it may have moved
+# unnoticed, but nothing says so, and usable that comes and goes with the load helps nobody.
+STARVED_PERIODS = 3
+STARVED = "starved: pairs of image and cloud wait for CPU time; give the node a core, or a higher priority (launch argument nice)"
 
 
 class ExtrinsicPublisher:
@@ -55,11 +59,12 @@ class ExtrinsicPublisher:
         age, most = self._pipeline.data_age_s, self._parameters()["max_data_age_s"]
         if self._pipeline.paused:
             return Validity(False, 0, age, "not checked any more: the node is not active" if extrinsic.usable else "")
-        if age > most:
+        starved = self._pipeline.starved(most)
+        if age > (STARVED_PERIODS * most if starved else most):
             seen = f"no usable pair of image and cloud for {age:.0f} s" if age < float("inf") else "no usable pair yet"
-            return Validity(False, 0, age, f"not checked any more: {seen}" if extrinsic.usable else "")
-        now = self._node.get_clock().now().nanoseconds
-        return Validity(extrinsic.usable, now + round(self._valid_s * NANOSECONDS) if extrinsic.usable else 0, age)
+            return Validity(False, 0, age, f"not checked any more: {STARVED if starved else seen}" if extrinsic.usable else "")
+        until = self._node.get_clock().now().nanoseconds + round(self._valid_s * NANOSECONDS)
+        return Validity(extrinsic.usable, until if extrinsic.usable else 0, age, STARVED if starved and age > most else "")
 
     def publish(self, extrinsic: Extrinsic, stamp: int) -> None:
         """stamp: ns, of the newest data the extrinsic was tested with."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import threading
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -224,6 +226,32 @@ def test_an_extrinsic_is_usable_only_while_data_come(peer, street):
     peer.change(max_data_age_s=3600.0)
     peer.publish(street[5])
     peer.until(lambda: peer.extrinsics[-1].usable, "that data come again")
+
+
+def test_usable_outlives_a_lack_of_cpu_time_for_a_while(peer, street, monkeypatch):
+    """Pairs come, but nobody gets to look at them."""
+    looked, decode = threading.Event(), peer.pipeline._inputs.decode
+    inputs = dataclasses.replace(peer.pipeline._inputs, decode=lambda *pair: (looked.wait(), decode(*pair))[1])
+    monkeypatch.setattr(peer.pipeline, "_inputs", inputs)
+    peer.change(max_data_age_s=AGE_S)
+    later = (
+        dataclasses.replace(frame, stamp=street[-1].stamp + k * NANOSECONDS // 10, cloud_stamp=None)
+        for k, frame in enumerate(cycle(street), 1)
+    )
+
+    def said(usable: bool) -> Extrinsic:
+        def found() -> Extrinsic | None:
+            peer.publish(next(later), settle=False)
+            msg = peer.extrinsics[-1]
+            return msg if msg.usable == usable and "starved" in msg.reason else None
+
+        return peer.until(found, f"starved, usable {usable}")
+
+    assert seconds(said(True).data_age) > AGE_S
+    assert seconds(said(False).data_age) > 3 * AGE_S
+    looked.set()
+    peer.change(max_data_age_s=3600.0)
+    peer.until(lambda: peer.extrinsics[-1].usable, "that there is time again")
 
 
 def test_reset_goes_back_to_the_start_and_calibrate_answers_when_its_estimate_is_done(peer, street, drive):
