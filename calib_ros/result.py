@@ -109,7 +109,7 @@ class Result:
     motion : for people, how the vehicle's motion was dealt with.
     refusal : why it is refused or insufficient. refusal_figures : numbers that this rests on, by name, as ``seconds`` of
         ``wrong_times``.
-    optimum : (4, 4), the one that was refused. Not to be used as a calibration.
+    optimum : (4, 4), the one that was refused. Not to be used as a calibration. optimum_covariance* : (6, 6), of that one.
     evidence : what speaks for the optimum.
     intrinsics : ``focal_length_share``, ``principal_point_x_px`` and ``principal_point_y_px``: which change of the given ones, to
         which the extrinsic belongs, the scenes match best with. With camera.intrinsics: refine, the changes that were made,
@@ -148,6 +148,7 @@ class Result:
     refusal: RefusalCode | None = None
     refusal_figures: Mapping[str, float] = field(default_factory=dict)
     optimum: Transform | None = None
+    optimum_covariance: Covariance | None = None
     evidence: Evidence | None = None
     intrinsics: Mapping[str, IntrinsicEstimate] = field(default_factory=dict)
     origin: InitialSource | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,13 @@ from calib_ros.datasets.source import Source, WithMotion, neighbours
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.io import check_output
+from calib_ros.online.coach import need, words
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, GUESSES, MOTION, nominal_start
 from calib_ros.registration.search.constraints import NOMINAL_BOX, Axes
-from calib_ros.result import Extrinsic, Result
+from calib_ros.result import Extrinsic, RefusalCode, Result
 
 
 def calibrate(
@@ -71,6 +73,14 @@ def calibrate(
             shown = replace(shown, camera=result.refined_camera.camera)
         draw(overlay, shown, Extrinsic(result), config)
     return result
+
+
+def advice(result: Result, source: Source, config: Config) -> str:
+    """What frames to add where those given leave a direction open, in a line; "" where that is not what is missing."""
+    lacking = need(result, config) if result.refusal is RefusalCode.TOO_UNCERTAIN else None
+    if lacking is None:
+        return ""
+    return words(lacking, FeatureExtractor(source.camera, config).camera, result.T_camera_lidar, "add frames that show")
 
 
 def _read(source: Source, positions: list[int], config: Config) -> list[Frame]:
@@ -147,6 +157,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
                 "frame_stamp": frame.stamp,
                 "estimated": estimated,
                 "keyframes": len(recalibrator.buffer),
+                "advice": asdict(recalibrator.advice(extrinsic)),
                 "drift": extrinsic.normalised_innovation,
                 **result.to_dict(),
             }

@@ -88,7 +88,7 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    from calib_ros.cli.calibrate import calibrate
+    from calib_ros.cli.calibrate import advice, calibrate
     from calib_ros.cli.inputs import configuration, constraint_options, initial_of, open_named_source
     from calib_ros.cli.output import check_camera_info, check_json, print_or_save, save_camera_info, summary
 
@@ -98,11 +98,12 @@ def _calibrate(args: argparse.Namespace) -> int:
     config = configuration(args.config, args.seed, args.objective, constraints, args.threads, args.intrinsics, args.preset)
     args.initial = initial_of(args, config)
     check_camera_info(args.camera_info, config.camera)
+    source = open_named_source(args, config)
     result = calibrate(
-        *(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config),
+        *(source, args.frames, args.initial, args.yaw_deg, config),
         *(args.search_deg, args.search_m, args.overlay),
     )
-    print_or_save(result, summary(result), args.json)
+    print_or_save(result, summary(result, advice(result, source, config)), args.json)
     if args.camera_info is not None:
         save_camera_info(result, args.camera_info)
     return OK if result.converged else NOT_CONVERGED

@@ -57,11 +57,13 @@ def motion(frames: Sequence[Frame], config: MotionConfig) -> str:
     return f"points stay where they were measured, the vehicle's velocity is not known{unused}"
 
 
-def summary(result: Result, scan_period_s: float = MotionConfig.scan_period_s) -> str:
-    """What `calib-ros calibrate` prints. scan_period_s: see ``motion.scan_period_s``."""
+def summary(result: Result, advice: str = "", scan_period_s: float = MotionConfig.scan_period_s) -> str:
+    """What `calib-ros calibrate` prints. advice: what to add. scan_period_s: see ``motion.scan_period_s``."""
     lines = [f"{result.status}: {result.frames_used} frames, score {result.score:.3f}, {result.elapsed_s:.1f} s"]
     if result.reason:
         lines.append(result.reason)
+    if advice:
+        lines.append(f"advice: {advice}")
     lines.append(f"T_{result.camera_frame}_{result.lidar_frame}  {pose(result.T_camera_lidar)}")
     if result.covariance is not None:
         sigma = np.sqrt(np.diag(result.covariance))

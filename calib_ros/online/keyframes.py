@@ -125,6 +125,11 @@ class KeyframeBuffer:
         ids = set(map(id, chosen))
         return sum(id(own) in ids for own in list(self.features)[-count:]) if count > 0 else 0
 
+    def per_s(self, now: int | None) -> float:
+        """New keyframes per second from the oldest one kept until now, ns; 0 = unknown."""
+        elapsed = (now - self.features[0].stamp) / NANOSECONDS if now is not None and len(self.features) > 1 else 0.0
+        return (len(self.features) - 1) / elapsed if elapsed > 0 else 0.0
+
     def batch(self, chosen: Sequence[FrameFeatures]) -> Batch:
         """The chosen keyframes, for an estimate that begins now."""
         new, self.new = self.new, 0

@@ -191,17 +191,17 @@ class Schedule:
 
     def __init__(self, config: OnlineConfig) -> None:
         self.config = config
-        self._newest: int | None = None
+        self.newest: int | None = None  # stamp of the newest frame
         self._estimated: int | None = None
         self._estimated_before: int | None = None
 
     def add_frame(self, stamp: int) -> None:
         """A frame, keyframe or not, with its stamp."""
-        self._newest = stamp
+        self.newest = stamp
 
     def start_estimate(self) -> None:
         """An estimate begins, on request or not: the next period counts from the newest frame."""
-        self._estimated_before, self._estimated = self._estimated, self._newest
+        self._estimated_before, self._estimated = self._estimated, self.newest
 
     def cancel_estimate(self) -> None:
         """The estimate that began last ended without a result."""
@@ -218,7 +218,7 @@ class Schedule:
         return self.config.mode == PERIODIC and (urgent or self._elapsed(self.config.period_s))
 
     def _elapsed(self, period_s: float) -> bool:
-        if self._newest is None or self._estimated is None:
+        if self.newest is None or self._estimated is None:
             return True
-        elapsed = (self._newest - self._estimated) / NANOSECONDS
+        elapsed = (self.newest - self._estimated) / NANOSECONDS
         return elapsed < 0 or elapsed >= period_s

@@ -17,6 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.intrinsics import RefinedCamera
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
+from calib_ros.online.coach import Advice, Counted, advise
 from calib_ros.online.first_guess import FirstGuess
 from calib_ros.online.glance import Glance
 from calib_ros.online.keyframe_classes import KeyframeSegmenter
@@ -161,6 +162,17 @@ class Recalibrator:
         """The keyframes that an estimate would use, oldest first, the configuration of their features, the current extrinsic."""
         with self._lock:
             return self._informative() or list(self.buffer), self.config, self.current.result
+
+    def advice(self, extrinsic: Extrinsic | None = None) -> Advice:
+        """What an extrinsic of this recalibrator lacks, None = the current one, and what to do about it."""
+        camera = self.calibrator.extract.camera
+        with self._lock:
+            tracker, keyframes = self.tracker, self.keyframes
+            counted = Counted(
+                *(len(keyframes), keyframes.per_s(self.schedule.newest), tracker.fused_keyframes),
+                *(tracker.missing, tracker.confirmations, tracker.fault),
+            )
+            return advise((extrinsic or tracker.current).result, self.config, camera, counted)
 
     def ready(self) -> bool:
         """True if an estimate is due: enough keyframes, new ones among them, and online.mode allows it."""

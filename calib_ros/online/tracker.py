@@ -14,8 +14,8 @@ from calib_ros.config.online import MANUAL
 from calib_ros.online.clocks import ClockEvidence
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
-from calib_ros.online.sensor_health import SensorProblem
-from calib_ros.online.tracker_states import TRANSITIONS, TrackerEvent, TrackerState
+from calib_ros.online.sensor_health import SensorFault, SensorProblem
+from calib_ros.online.tracker_states import NOTHING, TRANSITIONS, Confirmations, TrackerEvent, TrackerState
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, pose_constraints
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
@@ -36,7 +36,7 @@ class Tracker:
 
     config may be replaced at any time. current: what to publish, a new object after every change. state: what it rests on.
     last_good: the newest extrinsic to rely on, None before the first. settled: successive estimates agree, so that they refine
-    instead of searching.
+    instead of searching. fused_keyframes: how many the covariance rests on.
     """
 
     def __init__(self, initial: Result, current: Result | None = None, config: Config | None = None) -> None:
@@ -54,6 +54,7 @@ class Tracker:
         self._accepted = self._rejected_in_a_row = self._agreeing_in_a_row = 0
         self._accepted_since_moved = 0  # or since the beginning
         self._estimated_at = result.data_stamp
+        self.fused_keyframes = 0.0
         self._consistent_keyframes, self._agreed = 0, False  # confirmations: keyframes, and another estimate
         self._clocks = ClockEvidence()
         self._objection = result.reason if self.lost else None  # of the monitor
@@ -89,6 +90,11 @@ class Tracker:
     def suspect(self) -> bool:
         """True while the monitor has yet to decide whether the extrinsic still holds."""
         return self._objection is not None and not self.lost
+
+    @property
+    def fault(self) -> SensorFault | None:
+        """Of a sensor that shows nothing."""
+        return None if self._sensor_problem is None else self._sensor_problem.fault
 
     @property
     def steady(self) -> bool:
@@ -220,6 +226,7 @@ class Tracker:
             score=estimate.score,
             refusal=estimate.refusal,
             optimum=estimate.optimum,
+            optimum_covariance=estimate.optimum_covariance,
         )
         self._rejected_in_a_row += 1
         if self._rejected_in_a_row >= UNSETTLING_REJECTIONS:  # refinement has lost the calibration: the mount may have moved
@@ -282,16 +289,31 @@ class Tracker:
     @property
     def tentative(self) -> bool:
         """True while the extrinsic rests on one estimate that neither further keyframes nor another estimate have confirmed."""
-        needed, monitored = self.config.tracker.confirmations, self.config.monitor.enabled
-        if self.state is not TrackerState.TENTATIVE or not needed:
-            return False
-        rests_on_clocks = self._clocks.open and self.config.motion.max_time_offset_s > 0
-        return (monitored and self._consistent_keyframes < needed) or rests_on_clocks or not self._is_agreed
+        return self.state is TrackerState.TENTATIVE and any(self.missing)
 
     @property
-    def _is_agreed(self) -> bool:
-        """Does another estimate agree? In mode manual no further one comes."""
-        return self._agreed or (self.config.online.mode == MANUAL and self.config.monitor.enabled)
+    def confirmations(self) -> Confirmations:
+        """What the current extrinsic needs in all, as far as it is known by now."""
+        keyframes, monitored = self.config.tracker.confirmations, self.config.monitor.enabled
+        if self.state is TrackerState.CONFIRMED or not keyframes:
+            return NOTHING
+        if self.state is TrackerState.INITIAL and self.last_good is not None:  # a saved one
+            return Confirmations(keyframes=1) if monitored else Confirmations(estimates=1)
+        estimates = int(self.config.online.mode != MANUAL or not monitored)  # in mode manual no further one comes
+        if self.lost:
+            estimates = RECOVERING + 1
+        clocks = self._clocks.open and self.config.motion.max_time_offset_s > 0
+        return Confirmations(keyframes if monitored else 0, estimates, int(clocks))
+
+    @property
+    def missing(self) -> Confirmations:
+        """Which of its confirmations the current extrinsic still lacks."""
+        needed, agreeing = self.confirmations, int(self._agreed)
+        if self.lost:
+            agreeing = self._agreeing_in_a_row + min(self._accepted_since_moved, 1)
+        return Confirmations(
+            max(needed.keyframes - self._consistent_keyframes, 0), max(needed.estimates - agreeing, 0), needed.clocks
+        )
 
     # ---- fusion -------------------------------------------------------------------------------------------------------
 
@@ -302,7 +324,8 @@ class Tracker:
             self.filter = PoseFilter(estimate.T_camera_lidar, self._box_covariance())
             return
         if restart:
-            self.filter, share_new = PoseFilter(T, self._box_covariance()), 1.0
+            self.filter, share_new, self.fused_keyframes = PoseFilter(T, self._box_covariance()), 1.0, 0.0
+        self.fused_keyframes += share_new * estimate.frames_used
         shared = np.zeros((6, 6)) if estimate.shared_covariance is None else estimate.shared_covariance
         self.filter.update(estimate.T_camera_lidar, estimate.covariance - shared, share_new)
         # Both are within the limits; the pose between them on SE(3) may be a hair outside.
@@ -354,13 +377,13 @@ class Tracker:
         elif self.suspect:
             result = replace(result, status=SUSPECT, reason=self._objection or "")
         elif result.converged and self.tentative:
-            seen, needed = self._consistent_keyframes, self.config.tracker.confirmations
-            missing = "frames of another speed or turn, which show whether the clocks agree"
-            if seen < needed and self.config.monitor.enabled:
-                missing = f"keyframes, {seen} of {needed}"
-            elif not self._is_agreed:
-                missing = "another estimate"
-            reason = "; ".join(filter(None, [f"to be confirmed by {missing}", result.reason]))
+            missing, needed = self.missing, self.confirmations.keyframes
+            by = "frames of another speed or turn, which show whether the clocks agree"
+            if missing.keyframes:
+                by = f"keyframes, {needed - missing.keyframes} of {needed}"
+            elif missing.estimates:
+                by = "another estimate"
+            reason = "; ".join(filter(None, [f"to be confirmed by {by}", result.reason]))
             result = replace(result, status=TENTATIVE, reason=reason)
         elif result.converged and not self._accepted and not self._consistent_keyframes:
             result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")

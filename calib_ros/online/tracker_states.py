@@ -7,6 +7,7 @@ states: they come and go over any of these, and what was known before holds agai
 from __future__ import annotations
 
 from enum import Enum
+from typing import NamedTuple
 
 
 class TrackerState(Enum):
@@ -16,6 +17,17 @@ class TrackerState(Enum):
     TENTATIVE = "one estimate, to be confirmed"
     CONFIRMED = "estimates and keyframes agree"
     LOST = "it has moved"
+
+
+class Confirmations(NamedTuple):
+    """What confirms an extrinsic. keyframes: consistent ones. estimates: that agree. clocks: 1 = frames that show the offset."""
+
+    keyframes: int = 0
+    estimates: int = 0
+    clocks: int = 0
+
+
+NOTHING = Confirmations()
 
 
 class TrackerEvent(Enum):

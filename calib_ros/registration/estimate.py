@@ -123,6 +123,7 @@ class Estimate:
             refusal=refusal.code if refusal else None,
             refusal_figures=refusal.figures if refusal else {},
             optimum=self.pose.T if refusal else None,
+            optimum_covariance=self.pose.covariance if refusal else None,
             data_stamp=max(f.stamp for f in features),
             score=objective.value(self.pose.T),
             initial_score=objective.value(self.start),

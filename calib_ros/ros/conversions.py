@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
+from calib_ros_msgs.msg import Advice as AdviceMsg
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
 from calib_ros.messages.point_fields import LIVOX_FIELDS, LIVOX_OFFSETS, LIVOX_STRIDE, livox_scan
 from calib_ros.messages.wire import WireHeader, wire_header
+from calib_ros.online.coach import Advice
 from calib_ros.result import Extrinsic
 
 # ROS orders covariances of poses translation first; calib_ros has rotation first. The way back is the same.
@@ -125,9 +127,10 @@ class Validity:
 
 
 UNKNOWN = Validity()
+NO_ADVICE = Advice()
 
 
-def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNKNOWN) -> ExtrinsicMsg:
+def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNKNOWN, advice: Advice = NO_ADVICE) -> ExtrinsicMsg:
     """The current extrinsic -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element.
 
     The field `drift` is the normalised innovation. stamp: ns, of the newest data.
@@ -145,7 +148,16 @@ def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNK
         msg.time_offset, msg.time_offset_sigma = result.time_offset_s, result.time_offset_sigma_s
     else:
         msg.time_offset_sigma = -1.0
+    msg.advice = AdviceMsg(weak=list(advice.weak), text=advice.text, progress=advice.progress)
+    msg.advice.remaining = duration_message(-1.0 if advice.remaining_s is None else advice.remaining_s)
     return msg
+
+
+def advice_of(msg: ExtrinsicMsg) -> Advice:
+    """The other way."""
+    told, remaining = msg.advice, msg.advice.remaining
+    known = remaining.sec >= 0
+    return Advice(tuple(told.weak), told.text, told.progress, remaining.sec + remaining.nanosec / NANOSECONDS if known else None)
 
 
 def covariance_for_ros(covariance: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -233,6 +233,9 @@ class Diagnostics:
             values["sigma of translation, m"] = f"{sigma[3:].max():.4f}"
         if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
             values["time offset, ms"] = f"{1000 * result.time_offset_s:.1f} +- {1000 * result.time_offset_sigma_s:.1f}"
+        if recalibrator is not None:
+            advice = recalibrator.advice(state)
+            values |= {"advice": advice.text or "none", "progress, %": f"{100 * advice.progress:.0f}"}
         if recalibrator is not None and recalibrator.config.camera.intrinsics == REFINE:
             values |= refined_values(recalibrator.refined_camera)
         return values

@@ -21,7 +21,7 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.overlay import caption, render
 from calib_ros.result import Extrinsic
-from calib_ros.ros.conversions import UNKNOWN, Validity, duration_message, extrinsic_message, image_message
+from calib_ros.ros.conversions import NO_ADVICE, UNKNOWN, Validity, duration_message, extrinsic_message, image_message
 from calib_ros.ros.parameters import Parameters
 
 PROCESSED_KEPT = 100  # headers; more are of messages that are gone before a pair is worked off
@@ -76,7 +76,9 @@ class ExtrinsicPublisher:
         validity = self.validity(extrinsic)
         if validity.usable:
             self._last_good = (extrinsic, self.stamp, time.monotonic() - validity.data_age_s)
-        return extrinsic_message(extrinsic, self.stamp, validity)
+        recalibrator = self._pipeline.recalibrator
+        advice = NO_ADVICE if recalibrator is None else recalibrator.advice(extrinsic)
+        return extrinsic_message(extrinsic, self.stamp, validity, advice)
 
     def last_good(self) -> ExtrinsicMsg | None:
         """The newest message that said usable, with the age it has by now; None before the first."""

@@ -28,6 +28,7 @@ from std_srvs.srv import Trigger
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.messages import decode_image
 from calib_ros.ros.client import result_from_message
+from calib_ros.ros.conversions import advice_of
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros_view.session.live import BAD, GOOD, NEUTRAL, Diagnosis, LiveHistory, NodeState, Presence
 
@@ -352,7 +353,8 @@ class Watch:
             self._note(f"an extrinsic that cannot be read: {error}", BAD)
             return
         age = message.data_age.sec + 1e-9 * message.data_age.nanosec
-        state = NodeState(result, float(message.drift), bool(message.usable), age if age >= 0 else float("nan"))
+        age = age if age >= 0 else float("nan")
+        state = NodeState(result, float(message.drift), bool(message.usable), age, str(advice_of(message)))
         with self.lock:
             self.history.add_extrinsic(time.time(), state)
 

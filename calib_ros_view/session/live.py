@@ -61,12 +61,13 @@ class Event:
 
 @dataclass(frozen=True, eq=False)
 class NodeState:
-    """The newest of ~/extrinsic. data_age_s: NaN = no data yet."""
+    """The newest of ~/extrinsic. data_age_s: NaN = no data yet. advice: what it lacks, in a line."""
 
     result: Result
     drift: float = 0.0
     usable: bool = False
     data_age_s: float = math.nan
+    advice: str = ""
 
     @property
     def level(self) -> str:

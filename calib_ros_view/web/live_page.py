@@ -144,6 +144,7 @@ class _ClientPage:
                 self.usable = ui.label().classes("font-medium")
             self.words = ui.label().classes("wrap")
             self.reason = ui.label().classes("muted wrap")
+            self.advice = ui.label().classes("wrap")
             self.numbers = ui.html("", sanitize=False).classes("w-full")
 
     def _build_actions(self) -> None:
@@ -310,6 +311,7 @@ class _ClientPage:
                 poses, measures = history.poses(since, self._reference()), history.measures.rows(since, 300)
         self.shown_from, self.shown_to = since, now
         self.badge.text, self.usable.text, self.words.text, self.reason.text = said.badge, said.usable, said.words, said.reason
+        self.advice.text = f"To do: {said.advice}" if said.advice else ""
         self.badge.style(f"background: {said.colour}")
         self.strip.style(f"background-image: {live_charts.strip_css(strip, since, now)}")
         self.legend.content = legend_html(list(dict.fromkeys(status for _, _, status in strip)))

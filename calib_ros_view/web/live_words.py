@@ -84,13 +84,15 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class Said:
-    """badge: the status. level: how good it is. usable: in words, or nothing. words: what it means. reason: why it is so."""
+    """badge: the status. level: how good it is. usable: in words, or nothing. words: what it means. reason: why it is so. advice:
+    what to do, or nothing."""
 
     badge: str
     level: str
     usable: str
     words: str
     reason: str
+    advice: str = ""
 
     @property
     def colour(self) -> str:
@@ -125,7 +127,7 @@ def said_of(watch: Watch, now: float) -> Said:
     for sign in ":;":  # the badge says the status already
         problem = problem.removeprefix(f"{state.result.status}{sign} ")
     reason = problem if own in problem else "; ".join(filter(None, [own, problem]))
-    return Said(state.result.status, state.level, "usable" if state.usable else "not usable", state.words, reason)
+    return Said(state.result.status, state.level, "usable" if state.usable else "not usable", state.words, reason, state.advice)
 
 
 def numbers_html(history: LiveHistory) -> str:

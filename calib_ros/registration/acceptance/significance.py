@@ -123,15 +123,20 @@ def leaves_doubt(result: Result) -> bool:
     return not result.converged or result.evidence is None or result.evidence.z_score < UNDOUBTED_Z
 
 
+def largest_sigmas(tolerance_deg: float, tolerance_m: float) -> tuple[float, float]:
+    """Standard deviations, deg and m, of the axes of a rotation and a shift that are within the tolerance with 90 %, where the
+    axes share it alike."""
+    share = 1 / (WITH_90_PERCENT * np.sqrt(3))
+    return share * tolerance_deg, share * tolerance_m
+
+
 def check_uncertainty(covariance: Covariance, tolerance_deg: float, tolerance_m: float) -> Refusal | None:
     """Is an extrinsic of this covariance (6, 6) known to within the tolerance? Its rotation and its shift, with 90 %."""
     sigma = np.sqrt(np.diag(covariance))
-    limit_deg, limit_m = tolerance_deg / WITH_90_PERCENT, tolerance_m / WITH_90_PERCENT
-    if np.rad2deg(np.linalg.norm(sigma[:3])) <= limit_deg and np.linalg.norm(sigma[3:]) <= limit_m:
+    limits = largest_sigmas(tolerance_deg, tolerance_m)
+    if max(np.rad2deg(np.linalg.norm(sigma[:3])) / limits[0], np.linalg.norm(sigma[3:]) / limits[1]) <= np.sqrt(3):
         return None
-    # A rotation or a shift within the limit has its axes within it divided by the root of 3, if they share it alike.
-    directions = unobservable_directions(covariance, limit_deg / np.sqrt(3), limit_m / np.sqrt(3))
-    return too_uncertain(directions, tolerance_deg, tolerance_m)
+    return too_uncertain(unobservable_directions(covariance, *limits), tolerance_deg, tolerance_m)
 
 
 def semantic_likelihood_ratio(consistency: PointScore | None, T: Transform) -> float:

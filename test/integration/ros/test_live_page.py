@@ -38,7 +38,7 @@ def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(live, open_p
     with Peer(**start_parameters(drive.reference), **QUICK, online__mode="manual", initial_from_tf=False) as peer:
         vehicle = Vehicle(peer, street, drive.reference)
         peer.drive(vehicle.frame() for _ in range(4))
-        shows(browser, "Nothing estimated yet")
+        shows(browser, "Nothing estimated yet", "To do: call ~/calibrate")
         shows(browser, "keyframe", "drawn in")  # by itself
         press(browser, "g")
         shows(browser, "4 keyframes, drawn in")

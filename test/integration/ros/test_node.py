@@ -173,6 +173,10 @@ def test_the_start_is_published_again_and_again_and_not_usable(peer, street, dri
     assert not any(msg.usable for msg in peer.extrinsics)
     assert (first.status, first.estimated_at.sec) == ("initial", 0)
     np.testing.assert_allclose(matrix(first), off(drive.reference), atol=1e-9)
+    advice = peer.get_extrinsic().extrinsic.advice
+    assert advice.text == "keep driving: 1 of 4 keyframes, each of another view"
+    assert 0 < advice.progress < 0.3
+    assert advice.remaining.sec == -1, "one keyframe has no pace"
 
 
 def test_from_messages_to_a_published_extrinsic(peer, street, drive):
@@ -185,6 +189,10 @@ def test_from_messages_to_a_published_extrinsic(peer, street, drive):
     result = result_from_message(answer.extrinsic)
     assert is_near(drive.reference, result.T_camera_lidar, 0.3, 0.08)
     assert result.frames_used == len(peer.recalibrator.buffer) >= 5
+    assert (list(answer.extrinsic.advice.weak), answer.extrinsic.advice.text) == ([], "")
+    assert (answer.extrinsic.advice.progress, seconds(answer.extrinsic.advice.remaining)) == (1.0, 0.0)
+    values = {value.key: value.value for value in peer.until(lambda: peer.diagnostics, "diagnostics")[-1].status[0].values}
+    assert {"advice", "progress, %"} <= values.keys()
     # The covariance crosses the border into ROS's order and back unchanged.
     np.testing.assert_allclose(result.covariance, peer.recalibrator.current.result.covariance)
     assert np.sqrt(answer.extrinsic.covariance[0]) == pytest.approx(0.018, abs=0.02)  # metres come first in ROS

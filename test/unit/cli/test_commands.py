@@ -21,7 +21,7 @@ from paths import ROOT
 from calib_ros import open_dataset, se3
 from calib_ros.camera import Camera
 from calib_ros.cli import inputs, main
-from calib_ros.cli.calibrate import calibrate
+from calib_ros.cli.calibrate import advice, calibrate
 from calib_ros.cli.inputs import ConstraintOptions
 from calib_ros.cli.output import motion, summary
 from calib_ros.config import Config, MotionConfig, update
@@ -30,7 +30,7 @@ from calib_ros.frame import Frame
 from calib_ros.intrinsics import FOCAL, camera_info_yaml, changed
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
-from calib_ros.result import CONVERGED, Result, load
+from calib_ros.result import CONVERGED, REFUSED, RefusalCode, Result, load
 from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
@@ -300,6 +300,8 @@ def test_replay_prints_a_line_per_estimate_and_keeps_constraints_between_them(
     assert code == 0
     lines = [json.loads(line) for line in out.splitlines()]  # one per estimate
     assert [line["keyframes"] for line in lines] == [5, 6]
+    assert lines[0]["advice"]["text"] == "keep driving: 0 of 5 further keyframes"
+    assert lines[0]["advice"]["progress"] < lines[1]["advice"]["progress"] < 1
     assert lines[-1]["status"] == "tentative"  # as many keyframes again would confirm it
     assert lines[-1]["reference_error"]["rotation_deg"] < 0.3
 
@@ -422,6 +424,14 @@ def test_summary_names_outlier_frames() -> None:
     ]
     agreeing = summary(Result(np.eye(4), CONVERGED, frame_scores=(0.5, 0.6), frame_names=("a", "b")))
     assert not {"search", "left", "frame", "motion"} & {line.split()[0].rstrip(":") for line in agreeing.splitlines()}
+
+
+def test_summary_says_which_scenes_show_what_is_not_known(drive: SyntheticDrive) -> None:
+    unknown = np.diag(np.square([1e-4, 1e-4, 0.02, 1e-3, 1e-3, 1e-3]))
+    refused = Result(np.eye(4), REFUSED, "why", refusal=RefusalCode.TOO_UNCERTAIN, optimum_covariance=unknown)
+    line = "advice: not known well enough: roll; add frames that show edges at any distance towards the sides of the image"
+    assert line in summary(refused, advice(refused, drive, Config())).splitlines()
+    assert advice(replace(refused, refusal=RefusalCode.NOT_SIGNIFICANT), drive, Config()) == ""
 
 
 def test_summary_reports_deskewing(street: list) -> None:
