@@ -153,7 +153,7 @@ def sights(lacking: Need, camera: Camera, T: Transform) -> tuple[Sight, ...]:
         elif axis == "forward":  # no rotation looks like it; at the border it moves edges by so much less
             found.append(Sight("edges", "parked cars, walls, poles", nearer=border * near(0.0), at_sides=True))
         elif axis == "roll":
-            found.append(Sight("edges", at_sides=True))
+            found += [] if "forward" in lacking.weak else [Sight("edges", at_sides=True)]
         elif any(TURN_LIKE.get(other) == axis for other in lacking.weak):
             found.append(Sight(edges[0], farther=FAR * near(turns[axis])))
         else:

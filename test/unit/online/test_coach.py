@@ -105,6 +105,7 @@ def test_an_edge_has_to_be_as_near_as_the_rotation_beside_it_is_badly_known() ->
         (covariance(height=2.0), "horizontal edges nearer than 20 m (parked cars, low walls, kerbs)"),
         (covariance(sideways=2.0), "vertical edges nearer than 20 m (poles, trunks, corners of buildings)"),
         (covariance(forward=2.0), "edges nearer than 12 m towards the sides of the image (parked cars, walls, poles)"),
+        (covariance(roll=3.0, forward=2.0), "edges nearer than 12 m towards the sides of the image (parked cars, walls, poles)"),
         (covariance(roll=2.0), "edges at any distance towards the sides of the image"),
         (covariance(yaw=2.0), "vertical edges at any distance (poles, trunks, corners of buildings)"),
         (
