@@ -15,7 +15,7 @@ from calib_ros.online.monitor import Assessment, Verdict
 from calib_ros.online.pose_filter import SYSTEMATIC_COVARIANCE, PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorFault, SensorProblem
 from calib_ros.online.tracker import RECOVERING, SETTLED_DEG, SETTLED_M, UNSETTLING_REJECTIONS, Tracker
-from calib_ros.online.tracker_states import TRANSITIONS, TrackerState
+from calib_ros.online.tracker_states import NOTHING, TRANSITIONS, TrackerState
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
@@ -106,6 +106,27 @@ def consistent(tracker: Tracker, keyframes: int) -> Extrinsic:
     for _ in range(keyframes):
         tracker.apply(assessment(Verdict.CONSISTENT))
     return tracker.current
+
+
+def test_confirmations_that_are_missing_are_counted_down_and_anew_after_a_movement():
+    needed = TrackerConfig().confirmations
+    tracker = Tracker(Result(T, INITIAL))
+    assert tracker.missing == tracker.confirmations == (needed, 1, 0)
+    tracker.update(estimate())
+    consistent(tracker, needed - 1)
+    assert (tracker.missing, tracker.confirmations) == ((1, 1, 0), (needed, 1, 0))
+    tracker.update(estimate())
+    assert tracker.missing == (1, 0, 0)
+    consistent(tracker, 1)
+    assert (tracker.missing, tracker.confirmations) == (NOTHING, NOTHING)
+    tracker.apply(assessment(Verdict.MOVED))
+    assert tracker.missing == (needed, RECOVERING + 1, 0)
+    tracker.update(estimate(turned(2)))
+    assert tracker.missing == (needed, RECOVERING, 0)
+    saved = Tracker(Result(T, INITIAL), Result(T, CONVERGED, covariance=variances()))
+    assert saved.missing == (1, 0, 0)
+    consistent(saved, 1)
+    assert saved.missing == NOTHING
 
 
 @pytest.mark.parametrize("by", [STILL, ((0, 0.1, 0), (0.02, 0, 0))])
