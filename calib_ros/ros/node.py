@@ -17,8 +17,8 @@ from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inpu
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
-from calib_ros.ros.bags import Capture
 from calib_ros.ros.calibrate import CalibrateServers
+from calib_ros.ros.capture import Capture
 from calib_ros.ros.conversions import cloud_from_message, frame_from_messages, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic

@@ -16,7 +16,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Extrinsic, Result
 from calib_ros.ros.answers import after_answers, done
-from calib_ros.ros.bags import Capture
+from calib_ros.ros.capture import Capture
 from calib_ros.ros.conversions import extrinsic_message
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic
