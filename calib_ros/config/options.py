@@ -66,8 +66,10 @@ def checked(name: str, value: Any, f: dataclasses.Field[Any]) -> Any:
     """`value` converted to the type of the field's default, or ConfigError."""
     meta: Any = f.metadata
     default: Any = f.default
+    if value is None and isinstance(default, tuple):  # of an empty list in a parameter file ROS knows no type
+        value = ()
     values = tuple(value) if isinstance(default, tuple) and isinstance(value, (list, tuple)) else (value,)
-    want = type(default[0]) if isinstance(default, tuple) else type(default)
+    want: type[Any] = type(next(iter(default), "")) if isinstance(default, tuple) else type(default)
     if isinstance(default, tuple) and not isinstance(value, (list, tuple)):
         raise ConfigError(f"{name} = {_printed(value)} must be a list of {want.__name__}")
     if meta["length"] is not None and len(values) != meta["length"]:

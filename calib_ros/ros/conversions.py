@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import array
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from calib_ros_msgs.msg import Advice as AdviceMsg
+from calib_ros_msgs.msg import Consumer as ConsumerMsg
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from std_msgs.msg import Header
 
 from calib_ros import se3
 from calib_ros.camera import Camera
+from calib_ros.consumers import Consumer
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
 from calib_ros.messages.point_fields import LIVOX_FIELDS, LIVOX_OFFSETS, LIVOX_STRIDE, livox_scan
@@ -130,10 +132,16 @@ UNKNOWN = Validity()
 NO_ADVICE = Advice()
 
 
-def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNKNOWN, advice: Advice = NO_ADVICE) -> ExtrinsicMsg:
+def extrinsic_message(
+    extrinsic: Extrinsic,
+    stamp: int,
+    validity: Validity = UNKNOWN,
+    consumers: Sequence[Consumer] = (),
+    advice: Advice = NO_ADVICE,
+) -> ExtrinsicMsg:
     """The current extrinsic -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element.
 
-    The field `drift` is the normalised innovation. stamp: ns, of the newest data.
+    The field `drift` is the normalised innovation. stamp: ns, of the newest data. consumers: who is told whether to use it.
     """
     result = extrinsic.result
     msg = ExtrinsicMsg()
@@ -150,6 +158,10 @@ def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNK
         msg.time_offset_sigma = -1.0
     msg.advice = AdviceMsg(weak=list(advice.weak), text=advice.text, progress=advice.progress)
     msg.advice.remaining = duration_message(-1.0 if advice.remaining_s is None else advice.remaining_s)
+    for consumer in consumers:
+        usable = validity.usable and consumer.is_served(result.covariance)
+        told = ConsumerMsg(name=consumer.name, tolerance_deg=consumer.deg, tolerance_m=consumer.m, usable=usable)
+        msg.consumers.append(told)
     return msg
 
 

@@ -211,6 +211,8 @@ class RosInterface:
                 self.pipeline.restart()
             extra = {"reliable topics": " ".join(s.topic for s in self.sensors.adaptive if s.reliable) or "none"}
             extra["raw keyframes kept"] = str(len(self.capture))
+            if self.parameters["consumers"]:
+                extra["usable for"] = " ".join(self.extrinsic.served) or "none"
             message = self._diagnostics.message(self._node.get_clock().now().to_msg(), extra)
             message.status += [status for service in self.beside.values() if (status := service.status()) is not None]
             self._diagnostics_pub.publish(message)

@@ -20,6 +20,7 @@ from calib_ros import se3
 from calib_ros.config import Config, former_names, load_stages, preset, stages, update
 from calib_ros.config.options import checked, option
 from calib_ros.config.removed import REMOVED, notices
+from calib_ros.consumers import Consumer, parse_consumers
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.extensions import PRESETS, names
 from calib_ros.image.mask import check_mask
@@ -94,6 +95,11 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
         low=0.5,
         high=3600.0,
     ),
+    "consumers": option(
+        (),
+        "consumers of the extrinsic with the largest errors that each can live with, as 'NAME DEG M'; ~/extrinsic says who may "
+        "use it",
+    ),
     "overlay_period_s": option(
         1.0,
         "shortest time between two overlays, s; 0 = one for every pair; drawn only while there is a subscriber",
@@ -112,7 +118,7 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
 }
 # Those that may change while the node runs, as all constants of the stages may.
 LIVE = {"image_is_rectified", "reliability", "state_file", "publish_tf", "tf_parent", "tf_child", "max_data_age_s"}
-LIVE |= {"overlay_period_s", "capture_dir", "capture_frames"}
+LIVE |= {"consumers", "overlay_period_s", "capture_dir", "capture_frames"}
 
 
 @dataclass(frozen=True)
@@ -138,9 +144,14 @@ class Parameters:
             origin=InitialSource.PARAMETERS,
         )
 
+    def consumers(self) -> tuple[Consumer, ...]:
+        """Those that state tolerances."""
+        return parse_consumers(self["consumers"])
+
     def check(self) -> None:
-        """ConfigError for settings that contradict each other, or an initial extrinsic that is none."""
+        """ConfigError for settings that contradict each other, an initial extrinsic that is none, or consumers without form."""
         self.initial()
+        self.consumers()
         if not self["tf_child"] and self["tf_parent"] not in ("camera", "lidar"):
             raise ConfigError(f"tf_parent = {self['tf_parent']!r} must be camera or lidar, or tf_child must name its child")
 

@@ -36,13 +36,14 @@ class ExtrinsicPublisher:
     """~/extrinsic: on every change, and at least once in publish_period_s, with what a consumer needs to rely on it.
 
     DDS tells subscribers that ask for it when the messages stay away (deadline) or the process ends (liveliness). stamp: of the
-    newest message, ns.
+    newest message, ns. served: the consumers that may use the newest published one.
     """
 
     def __init__(self, node: Node, pipeline: Pipeline, parameters: Callable[[], Parameters]) -> None:
         self._node, self._pipeline, self._parameters = node, pipeline, parameters
         self._valid_s = VALID_PERIODS * parameters()["publish_period_s"]
         self.stamp = 0
+        self.served: list[str] = []
         self._last_good: tuple[Extrinsic, int, float] | None = None
         profile = QoSProfile(
             depth=1,
@@ -69,23 +70,26 @@ class ExtrinsicPublisher:
     def publish(self, extrinsic: Extrinsic, stamp: int) -> None:
         """stamp: ns, of the newest data the extrinsic was tested with."""
         self.stamp = stamp
-        self.publisher.publish(self.message(extrinsic))
+        message = self.message(extrinsic)
+        self.served = [consumer.name for consumer in message.consumers if consumer.usable]
+        self.publisher.publish(message)
 
-    def message(self, extrinsic: Extrinsic) -> ExtrinsicMsg:
-        """The message as of now."""
+    def message(self, extrinsic: Extrinsic, stamp: int | None = None) -> ExtrinsicMsg:
+        """The message as of now. stamp: ns, if not that of the newest one published."""
         validity = self.validity(extrinsic)
         if validity.usable:
             self._last_good = (extrinsic, self.stamp, time.monotonic() - validity.data_age_s)
         recalibrator = self._pipeline.recalibrator
         advice = NO_ADVICE if recalibrator is None else recalibrator.advice(extrinsic)
-        return extrinsic_message(extrinsic, self.stamp, validity, advice)
+        stamp = self.stamp if stamp is None else stamp
+        return extrinsic_message(extrinsic, stamp, validity, self._parameters().consumers(), advice)
 
     def last_good(self) -> ExtrinsicMsg | None:
         """The newest message that said usable, with the age it has by now; None before the first."""
         if self._last_good is None:
             return None
         extrinsic, stamp, received = self._last_good
-        msg = extrinsic_message(extrinsic, stamp, UNKNOWN)
+        msg = extrinsic_message(extrinsic, stamp, UNKNOWN, self._parameters().consumers())
         msg.data_age = duration_message(time.monotonic() - received)
         return msg
 

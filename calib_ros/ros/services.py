@@ -17,7 +17,6 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Extrinsic, Result
 from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.capture import Capture
-from calib_ros.ros.conversions import extrinsic_message
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic
 from calib_ros.ros.publishers import ExtrinsicPublisher
@@ -57,7 +56,7 @@ class Services:
         if extrinsic is None and recalibrator is not None:
             extrinsic = recalibrator.current
         if extrinsic is None:
-            return extrinsic_message(Extrinsic(self._initial.before_messages()), 0)
+            return self._publisher.message(Extrinsic(self._initial.before_messages()), 0)
         return self._publisher.message(extrinsic)
 
     def _safe(self, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:

@@ -86,6 +86,8 @@ def test_a_parameter_under_both_names_is_refused():
         ({"initial_translation_m": [0.0], "initial_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}, "initial_translation_m"),
         ({"image_transport": "theora"}, "image_transport"),
         ({"overlay_period_s": -1}, "overlay_period_s"),
+        ({"consumers": ["planner 0.5"]}, "'planner 0.5' must be NAME DEG M"),
+        ({"consumers": [1, 2]}, "consumers = 1 must be of type str"),
         ({"overlay_period_s": "often"}, "overlay_period_s"),
         ({"constraints__sigma_m": [1.0, 2.0]}, "constraints.sigma_m"),
         (
@@ -108,7 +110,7 @@ def test_every_parameter_describes_its_meaning_and_range(vehicle):
     for d in found:
         assert d.description
         ranged = d.floating_point_range or d.integer_range or d.additional_constraints
-        assert ranged or isinstance(defaults[d.name], (bool, str)) or d.name.startswith("initial_"), d.name
+        assert ranged or isinstance(defaults[d.name], (bool, str)) or defaults[d.name] == () or d.name.startswith("initial_")
         assert d.read_only == (d.name in SETTINGS and d.name not in LIVE)
 
 
