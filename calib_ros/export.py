@@ -1,4 +1,4 @@
-"""An extrinsic in the formats of other tools.
+"""An extrinsic in the formats of other tools, and written back into their files.
 
 T_camera_lidar maps LiDAR points into the camera's optical frame. In ROS that is the pose of the LiDAR in its parent, the camera:
 frame_id = camera, child_frame_id = LiDAR, the same numbers. With the LiDAR as parent the transform is inverted. Lengths are in
@@ -9,19 +9,24 @@ R = Rz(yaw) Ry(pitch) Rx(roll).
 from __future__ import annotations
 
 import math
+import re
 import shlex
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import yaml
 
-from calib_ros import se3
+from calib_ros import io, se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.result import Result
+
+POSE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw")  # of Autoware
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +90,7 @@ def urdf_joint(pose: Pose) -> str:
 
 def autoware_yaml(pose: Pose) -> str:
     """An entry of Autoware's sensors_calibration.yaml or sensor_kit_calibration.yaml."""
-    names = ("x", "y", "z", "roll", "pitch", "yaw")
-    entry = dict(zip(names, (*pose.xyz, *pose.rpy), strict=True))
+    entry = dict(zip(POSE_NAMES, (*pose.xyz, *pose.rpy), strict=True))
     return str(yaml.safe_dump({pose.parent: {pose.child: entry}}, sort_keys=False))
 
 
@@ -141,6 +145,161 @@ def export(
     if parent != "camera":
         raise BadInputError(f"{form} files hold the transform from LiDAR to camera by definition; leave out --parent {parent}")
     return _OF_RESULT[form](result, camera)
+
+
+# ---- files that hold more than the extrinsic ------------------------------------------------------------------------------
+
+# (parent, child) -> T_parent_child (4, 4) by which a tree of frames gives the extrinsic, its other edges being as they are.
+Edges = Mapping[tuple[str, str], Transform]
+FORMER = ".former"  # appended to the name of a file, for what was in it before
+DESCRIPTIONS, AUTOWARE = (".urdf", ".xacro"), (".yaml", ".yml")
+WRITABLE = (".json", *DESCRIPTIONS, *AUTOWARE)
+
+
+def has_changed(result: Result, before: Result) -> bool:
+    """Whether an extrinsic is another than the one before: by more than its own standard deviation in one of the six directions,
+    or of other frames; also where its covariance is unknown."""
+    same_frames = (result.camera_frame, result.lidar_frame) == (before.camera_frame, before.lidar_frame)
+    if result.covariance is None or not same_frames:
+        return True
+    moved = np.abs(se3.log(result.T_camera_lidar @ se3.inverse(before.T_camera_lidar)))
+    return bool((moved > np.sqrt(np.diag(result.covariance))).any())
+
+
+def write_back(path: str, result: Result, edges: Edges, joint: str) -> None:
+    """Write an extrinsic to a file of one of the WRITABLE kinds, and keep the former file beside it as NAME.former.
+
+    A result (.json) and a missing YAML file are written as a whole. Of a robot's description the origin of the joint of this name
+    changes, of Autoware's YAML the entry between the frames, and every other byte stays. edges: beside those from camera to LiDAR
+    and back, from the camera on: the first that a YAML file has is written. Raises BadInputError if the file cannot be read or
+    written, or has no such joint or entry; it is as it was then.
+    """
+    poses = [Pose.of(result, parent) for parent in ("camera", "lidar")]
+    edges = {(pose.parent, pose.child): pose.T for pose in poses} | dict(edges)
+    kind, before = Path(path).suffix.lower(), None
+    try:
+        before = Path(path).read_bytes()
+    except FileNotFoundError:
+        if kind in DESCRIPTIONS:
+            raise BadInputError(f"{path} does not exist; name the robot's description") from None
+    except OSError as error:
+        raise BadInputError(f"cannot read {path}: {error.strerror}; name a file") from None
+    if kind in DESCRIPTIONS:
+        data = _with_origin(before or b"", path, joint, edges)
+    elif kind in AUTOWARE:
+        data = autoware_yaml(poses[0]).encode() if before is None else _with_entry(before, path, edges)
+    else:
+        data = result.dumps().encode()
+    if before is not None and data != before:
+        io.write_atomically(path + FORMER, before)
+    if data != before:
+        io.write_atomically(path, data)
+
+
+@dataclass
+class _Joint:
+    """Of a robot's description. links: of parent and child. link_at, origins: where these elements begin, byte offsets."""
+
+    links: dict[str, str] = field(default_factory=dict)
+    link_at: int = 0
+    origins: list[int] = field(default_factory=list)
+
+
+def _joints(data: bytes, path: str) -> dict[str, list[_Joint]]:
+    """The joints of a robot's description by name. Those of transmissions have no type."""
+    found: dict[str, list[_Joint]] = {}
+    within: list[_Joint | None] = [None]  # for every element that is open: the joint around its children
+    parser = expat.ParserCreate()
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        joint = within[-1]
+        if joint is not None and name in ("parent", "child"):
+            joint.links[name] = attributes.get("link", "")
+            joint.link_at = parser.CurrentByteIndex
+        elif joint is not None and name == "origin":
+            joint.origins.append(parser.CurrentByteIndex)
+        elif name == "joint" and "type" in attributes:
+            joint = _Joint()
+            found.setdefault(attributes.get("name", ""), []).append(joint)
+        within.append(joint)
+
+    def end(name: str) -> None:
+        within.pop()
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise BadInputError(f"{path} is no valid XML: {error}; correct it") from None
+    return found
+
+
+def _with_origin(data: bytes, path: str, name: str, edges: Edges) -> bytes:
+    """A robot's description with the origin of a joint replaced."""
+    joints = _joints(data, path)
+    if len(joints.get(name, ())) != 1:
+        there = ", ".join(sorted(joints)[:8]) + (", ..." if len(joints) > 8 else "")
+        count = len(joints[name]) if name in joints else "no"
+        raise BadInputError(
+            f"{path} has {count} joints named '{name}'; set export.joint to one of: {there or 'none, it has no joint'}"
+        )
+    (joint,) = joints[name]
+    parent, child = (joint.links.get(end, "") for end in ("parent", "child"))
+    if (parent, child) not in edges:
+        raise BadInputError(f"{path}: joint '{name}' connects '{parent}' and '{child}'; {_no_edge(edges)}, and set export.joint")
+    pose = Pose(parent, child, edges[parent, child])
+    values = {b"xyz": _numbers(pose.xyz).encode(), b"rpy": _numbers(pose.rpy).encode()}
+    at = (joint.origins or [joint.link_at])[0]
+    tag = re.compile(rb"""<(?:origin|parent|child)(?:[^>"']|"[^"]*"|'[^']*')*>""").match(data, at)
+    if len(joint.origins) > 1 or tag is None:
+        raise BadInputError(f"{path}: joint '{name}' has several origins, or the file is not in UTF-8; leave one, in UTF-8")
+    if not joint.origins:
+        space = data[len(data[:at].rstrip()) : at]
+        return data[:at] + b'<origin xyz="%s" rpy="%s"/>' % (values[b"xyz"], values[b"rpy"]) + space + data[at:]
+    text = tag.group()
+    for attribute, value in values.items():
+        given = re.search(rb"""\s%s\s*=\s*("[^"]*"|'[^']*')""" % attribute, text)
+        if given is not None:
+            text = text[: given.start(1)] + b'"%s"' % value + text[given.end(1) :]
+        else:
+            text = b'<origin %s="%s"' % (attribute, value) + text.removeprefix(b"<origin")
+    return data[:at] + text + data[tag.end() :]
+
+
+def _with_entry(data: bytes, path: str, edges: Edges) -> bytes:
+    """Autoware's YAML with the numbers of the first of the edges that it has replaced."""
+    try:
+        text = data.decode()
+        root = io.compose(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise BadInputError(f"{path} is no valid YAML{io.what_is_wrong(error)}; correct it") from None
+    for (parent, child), T in edges.items():
+        entry = _value_of(_value_of(root, parent), child)
+        if entry is None:
+            continue
+        pose = Pose(parent, child, T)
+        values = [(_value_of(entry, name), value) for name, value in zip(POSE_NAMES, (*pose.xyz, *pose.rpy), strict=True)]
+        places = [
+            (node.start_mark.index, node.end_mark.index, value) for node, value in values if isinstance(node, yaml.ScalarNode)
+        ]
+        if len(places) < len(values):
+            raise BadInputError(f"{path}: the entry of {child} must hold {', '.join(POSE_NAMES)}")
+        for begin, end, value in sorted(places, reverse=True):
+            text = text[:begin] + _number(value) + text[end:]
+        return text.encode()
+    raise BadInputError(f"{path} has no entry of the extrinsic; {_no_edge(edges)}")
+
+
+def _value_of(node: yaml.Node | None, name: str) -> yaml.Node | None:
+    """What a mapping holds under a name."""
+    pairs = node.value if isinstance(node, yaml.MappingNode) else ()
+    return next((value for key, value in pairs if key.value == name), None)
+
+
+def _no_edge(edges: Edges) -> str:
+    """What to do."""
+    names = ", ".join(f"{parent} -> {child}" for parent, child in edges)
+    return f"name one of {names} (parent -> child), or publish the frames between them on /tf_static"
 
 
 def _number(value: float) -> str:

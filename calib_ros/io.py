@@ -115,6 +115,11 @@ def load(text: str) -> Any:
     return yaml.load(text, _Loader)
 
 
+def compose(text: str) -> yaml.Node | None:
+    """The nodes of a YAML text with their places in it; otherwise as `load`."""
+    return yaml.compose(text, _Loader)
+
+
 def what_is_wrong(error: Exception) -> str:
     """Line and cause of what `load` raised, as far as they are known: " in line 3 (why)"."""
     where, why = getattr(error, "problem_mark", None), getattr(error, "problem", None)

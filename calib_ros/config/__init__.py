@@ -100,6 +100,7 @@ class Config:
         return {name: dataclasses.asdict(_get(self, name)) for name in stages()}
 
 
+NODE_GROUPS = ("capture", "export")  # settings of the node alone begin like a stage with these
 OWN_STAGES: dict[str, type[Stage]] = {name: kind for name, kind in get_type_hints(Config).items() if name != "others"}
 
 
@@ -187,8 +188,10 @@ def load_stages(path: str | Path) -> dict[str, Any]:
     stages: dict[str, Any] = {}
     for key, value in parameters.items():
         stage, dot, name = str(key).partition(".")
-        if dot:  # the node's own settings have no dot; an unknown stage is refused by update()
+        if stage in NODE_GROUPS:
+            continue
+        if dot:  # an unknown stage is refused by update()
             stages.setdefault(stage, {})[name] = value
-        elif isinstance(value, dict):
+        elif isinstance(value, dict):  # other settings of the node are no groups
             stages.setdefault(stage, {}).update(value)
     return stages

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import scipy.stats.qmc  # noqa: F401 - half a second, for which the first search would wait
@@ -26,6 +27,7 @@ from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, Proce
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, StaticTf
+from calib_ros.ros.write_back import WriteBack
 
 INACTIVE = "the node is not active; activate it first"
 
@@ -51,6 +53,9 @@ class RosInterface:
         self.tf = StaticTf(node, self.parameters["initial_from_tf"], self.parameters["publish_tf"], self.health.error)
         self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
+        self._files = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_files")  # disks may be slow
+        self.write_back = WriteBack(lambda: self.parameters, self.tf.edges, self._files, self.health)
+        self._export_settings = self._export_parameters()
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
         inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, cloud_from_message, self.tf.other_frames)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
@@ -67,7 +72,8 @@ class RosInterface:
         self._ended: bool | None = None
         self._nameless: set[str] = set()  # sensors whose messages have no frame_id
         self._timers: list[Timer] = []
-        self.serving = Services(*(node, self.pipeline, self.initial, self.capture, self._save, self.extrinsic, self.health))
+        helpers = self.initial, self.capture, self._save, self.extrinsic, self.health, self._files
+        self.serving = Services(node, self.pipeline, *helpers)
         self.calibrating = CalibrateServers(node, self.pipeline, self.serving.message, self.health)
         makers = node_services(node.get_logger().warning)
         self.beside = {name: make(node, self.pipeline, self.health) for name, make in makers.items()}
@@ -108,10 +114,10 @@ class RosInterface:
         self.pipeline.read_current(self.extrinsic.publish)
 
     def stop(self) -> bool:
-        """End all threads, an estimate under way included; a capture under way is finished. True if they ended."""
+        """End all threads, an estimate under way included; files under way are finished. True if they ended."""
         if self._ended is None:
             self._ended = self.pipeline.stop()
-            self.serving.stop()
+            self._files.shutdown(wait=True)
             for service in self.beside.values():
                 service.stop()
         return self._ended
@@ -159,6 +165,7 @@ class RosInterface:
             if result.status == CONVERGED and extrinsic.accepted > self._saved:
                 self._saved = extrinsic.accepted
                 self._save(result)
+            self.write_back.add(extrinsic)
             self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_keyframe, at_once=True)
         elif isinstance(event, FrameIngested):
             if event.is_keyframe:
@@ -176,6 +183,9 @@ class RosInterface:
 
     def _tf_parameters(self) -> tuple[bool, str, str]:
         return self.parameters["publish_tf"], self.parameters["tf_parent"], self.parameters["tf_child"]
+
+    def _export_parameters(self) -> tuple[Any, ...]:
+        return self.parameters["export.on_converged"], self.parameters["export.joint"]
 
     def _save(self, result: Result) -> tuple[bool, str]:
         return self.initial.save(result, self.pipeline, self._last_stamp)
@@ -205,6 +215,9 @@ class RosInterface:
                 self._tf_settings = tf_settings
                 self.tf.switch(tf_settings[0])
                 self.pipeline.read_current(self._publish_tf)
+            if self._export_settings != (new := self._export_parameters()):
+                self._export_settings = new
+                self.pipeline.read_current(self.write_back.add)
             recalibrator = self.pipeline.recalibrator
             if recalibrator is not None and self.initial.superseded_by_tf(recalibrator):
                 self._node.get_logger().info("TF connects camera and LiDAR by now: starting anew from it")

@@ -22,6 +22,7 @@ from calib_ros.config.options import checked, option
 from calib_ros.config.removed import REMOVED, notices
 from calib_ros.consumers import Consumer, parse_consumers
 from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.export import DESCRIPTIONS, WRITABLE
 from calib_ros.extensions import PRESETS, names
 from calib_ros.image.mask import check_mask
 from calib_ros.result import INITIAL, InitialSource, Result
@@ -106,6 +107,15 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
         low=0.0,
         high=3600.0,
     ),
+    "export.on_converged": option(
+        (),
+        "files that the extrinsic is written to when it has converged, and again when it has changed by more than its standard "
+        "deviations: .json = result, .urdf and .xacro = origin of export.joint, .yaml = Autoware's sensor_kit_calibration.yaml; "
+        "the former file is kept as NAME.former",
+    ),
+    "export.joint": option(
+        "", "name of the joint of the robot's description in export.on_converged that lies between camera and LiDAR"
+    ),
     "capture_dir": option(
         "", "folder that ~/capture writes the raw messages of the newest keyframes to; empty = ~/capture is off"
     ),
@@ -118,7 +128,7 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
 }
 # Those that may change while the node runs, as all constants of the stages may.
 LIVE = {"image_is_rectified", "reliability", "state_file", "publish_tf", "tf_parent", "tf_child", "max_data_age_s"}
-LIVE |= {"consumers", "overlay_period_s", "capture_dir", "capture_frames"}
+LIVE |= {"consumers", "overlay_period_s", "capture_dir", "capture_frames", "export.on_converged", "export.joint"}
 
 
 @dataclass(frozen=True)
@@ -152,6 +162,14 @@ class Parameters:
         """ConfigError for settings that contradict each other, an initial extrinsic that is none, or consumers without form."""
         self.initial()
         self.consumers()
+        files = self["export.on_converged"]
+        for name in files:
+            if not name.lower().endswith(WRITABLE):
+                raise ConfigError(f"export.on_converged: the kind of {name!r} is none of {', '.join(WRITABLE)}")
+        if not self["export.joint"] and any(name.lower().endswith(DESCRIPTIONS) for name in files):
+            raise ConfigError(
+                "export.on_converged has a robot's description: export.joint must name its joint between the sensors"
+            )
         if not self["tf_child"] and self["tf_parent"] not in ("camera", "lidar"):
             raise ConfigError(f"tf_parent = {self['tf_parent']!r} must be camera or lidar, or tf_child must name its child")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from typing import Any
 
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
@@ -25,7 +25,7 @@ from calib_ros.ros.publishers import ExtrinsicPublisher
 class Services:
     """~/get_extrinsic, ~/reset, ~/save and ~/capture.
 
-    save: writes a result to the state file. publisher: of ~/extrinsic.
+    save: writes a result to the state file. publisher: of ~/extrinsic. files: writes captures.
     """
 
     def __init__(
@@ -37,11 +37,11 @@ class Services:
         save: Callable[[Result], tuple[bool, str]],
         publisher: ExtrinsicPublisher,
         health: Health,
+        files: Executor,
     ) -> None:
         self._health = health
         self._node, self._pipeline, self._initial, self._recorder = node, pipeline, initial, capture
-        self._write, self._publisher = save, publisher
-        self._aside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_capture")
+        self._write, self._publisher, self._files = save, publisher, files
         self._services = [
             node.create_service(GetExtrinsic, "~/get_extrinsic", self._safe(self._get_extrinsic)),
             # A callback that awaits blocks its group: in the node's own group it would block all others until it is done.
@@ -73,12 +73,8 @@ class Services:
 
         return answered
 
-    def stop(self) -> None:
-        """Wait for a capture under way."""
-        self._aside.shutdown(wait=True, cancel_futures=True)
-
     def destroy(self) -> None:
-        """To be called after stop(); answers that are made already are sent before."""
+        """Answers that are made already are sent before."""
         after_answers(self._node, self._destroy)
 
     def _destroy(self) -> None:
@@ -107,7 +103,7 @@ class Services:
         return response
 
     async def _capture(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        written = await done(self._node, self._aside.submit(self._recorder.write, self._pipeline))
+        written = await done(self._node, self._files.submit(self._recorder.write, self._pipeline))
         error = written.exception()
         if error is None:
             response.success, response.message = True, str(written.result())

@@ -98,6 +98,12 @@ class StaticTf:
         own = (camera_frame, lidar_frame)
         return {name: T for name, T in self._tree.frames(camera_frame).items() if name not in own}
 
+    def edges(self, result: Result) -> dict[tuple[str, str], Transform]:
+        """(parent, child) -> T_parent_child (4, 4) by which the tree gives an extrinsic, of all edges between the sensors, from
+        the camera on; none if the tree does not connect them."""
+        T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
+        return {edge: self._edge_between(T, camera, lidar, *edge) for edge in self._tree.path(camera, lidar)}
+
     def publish(self, result: Result, parent: str, child: str, stamp: int) -> None:
         """Publish the extrinsic as an edge of the tree, if switched on; an edge that cannot carry it is reported instead.
 

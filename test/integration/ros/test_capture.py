@@ -125,7 +125,7 @@ def test_callbacks_go_on_during_a_capture_and_the_node_finishes_it_before_it_end
         threading.Timer(0.1, held.set).start()
         peer.node.stop()  # waits for it
         (folder,) = folders(tmp_path)
-    assert threads == ["calib_capture_0"]
+    assert threads == ["calib_files_0"]
     assert folder.name.startswith("capture_")
     with open_dataset(folder / "bag") as source:
         assert len(source) == 8

@@ -91,6 +91,11 @@ def test_the_published_edge_follows_parameters_and_tree(street, drive):
             tree = StaticTransforms()
             tree.add(message({**edges, edge: published(*edge)}))
             np.testing.assert_allclose(tree.lookup("camera", "velodyne"), start, atol=1e-9)
+        own = peer.calibration.tf.edges(peer.recalibrator.current.result)
+        assert list(own) == [TREE[k] for k in (3, 2, 0, 1)]  # from the camera on
+        for edge, T in own.items():
+            tree.add(message({**edges, edge: T}))
+            np.testing.assert_allclose(tree.lookup("camera", "velodyne"), start, atol=1e-9)
         count = len(got)
         peer.until(lambda: len(got) > count + 1, "the corrected edge again, for those who join late")
         for parent, child, text in (
