@@ -43,7 +43,7 @@ def write_atomically(path: str | Path, data: bytes) -> None:
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
         temporary = None
-        _flush_folder(path.parent)
+        flush(path.parent)
     except OSError as error:
         raise BadInputError(f"cannot write {path}: {error.strerror}; check the folder, its permissions and free space") from None
     finally:
@@ -83,10 +83,10 @@ def _remove_abandoned(path: Path) -> None:
                     os.unlink(path.parent / name)
 
 
-def _flush_folder(folder: Path) -> None:
-    """Flush the folder, which holds the new name. Not all file systems can; the file itself is complete in any case."""
+def flush(path: Path) -> None:
+    """Flush to disk a file, or a folder, which holds names. Not all file systems can the latter; files are complete then, too."""
     with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
+        handle = os.open(path, os.O_RDONLY)
         try:
             os.fsync(handle)
         finally:

@@ -308,7 +308,8 @@ class Extrinsic:
     `monitor.normalised_innovation`. accepted: estimates accepted so far. monitor_message: the monitor's assessment of the newest
     keyframes, for a person; "" before the first. p_value: probability that keyframes of a right extrinsic look at least this
     wrong; NaN if unknown. usable: an estimate was accepted and nothing objects to it, as far as the data so far tell.
-    estimated_at: stamp, ns, of the newest data in the newest accepted estimate; 0 before the first.
+    estimated_at: stamp, ns, of the newest data in the newest accepted estimate; 0 before the first. disputed_since: stamp, ns, of
+    the first keyframe that speaks against it; 0 if none does.
     """
 
     result: Result
@@ -318,3 +319,4 @@ class Extrinsic:
     p_value: float = math.nan
     usable: bool = False
     estimated_at: int = 0
+    disputed_since: int = 0

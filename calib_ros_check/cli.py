@@ -43,7 +43,7 @@ def check_one(source: str, args: argparse.Namespace) -> int:
     if args.report is not None:
         from calib_ros_check.report import write_report
 
-        write_report(args.report, result, checked.frames, checked.source, options.config)
+        write_report(args.report, result, checked.frames, checked.source, checked.config)
     return EXIT[result.verdict]
 
 

@@ -11,11 +11,13 @@ from calib_ros import result
 from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
+from calib_ros.datasets.capture import RESULT, capture_config, is_capture
 from calib_ros.datasets.open import is_bag
 from calib_ros.datasets.positions import frame_positions, spread_positions
 from calib_ros.datasets.source import Source, WithMotion
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
+from calib_ros.online.clocks import with_clocks
 from calib_ros.registration.progress import Callback
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, Tolerance
@@ -29,7 +31,8 @@ class CheckOptions:
     """How recordings are checked.
 
     extrinsic: ``reference``, what the source says; ``tf``, the static transforms of a bag; or a result file. frames: positions as
-    `frame_positions` has them; "" = FRAMES, evenly spread. camera, topics and clock: as `open_dataset`.
+    `frame_positions` has them; "" = FRAMES, evenly spread. camera, topics and clock: as `open_dataset`. config: the default is
+    the node's own for what the node has captured.
     """
 
     extrinsic: str = REFERENCE
@@ -46,11 +49,12 @@ class CheckOptions:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A check with what it was made of, to be drawn. source: name of the recording."""
+    """A check with what it was made of, to be drawn. source: name of the recording. config: by which it was checked."""
 
     result: CheckResult
     frames: Sequence[Frame]
     source: str
+    config: Config
 
 
 def check_source(
@@ -67,12 +71,15 @@ def check_source(
     and noted, unless it is the only one.
     """
     options = options or CheckOptions()
+    if is_capture(folder := Path(path).expanduser()) and options.config == Config():
+        options = replace(options, config=with_clocks(capture_config(folder), result.load(folder / RESULT)))
     source = _opened(path, options)
     T = extrinsic_of(source, path, options.extrinsic)
     if options.frames:
         positions = frame_positions(options.frames, len(source))
     else:
-        positions = getattr(source, "middles", None) or spread_positions(FRAMES, len(source))
+        those = getattr(source, "middles", None) or range(len(source))
+        positions = [those[k] for k in spread_positions(FRAMES, len(those))]
     frames, notes = _read(source, positions, options.config, reading, warn)
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
@@ -82,7 +89,7 @@ def check_source(
         camera_frame=source.camera_frame,
         lidar_frame=source.lidar_frame,
     )
-    return Checked(found, frames, source.name)
+    return Checked(found, frames, source.name, options.config)
 
 
 def extrinsic_of(source: Source, path: str, extrinsic: str) -> Transform:
@@ -105,9 +112,10 @@ def _opened(path: str, options: CheckOptions) -> Source:
     """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
     names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     given: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name)}
-    if is_bag(Path(path).expanduser()):
+    captured = is_capture(Path(path).expanduser())
+    if captured or is_bag(Path(path).expanduser()):
         given |= {"motion": options.config.motion, "tolerance_s": options.config.online.pair_tolerance_s}
-        given |= {} if options.frames else {"windows": FRAMES}
+        given |= {} if options.frames or captured else {"windows": FRAMES}
         if options.extrinsic not in (REFERENCE, TF):
             given["T_camera_lidar"] = result.load(options.extrinsic).T_camera_lidar
     return open_dataset(path, camera=options.camera, **given)

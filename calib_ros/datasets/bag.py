@@ -195,6 +195,11 @@ class BagSource:
                 return sweep.ns
         return sweep.stamped_ns
 
+    @property
+    def stamps(self) -> list[int]:
+        """Of the frames' images, ns."""
+        return [int(stamp) for stamp in self._index.image.stamps[self._pairs[0]]]
+
     def close(self) -> None:
         """Close the bag's files; garbage collection does it too."""
         self._bag.close()

@@ -6,6 +6,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
+from calib_ros.datasets.capture import CaptureSource, is_capture
 from calib_ros.datasets.folder import EXPECTED_FOLDER, FolderSource, is_folder_dataset
 from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
 from calib_ros.datasets.nuscenes import EXPECTED_NUSCENES, NuScenesSource, split_scene, tables_folder
@@ -25,14 +26,14 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
 
     Parameters
     ----------
-    path_or_text : path of a bag, of a KITTI raw, odometry or object folder, of a folder with images/, clouds/ and
-        calibration.yaml (see `FolderSource`), or of nuScenes (``"ROOT#scene-0061"``, by default the first scene; see
-        `NuScenesSource`). Or ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as
+    path_or_text : path of a bag, of what the node has captured (see `CaptureSource`), of a KITTI raw, odometry or object folder,
+        of a folder with images/, clouds/ and calibration.yaml (see `FolderSource`), or of nuScenes (``"ROOT#scene-0061"``, by
+        default the first scene; see `NuScenesSource`). Or ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as
         ``"synthetic[:name=value,...]"``, the simulated drive.
     camera : of a KITTI folder, 0 to 3 (default 2; of KITTI-360 0 or 1), of nuScenes, its channel or number (default CAM_FRONT),
         of ONCE or a plain folder, a name or number in its calibration (default the first).
-    **options : of a bag, see `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion,
-        T_camera_lidar, windows; None = default.
+    **options : of a bag or capture, see `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, rectified,
+        motion, T_camera_lidar, windows; None = default.
 
     Raises BadInputError if the path is none of these, or an option does not belong to the dataset.
     """
@@ -53,12 +54,12 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         by_name = "".join(f", or '{name}'" for name in installed(SOURCES))
         raise BadInputError(f"{text} does not exist; give a folder or a bag{by_name}")
     # Readers of bags are imported where needed: rosbags alone takes a third of a second.
-    if is_bag(path):
+    if is_bag(path) or is_capture(path):
         from calib_ros.datasets.bag import BagSource
 
         known = list(signature(BagSource).parameters)[1:]
         _refuse({name: options[name] for name in options.keys() - known}, text)
-        return BagSource(path, **options)
+        return CaptureSource(path, **options) if is_capture(path) else BagSource(path, **options)
     if is_folder_dataset(path):
         _refuse(options, text)
         return FolderSource(path, camera)
@@ -102,7 +103,7 @@ def is_bag(path: Path) -> bool:
 
 def is_single(path: Path) -> bool:
     """Whether a path is one source. KITTI drives are found from above, see `drives_in`."""
-    return is_bag(path) or is_folder_dataset(path) or is_nuscenes(path) or is_once(path)
+    return is_bag(path) or is_capture(path) or is_folder_dataset(path) or is_nuscenes(path) or is_once(path)
 
 
 def is_nuscenes(path: Path) -> bool:

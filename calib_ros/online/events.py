@@ -17,7 +17,7 @@ from calib_ros.result import Extrinsic, Result
 
 @dataclass(frozen=True, eq=False)
 class FrameIngested:
-    """A pair was decoded and ingested. image, cloud: its messages."""
+    """A pair was decoded and ingested. is_keyframe: it is one of the keyframes now. image, cloud: its messages."""
 
     frame: Frame
     is_keyframe: bool

@@ -64,7 +64,8 @@ class Assessment:
     """Result of the monitor at a keyframe.
 
     message: for a person. since: how many of the newest keyframes spoke against the extrinsic. out_of_sync: how many of these,
-    the oldest ones, have images and scans that were not taken at the same time.
+    the oldest ones, have images and scans that were not taken at the same time. since_stamp: of the oldest of those that spoke
+    against it, ns; 0 if none did.
     """
 
     verdict: Verdict
@@ -72,6 +73,7 @@ class Assessment:
     p_value: float
     since: int = 0
     out_of_sync: int = 0
+    since_stamp: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -295,7 +295,9 @@ class Pipeline:
             self._segmenter.put(None)
         if self._is_due(recalibrator):
             self._estimator.put(None)
-        self._announcer.tell(FrameIngested(frame, is_keyframe, *pair))
+        newest = recalibrator.newest()  # one that speaks against the extrinsic becomes a keyframe, too
+        is_kept = is_keyframe or (newest is not None and newest.stamp == frame.stamp)
+        self._announcer.tell(FrameIngested(frame, is_kept, *pair))
 
     def _prepare(self, intake: Intake) -> Recalibrator | None:
         """The recalibrator to ingest a pair; None while camera or start are unknown, and for messages that do not belong together

@@ -315,8 +315,10 @@ class Recalibrator:
         with self._lock:
             if generation != self.keyframes.generation or self._restart_monitor:
                 return
-            if tested is not None and assessment.verdict in (Verdict.SUSPECT, Verdict.MOVED):
-                self.keyframes.add(tested)
+            if assessment.verdict in (Verdict.SUSPECT, Verdict.MOVED):
+                assessment = replace(assessment, since_stamp=keyframes[-min(assessment.since, len(keyframes))].stamp)
+                if tested is not None:
+                    self.keyframes.add(tested)
             if assessment.verdict is Verdict.MOVED:
                 self._in_doubt = True
                 self.keyframes.keep_newest(assessment.since)

@@ -387,9 +387,10 @@ class Tracker:
             result = replace(result, status=TENTATIVE, reason=reason)
         elif result.converged and not self._accepted and not self._consistent_keyframes:
             result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")
-        message, p_value = ("", math.nan) if assessment is None else (assessment.message, assessment.p_value)
+        told = assessment or Assessment(Verdict.INCONCLUSIVE, "", math.nan)
         usable = self._is_usable(result.status)
-        return Extrinsic(result, self._innovation, self._accepted, message, p_value, usable, self._estimated_at)
+        monitored = told.message, told.p_value, usable, self._estimated_at, told.since_stamp
+        return Extrinsic(result, self._innovation, self._accepted, *monitored)
 
     def _is_usable(self, status: str) -> bool:
         """Is the current extrinsic the last good one, tested since the start, without any objection?

@@ -1,10 +1,16 @@
-"""~/capture: raw messages of the newest keyframes as a bag that `calib-ros` reads, with configuration and result beside it."""
+"""Captures: raw messages of the newest keyframes as a bag, with what else the node knew, see `calib_ros.datasets.capture`.
+
+One is written on request by ~/capture, and by the black box when the status becomes one of capture.on.
+"""
 
 from __future__ import annotations
 
 import importlib
 import os
+import re
+import shutil
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,13 +23,22 @@ from typing import Any, NamedTuple
 import yaml
 from rclpy.serialization import serialize_message
 
+from calib_ros.datasets.capture import BAG, CONFIG, EVENTS, MASK, RESULT
 from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.io import ABANDONED_S, flush
 from calib_ros.messages import stamp_ns
+from calib_ros.online.black_box import Occasion
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
 from calib_ros.ros.conversions import Serialized
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.subscriptions import type_name
+
+BLACK_BOX = re.compile(r"event_\d{8}T\d{6}Z_[a-z]+(_\d+)?")  # the newest has the last name
+SCRATCH = ".capture."  # hidden folders that are being written
+# Bytes beside images and points: of a keyframe its CameraInfo and headers, of a bag the message types and an index.
+KEYFRAME_BYTES, BAG_BYTES = 2_000, 30_000
+MEGABYTE = 1_000_000
 
 
 class RawKeyframe(NamedTuple):
@@ -35,7 +50,7 @@ class RawKeyframe(NamedTuple):
 
 
 class Capture:
-    """Keeps the raw messages of at most capture_frames keyframes and writes them on request. Thread-safe.
+    """Keeps the raw messages of at most capture_frames keyframes and writes them. Thread-safe.
 
     parameters: gives the current ones. camera_info: gives the newest CameraInfo message.
     """
@@ -69,44 +84,98 @@ class Capture:
         with self._lock:
             self._frames.clear()
 
-    def write(self, pipeline: Pipeline) -> str:
-        """A new folder in capture_dir with bag, config.yaml and result.json; returns what was written where, in a line.
+    def write(self, pipeline: Pipeline, events: str) -> str:
+        """A new capture in capture_dir, on request; returns what was written where, in a line. events: as JSON lines.
 
         The folder is there when it is whole, or not at all. BadInputError if nothing is kept or it cannot be written.
         """
-        parameters = self._parameters()
+        parameters, recalibrator, frames = self._parameters(), pipeline.recalibrator, self._kept()
         if not parameters["capture_dir"] or not parameters["capture_frames"]:
             raise BadInputError(
                 "nothing captured: set the parameters capture_dir to a folder and capture_frames to how many keyframes are to be "
                 "kept in memory"
             )
-        with self._lock:
-            frames = list(self._frames)
-        recalibrator = pipeline.recalibrator
         if not frames or recalibrator is None:
             raise BadInputError("nothing captured: no keyframe has come since capture_frames was set")
         result = recalibrator.current.result
-        folder = Path(parameters["capture_dir"])
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with TemporaryDirectory(prefix=".capture.", dir=folder) as scratch:
-                partial = Path(scratch) / "capture"
-                partial.mkdir()
-                _write_bag(partial / "bag", frames, result, parameters["image_is_rectified"])
-                text = yaml.safe_dump({"/**": {"ros__parameters": parameters.to_dict()}}, sort_keys=False)
-                (partial / "config.yaml").write_text(text, encoding="utf-8")
-                result.save(partial / "result.json")
-                target = _free_name(folder)
-                os.rename(partial, target)
-        except OSError as error:
+        return _write(parameters, "capture_{}", frames, result, _files(parameters, result, events))
+
+    def write_occasion(self, occasion: Occasion) -> str:
+        """The same for the black box. The oldest of its captures make room by capture.keep and capture.max_mb; keyframes that do
+        not fit, the oldest ones, are left out."""
+        parameters, frames = self._parameters(), self._kept()
+        files, most = _files(parameters, occasion.result, occasion.events), parameters["capture.max_mb"] * MEGABYTE
+        rest = most - BAG_BYTES - sum(map(len, files.values()))
+        while frames and sum(map(_size, frames)) > rest:
+            del frames[0]
+        if not frames:
             raise BadInputError(
-                f"nothing captured: {folder} cannot be written ({error.strerror or error}); check the folder and its free space"
-            ) from None
-        return f"{len(frames)} keyframes saved to {target}"
+                f"nothing captured of {occasion.kind}: capture.max_mb = {parameters['capture.max_mb']} is less than a keyframe "
+                "takes, or there is none; raise it"
+            )
+        size = most - rest + sum(map(_size, frames))
+        with suppress(OSError):  # said by who writes there
+            _make_room(Path(parameters["capture_dir"]), parameters["capture.keep"] - 1, most - size)
+        return _write(parameters, f"event_{{}}_{occasion.kind}", frames, occasion.result, files)
+
+    def _kept(self) -> list[RawKeyframe]:
+        with self._lock:
+            return list(self._frames)
 
 
-def _free_name(folder: Path) -> Path:
-    name = f"capture_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
+def _size(frame: RawKeyframe) -> int:
+    """Bytes of a keyframe in a bag."""
+    return len(frame.image.data) + len(frame.cloud.data) + KEYFRAME_BYTES
+
+
+def _files(parameters: Parameters, result: Result, events: str) -> dict[str, bytes]:
+    """What lies beside the bag: name -> content."""
+    text = yaml.safe_dump({"/**": {"ros__parameters": parameters.to_dict()}}, sort_keys=False)
+    files, mask = {CONFIG: text.encode(), RESULT: result.dumps().encode(), EVENTS: events.encode()}, parameters.config.image.mask
+    with suppress(OSError):  # it is gone since: the frames are no worse for it
+        files |= {MASK + Path(mask).suffix: Path(mask).read_bytes()} if mask else {}
+    return files
+
+
+def _write(parameters: Parameters, name: str, frames: list[RawKeyframe], result: Result, files: dict[str, bytes]) -> str:
+    """name: of the new folder, {} = the time."""
+    folder = Path(parameters["capture_dir"])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for left in folder.glob(f"{SCRATCH}*"):  # by a node that was killed
+            with suppress(OSError):  # another node's, and just done
+                if time.time() - left.stat().st_mtime > ABANDONED_S:
+                    shutil.rmtree(left)
+        with TemporaryDirectory(prefix=SCRATCH, dir=folder) as scratch:
+            partial = Path(scratch) / "capture"
+            partial.mkdir()
+            _write_bag(partial / BAG, frames, result, parameters["image_is_rectified"])
+            for file, data in files.items():
+                (partial / file).write_bytes(data)
+            for path in (*partial.rglob("*"), partial):
+                flush(path)
+            target = _free_name(folder, name.format(f"{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"))
+            os.rename(partial, target)
+        flush(folder)
+    except OSError as error:
+        raise BadInputError(
+            f"nothing captured: {folder} cannot be written ({error.strerror or error}); check the folder and its free space"
+        ) from None
+    return f"{len(frames)} keyframes saved to {target}"
+
+
+def _make_room(folder: Path, keep: int, most: int) -> None:
+    """Delete the black box's oldest captures until no more than `keep` are left, of no more than `most` bytes together."""
+    boxes = sorted(
+        path for path in folder.iterdir() if BLACK_BOX.fullmatch(path.name) and path.is_dir() and not path.is_symlink()
+    )
+    sizes = [sum(file.stat().st_size for file in box.rglob("*") if file.is_file()) for box in boxes]
+    while boxes and (len(boxes) > keep or sum(sizes) > most):
+        shutil.rmtree(boxes.pop(0), ignore_errors=True)
+        del sizes[0]
+
+
+def _free_name(folder: Path, name: str) -> Path:
     names = chain([name], (f"{name}_{k}" for k in count(2)))
     return next(path for path in map(folder.joinpath, names) if not path.exists())
 
@@ -135,8 +204,8 @@ def _write_bag(path: Path, frames: list[RawKeyframe], result: Result, rectified:
         joined = [writer.add_connection(topic, kind, typestore=types) for topic, kind in zip(topics, kinds, strict=True)]
         entries = []
         for frame in frames:
-            at_image, at_cloud = stamp_ns(frame.image.header.stamp), stamp_ns(frame.cloud.header.stamp)
-            entries += [(at_image, 0, frame.camera_info), (at_image, 1, frame.image), (at_cloud, 2, frame.cloud)]
+            at = stamp_ns(frame.image.header.stamp)  # of all, since clocks of clouds may differ by years: this tells the reader
+            entries += [(at, 0, frame.camera_info), (at, 1, frame.image), (at, 2, frame.cloud)]
         entries.sort(key=lambda entry: entry[:2])
         # The messages' own names of the frames: the node's parameters may name them otherwise.
         build = MessageBuilder(

@@ -13,7 +13,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
+from calib_ros.errors import CalibrationError
 from calib_ros.extensions import node_services
+from calib_ros.online.black_box import BlackBox, Occasion
 from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
@@ -60,6 +62,7 @@ class RosInterface:
         inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, cloud_from_message, self.tf.other_frames)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
         self.pipeline.pause(INACTIVE)
+        self.black_box = BlackBox(self.pipeline, lambda: self.parameters["capture.on"], self._record)
         self.processed = ProcessedPublisher(node, self.pipeline)
         self.sensors = SensorSubscriptions(node, self.parameters, motion, self.pipeline, self.health, self.processed.add)
         self.extrinsic = ExtrinsicPublisher(node, self.pipeline, lambda: self.parameters)
@@ -70,9 +73,10 @@ class RosInterface:
         self._last_stamp = 0
         self._saved = 0  # accepted estimates when the extrinsic was saved
         self._ended: bool | None = None
+        self._noted = ""  # the newest line of the diagnostics
         self._nameless: set[str] = set()  # sensors whose messages have no frame_id
         self._timers: list[Timer] = []
-        helpers = self.initial, self.capture, self._save, self.extrinsic, self.health, self._files
+        helpers = self.initial, self.capture, self._save, self.extrinsic, self.health, self._files, self.black_box.events
         self.serving = Services(node, self.pipeline, *helpers)
         self.calibrating = CalibrateServers(node, self.pipeline, self.serving.message, self.health)
         makers = node_services(node.get_logger().warning)
@@ -108,6 +112,7 @@ class RosInterface:
         """
         self.pipeline.pause(INACTIVE)
         self.sensors.stop()
+        self.black_box.flush()
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._timers = []
@@ -117,6 +122,7 @@ class RosInterface:
         """End all threads, an estimate under way included; files under way are finished. True if they ended."""
         if self._ended is None:
             self._ended = self.pipeline.stop()
+            self.black_box.flush()
             self._files.shutdown(wait=True)
             for service in self.beside.values():
                 service.stop()
@@ -168,15 +174,27 @@ class RosInterface:
             self.write_back.add(extrinsic)
             self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_keyframe, at_once=True)
         elif isinstance(event, FrameIngested):
-            if event.is_keyframe:
+            if self.black_box.wants(event):
                 self.capture.add(event.image, event.cloud)
             self.overlay.publish(self.pipeline.recalibrator, event.frame)
         elif isinstance(event, IntakeIdle):
             self.processed.publish()
         elif isinstance(event, Problem):
             self.health.error(event.message)
+        self.black_box.add(event)
         for service in self.beside.values():
             service.add(event)
+
+    def _record(self, occasion: Occasion) -> None:
+        def write() -> None:
+            try:
+                self._node.get_logger().info(f"{occasion.kind}: {self.capture.write_occasion(occasion)}")
+            except CalibrationError as error:
+                self.health.error(str(error), "capture.on")
+            except Exception as error:
+                self.health.unexpected(error)
+
+        self._files.submit(write)
 
     def _publish_tf(self, extrinsic: Extrinsic, stamp: int) -> None:
         self.tf.publish(extrinsic.result, self.parameters["tf_parent"], self.parameters["tf_child"], stamp)
@@ -229,6 +247,10 @@ class RosInterface:
             message = self._diagnostics.message(self._node.get_clock().now().to_msg(), extra)
             message.status += [status for service in self.beside.values() if (status := service.status()) is not None]
             self._diagnostics_pub.publish(message)
+            if (health := message.status[0].message) != self._noted:
+                self._noted = health
+                self.black_box.note(health, "health")
+            self.black_box.check()
 
     def _publish_again(self) -> None:
         """Others see that the node is alive, and whether its extrinsic still is."""

@@ -25,6 +25,7 @@ from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.export import DESCRIPTIONS, WRITABLE
 from calib_ros.extensions import PRESETS, names
 from calib_ros.image.mask import check_mask
+from calib_ros.online.black_box import KINDS
 from calib_ros.result import INITIAL, InitialSource, Result
 
 # Prefixes of the parameters that every ROS node has.
@@ -98,8 +99,7 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
     ),
     "consumers": option(
         (),
-        "consumers of the extrinsic with the largest errors that each can live with, as 'NAME DEG M'; ~/extrinsic says who may "
-        "use it",
+        "users of the extrinsic and the largest errors that each can live with, 'NAME DEG M'; ~/extrinsic says who may use it",
     ),
     "overlay_period_s": option(
         1.0,
@@ -109,26 +109,29 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
     ),
     "export.on_converged": option(
         (),
-        "files that the extrinsic is written to when it has converged, and again when it has changed by more than its standard "
-        "deviations: .json = result, .urdf and .xacro = origin of export.joint, .yaml = Autoware's sensor_kit_calibration.yaml; "
-        "the former file is kept as NAME.former",
+        "files that a converged extrinsic is written to; by their names: .json = result, .urdf and .xacro = origin of "
+        "export.joint, .yaml = Autoware's sensor_kit_calibration.yaml; the former file is kept as NAME.former",
     ),
-    "export.joint": option(
-        "", "name of the joint of the robot's description in export.on_converged that lies between camera and LiDAR"
-    ),
+    "export.joint": option("", "joint of the robot's description in export.on_converged, between camera and LiDAR"),
     "capture_dir": option(
-        "", "folder that ~/capture writes the raw messages of the newest keyframes to; empty = ~/capture is off"
+        "", "folder that captures, the raw messages of the newest keyframes, are written to; of one node; empty = off"
     ),
     "capture_frames": option(
         0,
-        "keyframes whose raw messages are kept in memory for ~/capture, 0 = none; each takes the size of one image and one cloud",
+        "keyframes whose raw messages are kept in memory for captures, 0 = none; each takes the size of one image and one cloud",
         low=0,
         high=200,
     ),
+    "capture.on": option(
+        (), "statuses at which a capture is written, as by a black box: " + ", ".join(KINDS) + "; empty = none", choices=KINDS
+    ),
+    "capture.keep": option(10, "captures of the black box that are kept; the oldest are deleted", low=1, high=1000),
+    "capture.max_mb": option(1000, "size of these captures together, megabytes; the oldest are deleted", low=1, high=1_000_000),
 }
 # Those that may change while the node runs, as all constants of the stages may.
 LIVE = {"image_is_rectified", "reliability", "state_file", "publish_tf", "tf_parent", "tf_child", "max_data_age_s"}
-LIVE |= {"consumers", "overlay_period_s", "capture_dir", "capture_frames", "export.on_converged", "export.joint"}
+LIVE |= {"consumers", "overlay_period_s", "capture_dir", "capture_frames", "capture.on", "capture.keep", "capture.max_mb"}
+LIVE |= {"export.on_converged", "export.joint"}
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,10 @@ class Parameters:
         """ConfigError for settings that contradict each other, an initial extrinsic that is none, or consumers without form."""
         self.initial()
         self.consumers()
+        if self["capture.on"] and not (self["capture_dir"] and self["capture_frames"]):
+            raise ConfigError(
+                "capture.on needs a folder in capture_dir and in capture_frames how many keyframes are kept, such as 20"
+            )
         files = self["export.on_converged"]
         for name in files:
             if not name.lower().endswith(WRITABLE):

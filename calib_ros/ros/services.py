@@ -25,7 +25,7 @@ from calib_ros.ros.publishers import ExtrinsicPublisher
 class Services:
     """~/get_extrinsic, ~/reset, ~/save and ~/capture.
 
-    save: writes a result to the state file. publisher: of ~/extrinsic. files: writes captures.
+    save: writes a result to the state file. publisher: of ~/extrinsic. files: writes captures. events: for these.
     """
 
     def __init__(
@@ -38,10 +38,11 @@ class Services:
         publisher: ExtrinsicPublisher,
         health: Health,
         files: Executor,
+        events: Callable[[], str],
     ) -> None:
         self._health = health
         self._node, self._pipeline, self._initial, self._recorder = node, pipeline, initial, capture
-        self._write, self._publisher, self._files = save, publisher, files
+        self._write, self._publisher, self._files, self._events = save, publisher, files, events
         self._services = [
             node.create_service(GetExtrinsic, "~/get_extrinsic", self._safe(self._get_extrinsic)),
             # A callback that awaits blocks its group: in the node's own group it would block all others until it is done.
@@ -103,7 +104,7 @@ class Services:
         return response
 
     async def _capture(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        written = await done(self._node, self._files.submit(self._recorder.write, self._pipeline))
+        written = await done(self._node, self._files.submit(self._recorder.write, self._pipeline, self._events()))
         error = written.exception()
         if error is None:
             response.success, response.message = True, str(written.result())

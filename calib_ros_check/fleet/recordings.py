@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from calib_ros.datasets.capture import is_capture
 from calib_ros.datasets.folder import is_folder_dataset
 from calib_ros.datasets.kitti import drives_in
 from calib_ros.datasets.once import is_once
@@ -97,7 +98,8 @@ def _look(folder: Path, drives: set[Path], found: list[Path], seen: set[str]) ->
     # A recorder that was killed leaves no metadata, but files that are named after the folder.
     named = len(stores) == 1 and stores[0].stem.startswith(folder.name)
     whole = (folder / "metadata.yaml").exists() or named
-    if not children or whole or folder in drives or is_folder_dataset(folder) or is_nuscenes(folder) or is_once(folder):
+    single = is_capture(folder) or is_folder_dataset(folder) or is_nuscenes(folder) or is_once(folder)
+    if not children or whole or folder in drives or single:
         found.append(folder)
         return
     found += [*stores, *(child for child in children if child.suffix in OTHERS and child.is_file())]

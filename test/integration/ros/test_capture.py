@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from ros_peer import Peer, cloud_message, start_parameters
+from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
 from scenes import is_near
 from sensor_msgs.msg import CompressedImage
 from std_srvs.srv import Trigger
@@ -20,7 +20,11 @@ from calib_ros import se3
 from calib_ros.cli.main import main
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
-from calib_ros.result import load
+from calib_ros.datasets.capture import read_events
+from calib_ros.errors import BadInputError
+from calib_ros.online.black_box import Occasion
+from calib_ros.result import INITIAL, SUSPECT, Result, load
+from calib_ros.ros.capture import MEGABYTE, RawKeyframe, _write_bag
 from calib_ros.ros.conversions import image_message
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -48,7 +52,8 @@ def test_capture_contains_the_received_frames(street, drive, tmp_path, capsys):
     first, second = folders(captures)
     assert done.message == f"5 keyframes saved to {first}"
     for folder in (first, second):
-        assert [path.name for path in folders(folder)] == ["bag", "config.yaml", "result.json"]
+        assert [path.name for path in folders(folder)] == ["bag", "config.yaml", "events.jsonl", "result.json"]
+        assert [event["event"] for event in read_events(folder)].count("keyframe") == len(street)
     with open_dataset(first / "bag") as source:
         assert (source.image_topic, source.points_topic, source.camera_info_topic) == ("/image", "/points", "/camera_info")
         assert (source.camera_frame, source.lidar_frame) == ("camera", "velodyne")
@@ -110,10 +115,10 @@ def test_callbacks_go_on_during_a_capture_and_the_node_finishes_it_before_it_end
         capture, held, threads = peer.calibration.capture, threading.Event(), []
         write = capture.write
 
-        def slowly(pipeline: Any) -> str:
+        def slowly(pipeline: Any, events: str) -> str:
             threads.append(threading.current_thread().name)
             assert held.wait(LIMIT_S)
-            return write(pipeline)
+            return write(pipeline, events)
 
         monkeypatch.setattr(capture, "write", slowly)
         answer = peer.call_async(peer._triggers["capture"], Trigger.Request())
@@ -129,3 +134,48 @@ def test_callbacks_go_on_during_a_capture_and_the_node_finishes_it_before_it_end
     assert folder.name.startswith("capture_")
     with open_dataset(folder / "bag") as source:
         assert len(source) == 8
+
+
+def test_clocks_of_clouds_may_count_from_elsewhere(street, tmp_path):
+    """As those of a LiDAR that counts from its start: the bag tells which messages came together."""
+    later = 10**18
+    messages = [(image_message(f.image, "camera", f.stamp), cloud_message(f.cloud, f.stamp - later)) for f in street]
+    kept = [RawKeyframe(image, cloud, camera_info_message(f)) for (image, cloud), f in zip(messages, street, strict=True)]
+    _write_bag(tmp_path / "bag", kept, Result(street[0].reference, INITIAL), False)
+    with open_dataset(tmp_path / "bag") as source:
+        assert len(source) == len(street)
+
+
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def test_the_black_box_keeps_to_number_and_size_and_captures_on_request_stay(street, drive, tmp_path):
+    with Peer(**start(drive.reference, tmp_path, 5)) as peer:
+        peer.drive(street[:5])
+        assert peer.trigger("capture").success
+        capture, result = peer.calibration.capture, peer.recalibrator.current.result
+
+        def record() -> tuple[int, Path]:
+            """How many keyframes were written where."""
+            words = capture.write_occasion(Occasion(SUSPECT, result, "{}\n")).split()
+            return int(words[0]), Path(words[-1])
+
+        peer.change(capture__keep=2)
+        for _ in range(4):
+            count, newest = record()
+        on_request, *events = folders(tmp_path)
+        assert on_request.name.startswith("capture_")
+        assert (count, len(events)) == (5, 2)
+        assert newest in events
+        assert size_of(newest) > sum(len(f.image.data) + len(f.cloud.data) for f in capture._frames)
+
+        for megabytes, keyframes in ((2 * size_of(newest) // MEGABYTE - 1, 5), (size_of(newest) // MEGABYTE // 2, 2)):
+            peer.change(capture__max_mb=megabytes)
+            count, newest = record()
+            assert (count, [on_request, newest]) == (keyframes, folders(tmp_path))
+            assert size_of(newest) <= megabytes * MEGABYTE
+        peer.change(capture__max_mb=1)
+        with pytest.raises(BadInputError, match=r"capture\.max_mb = 1 is less than a keyframe takes"):
+            record()
+        assert folders(tmp_path) == [on_request, newest]
