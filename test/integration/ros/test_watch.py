@@ -19,7 +19,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.ros.conversions import image_message
 from calib_ros_view.node.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch
 from calib_ros_view.session.live import NEUTRAL, Presence
-from calib_ros_view.web.live_words import words_of_check
+from calib_ros_view.web.live_words import said_of, words_of_check
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 PARAMETERS = {**QUICK, "online__mode": "manual"}
@@ -78,6 +78,7 @@ def test_keyframes_are_drawn_with_score_and_age(watch, peer, vehicle):
     answer = watch.keyframes(1, 5000).result(LIMIT_S)
     assert not answer.success
     assert "64 to 1280 px wide" in answer.message
+    until(lambda: said_of(watch, time.time()).advice == "call ~/calibrate (50% of what is needed)", "what to do")
 
 
 def test_the_overlay_is_only_drawn_for_lookers(watch, peer, vehicle):
