@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 from contextlib import suppress
 
@@ -26,6 +25,8 @@ def use_one_blas_thread() -> None:
 def return_freed_memory() -> None:
     """Let glibc map every large array on its own; does nothing with another C library. To be called before threads start."""
     # By default it keeps the places of freed arrays: of many sizes, their gaps let the memory grow by a sixth in ten minutes.
+    import ctypes  # five milliseconds in which a process could not be ready for signals
+
     with suppress(AttributeError, OSError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(M_MMAP_THRESHOLD, MMAP_THRESHOLD)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from concurrent.futures import Future as Promise
 from typing import Any
 
@@ -33,15 +33,10 @@ def after_answers(node: Node, action: Callable[[], None]) -> None:
         action()
         return
 
-    async def later() -> None:
-        for _ in range(ROUNDS):
-            executor.wake()
-            await _NextRound()
-        action()
+    def later(rounds: int) -> None:  # no coroutine: one that the process ends before would be complained of
+        if rounds:
+            executor.create_task(later, rounds - 1)
+        else:
+            action()
 
-    executor.create_task(later)
-
-
-class _NextRound:
-    def __await__(self) -> Generator[None, None, None]:
-        yield
+    executor.create_task(later, ROUNDS)

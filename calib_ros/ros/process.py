@@ -1,14 +1,31 @@
 """One node in a process: from the arguments to a clean end by SIGINT or SIGTERM, at whatever moment they come.
 
-Importing this module is quick, so that the entry points below stand ready for signals before all that a node needs is imported.
+Importing this module makes these signals end the process with exit code 0: entry points stand ready before they import the rest.
 """
 
+# ruff: noqa: E402
 from __future__ import annotations
 
 import os
 import signal
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_asked_to_end = _ros_runs = False
+
+
+def _on_signal(*_: object) -> None:
+    """As long as ROS does not run there is nothing to be finished. Then a node is, and `run` ends it: rclpy's own handlers would
+    take the context from under callbacks and threads that publish."""
+    global _asked_to_end
+    _asked_to_end = True
+    if not _ros_runs:
+        os._exit(0)
+
+
+for _number in SIGNALS:  # Python's own would raise KeyboardInterrupt wherever the main thread is
+    signal.signal(_number, _on_signal)
+
 import sys
-import threading
 import traceback
 from collections.abc import Callable
 from importlib import import_module
@@ -17,10 +34,7 @@ from typing import Any
 from calib_ros.errors import CalibrationError
 from calib_ros.runtime import return_freed_memory
 
-WAKE_S = 0.5
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-_ros_runs = threading.Event()
+WAKE_S = 0.2  # Python's handlers of signals run between callbacks only
 
 
 def calib_node(args: list[str] | None = None) -> int:
@@ -35,7 +49,6 @@ def calib_lifecycle_node(args: list[str] | None = None) -> int:
 
 def _run(name: str, module: str, node: str, args: list[str] | None) -> int:
     """Run the node of a module, which is imported when signals end the process already."""
-    end_at_signals()
     try:
         make = getattr(import_module(module), node)
     except CalibrationError as error:  # the compiled kernel is missing
@@ -49,11 +62,12 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
 
     make: a rclpy node with threads of its own, which its stop() ends; True if they ended.
     """
-    end_at_signals()
+    global _ros_runs
     import cv2
     import rclpy
     from rclpy.clock import Clock, ClockType
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
 
     from calib_ros.ros import parameters
     from calib_ros.ros.dds import use_large_message_profile
@@ -63,31 +77,27 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
     cv2.setNumThreads(1)  # online.max_load counts the own threads of the node, and cores belong to others
     try:
         parameters.check_files(sys.argv if args is None else args)
-        rclpy.init(args=args)
+        _ros_runs = True
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except CalibrationError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
     except Exception as error:  # rcl's message names what is wrong with the arguments or the parameter file
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    _ros_runs.set()
     executor = SingleThreadedExecutor()
     node: Any = None
     try:
         node = make()
-        # rclpy's handler wakes the executor before it ends the context: an executor that is back in its wait by then would wait
-        # for ever, if nothing else came.
         node.create_timer(WAKE_S, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
         executor.add_node(node)
-        executor.spin()
+        while not _asked_to_end:
+            executor.spin_once()
     except CalibrationError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
     except ExternalShutdownException:
         pass
-    except Exception:
-        if rclpy.ok():
-            raise  # else: a signal took the context away while the node was being made, or in a callback
     finally:
         ended = node is None or node.stop()
         executor.shutdown(timeout_sec=0.2)
@@ -98,22 +108,6 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
         if not ended:
             end_at_once()
     return 0
-
-
-def end_at_signals() -> None:
-    """End the process at the first SIGINT or SIGTERM with exit code 0, as long as ROS does not run: nothing is to be finished.
-
-    From rclpy.init on its own handlers end the context, and with it spin(); they call this one besides. In place of Python's
-    own for SIGINT, which would raise KeyboardInterrupt wherever the main thread is, and again while it cleans up: launch and
-    shell both send SIGINT.
-    """
-
-    def end(*_: object) -> None:
-        if not _ros_runs.is_set():
-            os._exit(0)
-
-    for number in SIGNALS:
-        signal.signal(number, end)
 
 
 def ignore_signals() -> None:

@@ -239,6 +239,32 @@ sys.exit({entry_point}() + 3)
 
 
 @pytest.mark.parametrize(
+    ("entry_point", "module", "owner", "name"),
+    [
+        ("calib_node", "rclpy.node", "Node", "create_publisher"),
+        ("calib_lifecycle_node", "rclpy.node", "Node", "create_publisher"),
+        ("calib_node", "calib_ros.ros.diagnostics", "Diagnostics", "message"),
+    ],
+)
+def test_a_signal_in_the_middle_of_making_or_publishing(entry_point, module, owner, name):
+    """What is begun goes on as usual: nothing is published without a context, or made in half of one."""
+    program = f"""
+import os, sys
+from calib_ros.ros.process import {entry_point}
+from {module} import {owner}
+original = {owner}.{name}
+def signalled(*args, **named):
+    os.kill(os.getpid(), {int(signal.SIGINT)})
+    return original(*args, **named)
+{owner}.{name} = signalled
+sys.exit({entry_point}())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S)
+    assert done.returncode == 0, done.stderr
+    assert not [line for line in done.stderr.splitlines() if "[INFO]" not in line], done.stderr
+
+
+@pytest.mark.parametrize(
     ("arguments", "text"),
     [
         (["-p", "search.rotation_deg:=-5.0"], "search.rotation_deg"),
