@@ -59,7 +59,8 @@ def motion(frames: Sequence[Frame], config: MotionConfig) -> str:
 
 def summary(result: Result, advice: str = "", scan_period_s: float = MotionConfig.scan_period_s) -> str:
     """What `calib-ros calibrate` prints. advice: what to add. scan_period_s: see ``motion.scan_period_s``."""
-    lines = [f"{result.status}: {result.frames_used} frames, score {result.score:.3f}, {result.elapsed_s:.1f} s"]
+    score = f"score {result.score:.3f}, " if np.isfinite(result.score) else ""
+    lines = [f"{result.status}: {result.frames_used} frames, {score}{result.elapsed_s:.1f} s"]
     if result.reason:
         lines.append(result.reason)
     if advice:

@@ -138,7 +138,8 @@ class FirstGuess:
         if waits:
             return self._insufficient(initial, self._failure)
         if lasted < ENOUGH_S:
-            return self._insufficient(initial, f"waiting for {ENOUGH_S:g} s of driving, {lasted:.1f} s so far")
+            so_far = f", {lasted:.1f} s so far" if lasted else ""
+            return self._insufficient(initial, f"waiting for {ENOUGH_S:g} s of driving{so_far}")
         if progress is not None:
             progress("first guess", 0.0)  # where the estimate may be cancelled
         try:
@@ -166,7 +167,8 @@ class FirstGuess:
         known, needed = len(views_of(features)), self.config.online.min_keyframes
         if known < needed:
             missing = calibrator.segmentation.missing(IMAGE, CLOUD)
-            return self._insufficient(initial, missing or f"waiting for the classes of keyframes, {known} of {needed}")
+            so_far = f", {known} so far" if known else ""
+            return self._insufficient(initial, missing or f"waiting for the classes of {needed} keyframes{so_far}")
         return calibrator.guess(features, progress=progress, method=self.config.initial.method)
 
     @staticmethod

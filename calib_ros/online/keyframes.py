@@ -302,9 +302,10 @@ class EgoMotion:
         turn, way = (sweep_s * float(np.linalg.norm(part)) for part in (twist[:3], twist[3:]))
         if 0 <= since <= REMEMBERED_S and (turn > np.deg2rad(limits.max_sigma_deg) or way > limits.max_sigma_m):
             self.left_out += 1
+            speed, rate = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
             reason = self.last.reason if self.last is not None and self.last.twist is None else "the scan before is missing"
             raise BadTimesError(
-                f"keyframe left out: the vehicle moved at {np.linalg.norm(twist[3:]):.1f} m/s {since:.1f} s ago, and its motion "
+                f"keyframe left out: the vehicle moved at {speed:.1f} m/s and {rate:.1f} deg/s {since:.1f} s ago, and its motion "
                 f"now is unknown ({reason}); if this lasts, the LiDAR's messages get lost"
             )
 

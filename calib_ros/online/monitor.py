@@ -265,9 +265,10 @@ class Monitor:
     def _describe(self, test: ShiftTest, count: int) -> str:
         frames, verb = (f"the newest {count} keyframes", "") if count > 1 else ("the newest keyframe", "es")
         if not test.significant or self._match.evidence > test.evidence:
-            return f"{frames} hardly match{verb} at the current extrinsic (p = {test.p_value:.2g})"
+            return f"{frames} hardly match{verb} at the current extrinsic"  # the p-value is that of a shift
         shift = f"{test.deg:.2f} deg / {100 * test.m:.0f} cm"
-        return f"{frames} fit{'s' if count == 1 else ''} best {shift} away from the current extrinsic (p = {test.p_value:.2g})"
+        p = f"p = {test.p_value:.2g}" if test.p_value else "p < 1e-300"
+        return f"{frames} fit{'s' if count == 1 else ''} best {shift} away from the current extrinsic ({p})"
 
 
 def measure_shift(

@@ -185,6 +185,11 @@ class Tracker:
             self.current = self._extrinsic()
         return self.current
 
+    @property
+    def sensor_problem(self) -> SensorProblem | None:
+        """What is wrong with a sensor; None while both work."""
+        return self._sensor_problem
+
     def set_sensor_problem(self, problem: SensorProblem | None) -> Extrinsic:
         """A sensor shows nothing; None when both work again. Another figure of the same problem changes nothing."""
         if problem != self._sensor_problem:
@@ -367,20 +372,19 @@ class Tracker:
         blinded = "" if self._sensor_problem is None else self._sensor_problem.message
         if self.lost:
             estimated = self._accepted_since_moved or self._rejected_in_a_row
-            agreed = f"{self._agreeing_in_a_row} of {RECOVERING} estimates in a row agree with the new one"
-            reason = f"estimate {result.status}: {result.reason or agreed}" if estimated else self._objection or ""
-            if self.config.online.mode == MANUAL:
-                reason += "; online.mode is manual: call ~/calibrate"
-            result = replace(result, status=MOVED, reason="; ".join(filter(None, [reason, blinded])))
+            more = RECOVERING - self._agreeing_in_a_row
+            missing = f"{more} more estimate{'s in a row' if more > 1 else ''} must agree with the new one"
+            reason = f"estimate {result.status}: {result.reason or missing}" if estimated else self._objection
+            by_hand = "online.mode is manual: call ~/calibrate" if self.config.online.mode == MANUAL else ""
+            result = replace(result, status=MOVED, reason="; ".join(filter(None, [reason, by_hand, blinded])))
         elif self._sensor_problem is not None:
             result = replace(result, status=BLINDED, reason=blinded)
         elif self.suspect:
             result = replace(result, status=SUSPECT, reason=self._objection or "")
         elif result.converged and self.tentative:
-            missing, needed = self.missing, self.confirmations.keyframes
-            by = "frames of another speed or turn, which show whether the clocks agree"
+            missing, by = self.missing, "frames of another speed or turn, which show whether the clocks agree"
             if missing.keyframes:
-                by = f"keyframes, {needed - missing.keyframes} of {needed}"
+                by = f"{missing.keyframes} more keyframe{'s' if missing.keyframes > 1 else ''}"
             elif missing.estimates:
                 by = "another estimate"
             reason = "; ".join(filter(None, [f"to be confirmed by {by}", result.reason]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future as Promise
@@ -111,5 +112,6 @@ def _outcome(estimate: Promise[Any]) -> tuple[bool, str]:
     if error is not None:
         return False, str(error) or "stopped"
     result = estimate.result().result
-    message = f"{result.status}: {result.frames_used} keyframes, score {result.score:.3f}. {result.reason}".strip()
-    return result.status in (CONVERGED, TENTATIVE), message
+    figures = f"{result.frames_used} keyframes, score {result.score:.3f}" if math.isfinite(result.score) else ""
+    message = ". ".join(filter(None, [figures, result.reason]))
+    return result.status in (CONVERGED, TENTATIVE), f"{result.status}: {message}"

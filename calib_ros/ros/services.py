@@ -95,12 +95,10 @@ class Services:
         last_good = self._publisher.last_good()
         if last_good is not None:
             response.last_good_known, response.last_good = True, last_good
-        wanted = max(recalibrator.config.online.min_keyframes, 1)
-        response.message = response.extrinsic.reason or (
-            f"estimated from {result.frames_used} keyframes"
-            if response.success
-            else f"{len(recalibrator.buffer)} of {wanted} keyframes"
-        )
+        more = recalibrator.config.online.min_keyframes - len(recalibrator.buffer)
+        waiting = f"waiting for {more} more keyframes" if more > 0 else "no estimate yet"
+        made = f"estimated from {result.frames_used} keyframes"
+        response.message = response.extrinsic.reason or (made if response.success else waiting)
         return response
 
     async def _capture(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

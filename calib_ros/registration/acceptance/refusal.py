@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -32,6 +33,8 @@ def _refusal(code: RefusalCode, text: str, **figures: float) -> Refusal:
 def worse_than_start(score: float, initial_score: float) -> Refusal:
     """The optimum scores less than the initial extrinsic."""
     text = f"no better extrinsic found: score {score:.3f} against {initial_score:.3f} at the start"
+    if score >= initial_score:  # but for the prior
+        text += " is too little for its distance from the start (constraints.sigma_deg, constraints.sigma_m)"
     return _refusal(RefusalCode.WORSE_THAN_START, text, score=score, initial_score=initial_score)
 
 
@@ -47,11 +50,9 @@ def too_far_from_start(rotation_deg: float, translation_m: float, max_rotation_d
 
 
 def low_score(score: float) -> Refusal:
-    """The score is no better than that of the mean of the edge maps."""
-    text = (
-        f"the score is {score:.2f}: the image shows nothing where the LiDAR sees edges; check exposure, lens, topics and time "
-        "stamps"
-    )
+    """The score is no better than that of the mean of the edge maps; NaN where there is none."""
+    figure = f" (score {score:.2g})" if math.isfinite(score) else ""
+    text = f"the image shows nothing where the LiDAR sees edges{figure}; check exposure, lens, topics and time stamps"
     return _refusal(RefusalCode.LOW_SCORE, text, score=score)
 
 
@@ -79,12 +80,13 @@ def too_uncertain(directions: Sequence[Direction], tolerance_deg: float, toleran
 def left_open(what: str, value: float, sigma: float, probability: float, tolerance_deg: float, tolerance_m: float) -> Refusal:
     """The scenes leave open whether something that was given is so wrong that the extrinsic is off by more than the tolerance.
 
-    what: its name with the unit. value: what the scenes show of it, with its standard deviation. probability: of being so wrong.
+    what: its name with the unit. value: what the scenes show of it, with its standard deviation, infinite where they show
+    nothing. probability: of being so wrong.
     """
+    shown = f"show a change of {what} of {value:.2g} +- {sigma:.2g}" if math.isfinite(sigma) else f"do not show {what}"
     text = (
-        f"not known to within {tolerance_deg:g} deg / {100 * tolerance_m:g} cm: the scenes show a change of "
-        f"{what} of {value:.2g} +- {sigma:.2g}, and leave open whether it is that wrong (probability "
-        f"{probability:.0%}); add frames of other scenes, or check K and D in camera_info and the clocks"
+        f"not known to within {tolerance_deg:g} deg / {100 * tolerance_m:g} cm: the scenes {shown}, and leave open whether it is "
+        f"that wrong (probability {probability:.0%}); add frames of other scenes, or check K and D in camera_info and the clocks"
     )
     figures = {"value": value, "sigma": sigma, "probability": probability}
     return _refusal(RefusalCode.TOO_UNCERTAIN, text, **figures, tolerance_deg=tolerance_deg, tolerance_m=tolerance_m)
@@ -105,9 +107,9 @@ def wrong_intrinsics(focal: float, u: float, v: float, deviations: float) -> Ref
     if focal:
         what = f"with a focal length about {abs(focal):.1%} {'longer' if focal > 0 else 'shorter'}"
     elif u:
-        what = f"with the principal point about {abs(u):.0f} px further to the {'right' if u > 0 else 'left'}"
+        what = f"with the principal point about {abs(u):.3g} px further to the {'right' if u > 0 else 'left'}"
     else:
-        what = f"with the principal point about {abs(v):.0f} px further {'down' if v > 0 else 'up'}"
+        what = f"with the principal point about {abs(v):.3g} px further {'down' if v > 0 else 'up'}"
     text = (
         f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); check K and D "
         "in camera_info, the image size they are for, and image_is_rectified"
@@ -119,10 +121,13 @@ def wrong_times(seconds: float, deviations: float) -> Refusal:
     """The scenes match better with the points measured at other times. seconds: what motion.time_offset_s lacks; deviations:
     how far that is from what is configured, in standard deviations."""
     late = "images are stamped late" if seconds > 0 else "images are stamped early"
+    apart = f"with the clocks set {1000 * abs(seconds):.0f} ms apart"
+    match = f"the best match is one {apart}, which the scenes do not confirm"
+    if deviations >= 1:
+        match = f"the scenes match clearly better {apart} ({deviations:.1f} standard deviations)"
     text = (
-        f"wrong times: the scenes match clearly better with the clocks set {1000 * abs(seconds):.0f} ms apart "
-        f"({deviations:.1f} standard deviations): {late}, or the scans the other way; synchronise the clocks, or add "
-        f"{seconds:g} to motion.time_offset_s"
+        f"wrong times: {match}: {late}, or the scans the other way; synchronise the clocks, or add {seconds:.3g} to "
+        "motion.time_offset_s"
     )
     return _refusal(RefusalCode.WRONG_TIMES, text, seconds=seconds, deviations=deviations)
 

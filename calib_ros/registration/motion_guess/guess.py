@@ -78,7 +78,7 @@ def motion_guess(frames: Sequence[Frame], extract: FeatureExtractor, seed: int =
     """
     if len(frames) < 2:
         raise TooFewFeaturesError(
-            f"a first guess from motion needs consecutive frames, a few seconds of them; there is {len(frames)}"
+            f"a first guess from motion needs consecutive frames, a few seconds of them, and not {'one' if frames else 'none'}"
         )
     if any(b.moment_of_cloud <= a.moment_of_cloud for a, b in pairwise(frames)):
         raise BadInputError(
@@ -92,10 +92,14 @@ def motion_guess(frames: Sequence[Frame], extract: FeatureExtractor, seed: int =
 
 def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> MotionGuess:
     """The same from points tracked in the images and the LiDAR's motion. Raises TooFewFeaturesError."""
-    if len(tracks) < MIN_TRACKS or len(np.unique(tracks.pair)) < MIN_PAIRS:
+    pairs = len(np.unique(tracks.pair))
+    if len(tracks) < MIN_TRACKS or pairs < MIN_PAIRS:
+        found = (
+            f"{len(tracks)} points could be tracked between {pairs} pairs of pictures" if pairs else "no point could be tracked"
+        )
         raise TooFewFeaturesError(
-            f"only {len(tracks)} points could be tracked from picture to picture, {MIN_TRACKS} are needed: give a few seconds of "
-            "frames that follow each other at 5 Hz or more, of scenes with texture"
+            f"{found}, {MIN_TRACKS} between {MIN_PAIRS} are needed: give a few seconds of frames that follow each other at 5 Hz "
+            "or more, of scenes with texture"
         )
     solver = HandEye(tracks, runs, seed)
     fits = solver.hypotheses(HYPOTHESES)

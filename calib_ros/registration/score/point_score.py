@@ -258,7 +258,7 @@ class FastScore(PointScore):
         frame = np.concatenate([np.full(len(p), j, np.int32) for j, p in enumerate(kept)])
         if len(frame) < MIN_POINTS:
             raise TooFewFeaturesError(
-                f"only {len(frame)} edge points near the image in {len(features)} frames (need {MIN_POINTS}); "
+                f"{len(frame) or 'no'} edge points near the image in {len(features)} frames, {MIN_POINTS} are needed; "
                 "wait for a scene with objects, or check the initial extrinsic"
             )
         weights = np.concatenate([_weights(p, config) for p in kept])

@@ -200,7 +200,7 @@ class TestEstimate:
             return replace(bare[2], stamp=bare[2].stamp + shift, cloud_stamp=bare[2].cloud_stamp + shift)
 
         recalibrator.selector.reset()
-        with pytest.raises(BadTimesError, match=r"moved at .* m/s 1\.\d s ago, and its motion now is unknown"):
+        with pytest.raises(BadTimesError, match=r"moved at .* m/s and .* deg/s 1\.\d s ago, and its motion now is unknown"):
             recalibrator.ingest(later(1.0))
         assert (recalibrator.keyframes_seen, recalibrator.motion.left_out) == (2, 1)
         assert recalibrator.ingest(later(9.0))  # nobody knows whether it still moves

@@ -132,7 +132,7 @@ def test_confirmations_that_are_missing_are_counted_down_and_anew_after_a_moveme
 @pytest.mark.parametrize("by", [STILL, ((0, 0.1, 0), (0.02, 0, 0))])
 def test_first_estimate_is_tentative_until_keyframes_and_another_estimate_confirm_it(by):
     tracker = confirming()
-    assert "keyframes, 4 of 5" in consistent(tracker, 4).result.reason
+    assert "1 more keyframe" in consistent(tracker, 4).result.reason
     assert tracker.update(estimate(by)).result.status == TENTATIVE
     assert tracker.apply(assessment(Verdict.INCONCLUSIVE)).result.status == TENTATIVE  # it shows nothing
     extrinsic = consistent(tracker, 1)
@@ -464,7 +464,7 @@ def test_moved_until_estimates_in_a_row_agree():
         assert played(tracker, new) == [MOVED]
         assert tracker.last_good is good
         assert not tracker.settled
-        agreeing.append(int(re.search(r"(\d) of \d", tracker.current.result.reason)[1]))
+        agreeing.append(RECOVERING - int(re.search(r"(\d) more", tracker.current.result.reason)[1]))
     assert agreeing == [0, 1, 0, *range(1, RECOVERING)]
     assert played(tracker, FAR) == [CONVERGED]
     assert (tracker.settled, tracker.monitored, tracker.current.monitor_message) == (True, True, "")

@@ -263,9 +263,9 @@ def test_too_few_points_are_refused_with_their_number(monkeypatch):
     with pytest.raises(TooFewFeaturesError, match="no frame"):
         FastScore([], nominal(), CONFIG)
     few = [frame(0, n=100), frame(1, n=90)]
-    with pytest.raises(TooFewFeaturesError, match=r"only 1\d\d edge points near the image in 2 frames \(need 200\)"):
+    with pytest.raises(TooFewFeaturesError, match=r"1\d\d edge points near the image in 2 frames, 200 are needed"):
         FastScore(few, nominal(), CONFIG)
-    with pytest.raises(TooFewFeaturesError, match="only 0 edge points"):
+    with pytest.raises(TooFewFeaturesError, match="no edge points"):
         FastScore([frame(0)], se3.from_parts(np.diag([-1.0, 1, -1]) @ nominal()[:3, :3], [0, 0, -500]), CONFIG)
     monkeypatch.setattr("calib_ros.registration.score.point_score.MIN_POINTS", 100)
     FastScore(few, nominal(), CONFIG)
