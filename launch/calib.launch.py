@@ -1,9 +1,7 @@
 """The node alone: ros2 launch calib_ros calib.launch.py image:=/camera/image_raw points:=/lidar/points"""
 
-import os
-
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -13,23 +11,14 @@ TOPICS = ("image", "camera_info", "points", "odom", "imu", "twist")
 CONFIG = PathJoinSubstitution([FindPackageShare("calib_ros"), "config"])
 
 
-def dds_profile() -> list[SetEnvironmentVariable]:
-    """Shared memory for images and scans, unless the user chose a profile."""
-    # Jazzy and older read only the second name; from Kilted on the second warns that it will go.
-    names = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-    if any(name in os.environ for name in names):
-        return []
-    old = os.environ.get("ROS_DISTRO") in ("humble", "iron", "jazzy")
-    return [SetEnvironmentVariable(names[old], PathJoinSubstitution([CONFIG, "fastdds_profile.xml"]))]
-
-
 def node(context: LaunchContext) -> list[Node]:
     """The state file is a parameter only if the argument is given: an empty one would override that of the parameter file. A
     preset holds where no parameter file does, and the usual one names all parameters."""
     state_file, preset = (LaunchConfiguration(name).perform(context) for name in ("state_file", "preset"))
     params_file = LaunchConfiguration("params_file").perform(context)
     usual = PathJoinSubstitution([CONFIG, "calib_ros.yaml"]).perform(context)
-    managed = LaunchConfiguration("managed").perform(context).lower() == "true"
+    managed, respawn = (LaunchConfiguration(name).perform(context) == "true" for name in ("managed", "respawn"))
+    nice = LaunchConfiguration("nice").perform(context)
     return [
         Node(
             package="calib_ros",
@@ -43,7 +32,11 @@ def node(context: LaunchContext) -> list[Node]:
                 *([{"preset": preset}] if preset else []),
             ],
             remappings=[(topic, LaunchConfiguration(topic)) for topic in TOPICS],
+            ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+            respawn=respawn,
+            respawn_delay=float(LaunchConfiguration("respawn_delay").perform(context)),
             output="screen",
+            **({"prefix": f"nice -n {nice}"} if nice else {}),  # else launch's own argument launch-prefix holds
         )
     ]
 
@@ -68,8 +61,13 @@ def generate_launch_description() -> LaunchDescription:
                 description="true: calib_lifecycle_node, which does nothing until it is configured and activated",
             ),
             DeclareLaunchArgument("use_sim_time", default_value="false", description="follow /clock"),
+            DeclareLaunchArgument(
+                "respawn", default_value="false", choices=["false", "true"], description="start the node again whenever it ends"
+            ),
+            DeclareLaunchArgument("respawn_delay", default_value="2.0", description="before that, s"),
+            DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal"),
+            DeclareLaunchArgument("nice", default_value="", description="niceness of the node, 1 to 19; empty = as launch"),
             *(DeclareLaunchArgument(topic, default_value=topic, description=f"topic to take as {topic}") for topic in TOPICS),
-            *dds_profile(),
             OpaqueFunction(function=node),
         ]
     )

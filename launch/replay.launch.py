@@ -16,7 +16,6 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("bag", description="ROS 2 bag to play"),
             DeclareLaunchArgument("rate", default_value="1.0", description="speed of the playback"),
-            # First, because it sets the DDS profile that the player needs as well.
             IncludeLaunchDescription(PythonLaunchDescriptionSource(calib), launch_arguments={"use_sim_time": "true"}.items()),
             # Not a Node: launch would append --ros-args, which this command line does not know.
             ExecuteProcess(

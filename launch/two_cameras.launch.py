@@ -4,7 +4,8 @@ r"""Two cameras and one LiDAR, a node for each pair:
         left_camera_info:=/front/camera_info right_image:=/rear/image_raw right_camera_info:=/rear/camera_info
 
 The nodes are /left/calib_ros and /right/calib_ros, and so are the names of their topics and services. Each keeps a state file of
-its own in state_dir. params_file, managed and use_sim_time are those of calib.launch.py, for both nodes.
+its own in state_dir. params_file, preset, managed, use_sim_time, respawn, respawn_delay, log_level and nice are those of
+calib.launch.py, for both nodes.
 """
 
 from launch import LaunchDescription
