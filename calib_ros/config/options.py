@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import field
@@ -26,6 +27,18 @@ def option(
     field in earlier versions; files and parameters that use it are still read."""
     meta = {"doc": doc, "low": low, "high": high, "choices": choices, "length": length, "formerly": formerly}
     return field(default=default, metadata=meta)
+
+
+def bounds(stage: type, name: str) -> tuple[float, float]:
+    """Lowest and highest value of a field of a stage; infinite without one."""
+    low, high = (stage.__dataclass_fields__[name].metadata[end] for end in ("low", "high"))  # type: ignore[attr-defined]
+    return -math.inf if low is None else low, math.inf if high is None else high
+
+
+def has_room(stage: Stage, name: str, up: bool) -> bool:
+    """Whether the value of a field can be raised (up), or lowered, within its range."""
+    low, high = bounds(type(stage), name)
+    return bool(getattr(stage, name) < high if up else getattr(stage, name) > low)
 
 
 class Stage:

@@ -9,8 +9,8 @@ import numpy as np
 from calib_ros.frame import NANOSECONDS
 from calib_ros.stamps import LONGEST_QUEUE_S, cause_of_difference, time_scales
 
-# Messages of both streams together that agree, before anything is concluded; more where pairs were found before, since a clock
-# that jumps usually comes back.
+# Changes from one stream to the other that agree, before anything is concluded; more where pairs were found before, since a clock
+# that jumps usually comes back. Of a stream that goes on alone nothing is learnt: the other one has stopped, or gets lost.
 SEEN, SEEN_LATER = 20, 200
 STEADY_S = 1.0  # within which leads of one pair of clocks stay, messages of a camera at 1 Hz included
 
@@ -23,17 +23,18 @@ class ClockDifference:
         self.ahead = 0
         self._image: int | None = None  # the newest stamps, ns
         self._cloud: int | None = None
+        self._newest_is_image: bool | None = None
         self._leads: deque[int] = deque(maxlen=SEEN_LATER)
 
     def add_image(self, stamp: int, paired: bool = False) -> bool:
         """An image's stamp, ns; True if it changes what is taken out. paired: whether there were pairs so far."""
         self._image = stamp
-        return self._look(paired)
+        return self._look(True, paired)
 
     def add_cloud(self, stamp: int, paired: bool = False) -> bool:
         """The same of a cloud, as its driver has stamped it."""
         self._cloud = stamp
-        return self._look(paired)
+        return self._look(False, paired)
 
     def describe(self) -> str:
         """For people; "" if there is no difference."""
@@ -46,8 +47,9 @@ class ClockDifference:
             "paired as received; synchronise the clocks (PTP, chrony)"
         )
 
-    def _look(self, paired: bool) -> bool:
-        if self._image is None or self._cloud is None:
+    def _look(self, is_image: bool, paired: bool) -> bool:
+        goes_on_alone, self._newest_is_image = is_image == self._newest_is_image, is_image
+        if goes_on_alone or self._image is None or self._cloud is None:
             return False
         self._leads.append(self._cloud - self._image)
         agrees = abs(self._cloud - self._image - self.ahead) <= STEADY_S * NANOSECONDS

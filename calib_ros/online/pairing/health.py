@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 
+from calib_ros.config import OnlineConfig
+from calib_ros.config.options import bounds
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.pairing.synchronizer import Synchronizer, SynchronizerCounts
-from calib_ros.stamps import time_scales
+from calib_ros.stamps import pair_tolerance, time_scales
 
 WINDOW = 11  # checks, at one a second: what happened in 10 s
 # Of the slower stream, from which share without partner on it is a problem: some messages get lost on most vehicles, and two of
@@ -15,6 +17,7 @@ WINDOW = 11  # checks, at one a second: what happened in 10 s
 UNPAIRED_SHARE, MIN_MESSAGES = 0.3, 10
 MISSING_SHARE = 0.1  # of a stream's messages, from which on their loss is named
 OTHER_CLOCK_S = 1.0  # between the newest stamps of both streams; drivers deliver within half a second
+SILENT_PERIODS = 2.5  # without a message: one may be lost, and another one late
 
 
 class PairingHealth:
@@ -64,20 +67,28 @@ class PairingHealth:
                 f"the newest image is stamped {_time(abs(lead))} {'after' if lead > 0 else 'before'} the newest cloud: {cause}; "
                 "synchronise the clocks (PTP, chrony)"
             )
-        missing = synchronizer.missing_shares()
-        if max(missing) >= MISSING_SHARE:
-            return f"{missing[0]:.0%} of the images and {missing[1]:.0%} of the clouds are missing between those that came"
+        alone, periods = synchronizer.alone_s(), synchronizer.periods
+        stopped, period = ("clouds", periods[1]) if alone > 0 else ("images", periods[0])
+        if abs(alone) >= max(OTHER_CLOCK_S, SILENT_PERIODS * period / NANOSECONDS):
+            return f"no {stopped} have come for {_time(abs(alone))}; see that their driver runs and their messages get through"
+        shares = dict(zip(("images", "clouds"), synchronizer.missing_shares(), strict=True))
+        lost = [f"{share:.0%} of the {name}" for name, share in shares.items() if share >= MISSING_SHARE]
+        if lost:
+            return f"{' and '.join(lost)} are missing between those that came; see that the drivers send them and none get lost"
         if synchronizer.outruns_queue():
             return (
                 "one stream comes later than the queue of the other one holds; raise online.pair_queue, or lower the rate of the "
                 "faster one"
             )
-        periods = " and ".join(f"{period / NANOSECONDS:.3g} s" for period in synchronizer.periods)
+        every = " and ".join(f"{period / NANOSECONDS:.3g} s" if period else "an unknown time" for period in periods)
         if gap is None or gap <= tolerance:
-            return f"images and clouds come every {periods}, at irregular times; check both drivers' rates and stamps"
+            return f"images and clouds come every {every}, at irregular times; check both drivers' rates and stamps"
+        widest = pair_tolerance(periods, bounds(OnlineConfig, "pair_tolerance_s")[1]) / NANOSECONDS
+        cures = ["trigger the camera by the scanner", "synchronise the clocks"]
+        cures += ["raise online.pair_tolerance_s"] if gap <= widest else []
         return (
-            f"their stamps are {gap:.3f} s apart and more, {tolerance:.3g} s are allowed (images and clouds every {periods}); "
-            "synchronise the clocks, or raise online.pair_tolerance_s"
+            f"their stamps are {gap:.3f} s apart and more, {tolerance:.3g} s are allowed (images and clouds every {every}); "
+            f"{', '.join(cures[:-1])} or {cures[-1]}"
         )
 
 

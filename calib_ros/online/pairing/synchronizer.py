@@ -66,6 +66,8 @@ class Synchronizer:
         self.cloud_offset = cloud_offset
         self.counts = SynchronizerCounts()
         self._images, self._clouds = _Stream(capacity), _Stream(capacity)
+        self._newest: _Stream | None = None
+        self._lead: int | None = None  # ns, see lead_s
 
     def configure(self, tolerance_s: float, capacity: int) -> None:
         """Use other limits from now on."""
@@ -103,10 +105,15 @@ class Synchronizer:
         return float(np.abs(clouds[nearest_index(clouds, images)] - images).min() / NANOSECONDS)
 
     def lead_s(self) -> float | None:
-        """How far the newest image is ahead of the newest cloud, s, negative if it is behind; None without one of them."""
-        if self._images.latest is None or self._clouds.latest is None:
-            return None
-        return (self._images.latest - self._clouds.latest - (self.cloud_offset or 0)) / NANOSECONDS
+        """How far the newest image was ahead of the newest cloud, s, negative if behind, when a message last followed one of the
+        other stream: both have gone on then. None before."""
+        return None if self._lead is None else (self._lead - (self.cloud_offset or 0)) / NANOSECONDS
+
+    def alone_s(self) -> float:
+        """For how long images have come without clouds since, by their stamps, s; negative: clouds without images."""
+        if self._lead is None or self._images.latest is None or self._clouds.latest is None:
+            return 0.0
+        return (self._images.latest - self._clouds.latest - self._lead) / NANOSECONDS
 
     def outruns_queue(self) -> bool:
         """True if a full queue of one stream holds only messages that are newer than all of the other one."""
@@ -119,6 +126,7 @@ class Synchronizer:
     def clear(self) -> None:
         """Drop the waiting messages, keep the counts."""
         self._images, self._clouds = _Stream(self._images.capacity), _Stream(self._clouds.capacity)
+        self._newest = self._lead = None
 
     # ---- messages -----------------------------------------------------------------------------------------------------
 
@@ -127,6 +135,7 @@ class Synchronizer:
         self._handle_jump(self._images, stamp)
         self.counts.images += 1
         self.counts.unpaired_images += self._images.push(stamp, image)
+        self._follow(self._images)
         return self._final_pairs()
 
     def add_cloud(self, stamp: int, cloud: Any) -> list[tuple[Any, Any]]:
@@ -134,6 +143,7 @@ class Synchronizer:
         self._handle_jump(self._clouds, stamp)
         self.counts.clouds += 1
         self.counts.unpaired_clouds += self._clouds.push(stamp, cloud)
+        self._follow(self._clouds)
         return self._final_pairs()
 
     def _handle_jump(self, stream: _Stream, stamp: int) -> None:
@@ -142,6 +152,11 @@ class Synchronizer:
             self.counts.unpaired_images += len(self._images.waiting)
             self.counts.unpaired_clouds += len(self._clouds.waiting)
             self.clear()
+
+    def _follow(self, stream: _Stream) -> None:
+        if stream is not self._newest and self._images.latest is not None and self._clouds.latest is not None:
+            self._lead = self._images.latest - self._clouds.latest
+        self._newest = stream
 
     def _cloud_moments(self) -> Stamps:
         return self._clouds.stamps() + (self.cloud_offset or 0)

@@ -278,6 +278,26 @@ def test_why_no_partner_is_found(watched, streams, said):
     assert re.search(said, Watched(**watched).feed(**{"images": ticks(10), "clouds": ticks(10, seed=1), **streams})[-1])
 
 
+@pytest.mark.parametrize(
+    ("images", "clouds", "said"),
+    [
+        (ticks(10), ticks(10, 8.0, seed=1), "no clouds have come for 12 s; see that their driver runs"),
+        (ticks(30, 2.0), ticks(10, seed=1), "no images have come for 18 s; see that their driver runs"),
+        (
+            ticks(10),
+            ticks(10, seed=1, lost=0.5),
+            r"^\d+% of the clouds are missing between those that came; see that the drivers",
+        ),
+        (ticks(1), ticks(1, seed=1) + 450.0, r"0\.12 s are allowed.* or raise online\.pair_tolerance_s$"),
+    ],
+)
+def test_clocks_are_not_blamed_for_what_is_lost_and_no_limit_is_to_be_raised_that_does_not_bind(images, clouds, said):
+    watched = Watched()
+    watched.feed(images, clouds)
+    assert re.search(said, watched.health.cause()), watched.health.cause()
+    assert "pair_tolerance" in said or "clocks" not in watched.health.cause()
+
+
 # ---- clocks of other epochs --------------------------------------------------------------------------------------------------
 
 
@@ -310,6 +330,14 @@ def test_other_epochs_are_known_as_well_as_messages_arrive(ahead_s):
 def test_what_may_be_messages_that_wait_is_left_alone(ahead_s):
     clocks = difference(ahead_s)
     assert (clocks.ahead, clocks.describe()) == (0, "")
+
+
+@pytest.mark.parametrize("period", [33, 100])
+def test_a_stream_that_goes_on_alone_tells_nothing_of_the_clocks(period):
+    """Although it is 18 s ahead after a while, as GPS time is, and then a minute."""
+    clocks = ClockDifference()
+    clocks.add_cloud(T0)
+    assert not any(clocks.add_image(T0 + t * MS) for t in range(0, 90_000, period))
 
 
 def test_clocks_that_are_set_right_later_are_noticed():
