@@ -38,7 +38,7 @@ GROUPS = {
     ],
     "Output": [
         "publish_tf", "tf_parent", "tf_child", "publish_period_s", "max_data_age_s", "consumers", "overlay_period_s",
-        "export.on_converged", "export.joint", "capture_dir", "capture_frames", "capture.on",
+        "export.on_converged", "export.joint", "capture_dir", "capture_frames", "capture.on", "vehicle",
     ],
     "Camera, scanner and motion of the vehicle": [
         "camera.intrinsics", "camera.focal_sigma", "lidar.layout", "lidar.min_range", "lidar.ego_box", "image.mask",

@@ -9,9 +9,10 @@ from typing import Any
 
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import CalibrationError, TooFewFeaturesError, defect, raised_at
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.sensor_health import SensorFault, SensorProblem
 from calib_ros.result import Extrinsic, Result
 
 
@@ -35,9 +36,18 @@ class ExtrinsicUpdated:
 
 @dataclass(frozen=True)
 class Problem:
-    """Something that a person should know, in one line."""
+    """Something that a person should know, in one line. kind: what counts as the same, whatever figures the message gives."""
 
     message: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Notice:
+    """The same of something that is well again."""
+
+    message: str
+    kind: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +62,7 @@ class IntakeIdle:
     """All pairs so far are worked off."""
 
 
-Event = FrameIngested | ExtrinsicUpdated | Problem | JobDone | IntakeIdle
+Event = FrameIngested | ExtrinsicUpdated | Problem | Notice | JobDone | IntakeIdle
 
 
 @dataclass(frozen=True)
@@ -76,11 +86,19 @@ class Inputs:
 class Announcer:
     """Thread-safe. tell: takes every event. stamp: of the newest keyframe, ns."""
 
+    NO_CAMERA = Problem("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'", "camera")
+    OTHER_CAMERA = Problem("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays", "intrinsics")
+    JUMPED_BACK = Problem(
+        "time stamps jumped back (a looping bag, or a clock was set back): messages that waited for a partner were dropped",
+        "stamps",
+    )
+
     def __init__(self, tell: Callable[[Event], None]) -> None:
         self.stamp = 0
         self.tell, self._lock = tell, threading.Lock()
         self._published: Result | None = None
-        self._notes: set[str] = set()
+        self._missing: set[str] = set()  # kinds of what the newest keyframe lacked
+        self._fault: SensorProblem | None = None
 
     def publish(self, recalibrator: Recalibrator, in_use: Callable[[], bool], again: bool) -> None:
         """The current extrinsic, if it or its status differs from the one published last; none of a replaced recalibrator.
@@ -105,26 +123,37 @@ class Announcer:
             self._lock.release()
 
     def note_what_is_missing(self, recalibrator: Recalibrator, keyframe: Frame) -> None:
-        """Tell what the estimates have to do without, once each."""
-        newest, notes = recalibrator.newest(), [recalibrator.motion.missing]
-        if keyframe.cloud.time_problem:
-            notes.append(f"{keyframe.cloud.time_problem}; until then the clouds count as without point times")
+        """Tell what the estimates have to do without, once it begins to be missing."""
+        newest, times = recalibrator.newest(), keyframe.cloud.time_problem
+        notes = {
+            "motion": recalibrator.motion.missing,
+            "times of points": times and f"{times}; until then the clouds count as without point times",
+        }
         if newest is not None and not newest.has_reflectivity:
-            notes.append("the cloud has no intensity: reflectivity edges are off, everything else works")
-        for note in notes:
-            if note and note not in self._notes:
-                self._notes.add(note)
-                self.tell(Problem(note))
+            notes["intensity"] = "the cloud has no intensity: reflectivity edges are off, everything else works"
+        missing = {kind for kind, note in notes.items() if note}
+        for kind in sorted(missing - self._missing):
+            self.tell(Problem(notes[kind], kind))
+        self._missing = missing
+
+    def sensors(self, recalibrator: Recalibrator) -> None:
+        """Tell when a sensor begins to show nothing, when it is for another reason, and when both work again."""
+        fault = recalibrator.tracker.sensor_problem
+        if fault == self._fault or (fault is None and recalibrator.sensors.faulty_frames):  # in doubt after a restart
+            return
+        self._fault = fault
+        if fault is None:
+            self.tell(Notice("camera and LiDAR work again", "sensors"))
+        else:
+            self.tell(Problem(fault.message, fault.fault.value))
 
     def other_sensors(self, names: Result, camera_frame: str, lidar_frame: str) -> None:
         """A pair of other sensors than those of a result came."""
         what = f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to"
-        self.tell(Problem(f"{what} {names.camera_frame}; give every camera-LiDAR pair its own node"))
+        self.tell(Problem(f"{what} {names.camera_frame}; give every camera-LiDAR pair its own node", "other sensors"))
 
     def report(self, error: Exception) -> None:
-        """Of a worker: a defect of ours says what it is, and the node goes on."""
-        if isinstance(error, CalibrationError):
-            self.tell(Problem(str(error)))
-        else:
-            line = f"unexpected {type(error).__name__}: {error}; please report it with the data that led to it"
-            self.tell(Problem(line))
+        """Of a worker, its kind being where it was raised: a defect of ours says what it is, and the node goes on."""
+        if isinstance(error, TooFewFeaturesError) and self._fault is not None and self._fault.fault is SensorFault.LIDAR_BLIND:
+            return  # which is told once, and not with every frame
+        self.tell(Problem(str(error) if isinstance(error, CalibrationError) else defect(error), raised_at(error)))

@@ -41,8 +41,6 @@ from calib_ros.result import Extrinsic, Result
 T = TypeVar("T")
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
-NO_CAMERA = "images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"
-JUMPED_BACK = "time stamps jumped back (a looping bag, or a clock was set back): messages that waited for a partner were dropped"
 
 
 class Pipeline:
@@ -90,7 +88,7 @@ class Pipeline:
         if self.recalibrator is not None:
             self._follow_clocks(self.recalibrator)
         if changed:
-            self._announcer.tell(Problem("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays"))
+            self._announcer.tell(Announcer.OTHER_CAMERA)
 
     def _recalibrator_at(self, camera: Camera, initial: Result, current: Result | None = None) -> Recalibrator:
         """A new one; its frames are those of the initial extrinsic."""
@@ -132,9 +130,9 @@ class Pipeline:
             jumped = self.synchronizer.counts.jumps_back > jumps
             clocks = self.clock_difference if self._pairing.clocks.ahead != ahead else ""
         if jumped:
-            self._announcer.tell(Problem(JUMPED_BACK))
+            self._announcer.tell(Announcer.JUMPED_BACK)
         if clocks:
-            self._announcer.tell(Problem(clocks))
+            self._announcer.tell(Problem(clocks, "clocks"))
 
     # ---- requests -----------------------------------------------------------------------------------------------------
 
@@ -285,6 +283,7 @@ class Pipeline:
             self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
+            self._announcer.sensors(recalibrator)
         self._learn_sweep(frame.cloud, recalibrator)
         if is_keyframe:
             self.last_keyframe = frame
@@ -304,7 +303,7 @@ class Pipeline:
         by what this cloud tells of the sweep."""
         camera = self.camera
         if camera is None:
-            self._announcer.tell(Problem(NO_CAMERA))
+            self._announcer.tell(Announcer.NO_CAMERA)
             return None
         recalibrator = self.recalibrator or self._start(camera, *self._inputs.frame_ids(intake.image, intake.cloud))
         if recalibrator is None:
@@ -406,8 +405,8 @@ class Pipeline:
         if recalibrator is not None:
             with self.load.counting(Work.CLASSES):
                 problems = recalibrator.segment_keyframe(lambda: self._segmenter.stopping or self.paused)
-            for problem in problems:
-                self._announcer.tell(Problem(problem))
+            for k, problem in enumerate(problems):
+                self._announcer.tell(Problem(problem, f"model {k}"))
             if self._is_due(recalibrator):
                 self._estimator.put(None)
 

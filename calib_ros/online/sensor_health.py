@@ -72,7 +72,7 @@ class SensorHealth:
             self._contrasts.clear()
         elif contrast < MIN_CONTRAST or self._low_contrast:
             figures = f"contrast {contrast:.1f}" + (f", usually {usual:.1f}" if usual else "")
-            message = f"the camera shows nothing ({figures}): a covered lens, no light, or overexposed"
+            message = f"the camera shows nothing ({figures}): a covered lens, no light, or overexposed; check lens and exposure"
             return SensorProblem(SensorFault.CAMERA_BLIND, message)
         self._contrasts.append(contrast)
         if not frozen:
@@ -101,7 +101,8 @@ class SensorHealth:
         if self._few_returns > ACCUSTOMED:
             self._returns.clear()
         elif returns == 0 or self._few_returns:
-            message = f"the LiDAR shows nothing ({returns} returns, usually {usual:.0f}): a covered or failing scanner"
+            figures = (f"{returns}" if returns else "no") + " returns" + (f", usually {usual:.0f}" if usual else "")
+            message = f"the LiDAR shows nothing ({figures}): a covered or failing scanner; check window and driver"
             return SensorProblem(SensorFault.LIDAR_BLIND, message)
         self._returns.append(returns)
         return None

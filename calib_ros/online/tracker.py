@@ -382,10 +382,10 @@ class Tracker:
         elif self.suspect:
             result = replace(result, status=SUSPECT, reason=self._objection or "")
         elif result.converged and self.tentative:
-            missing, by = self.missing, "frames of another speed or turn, which show whether the clocks agree"
-            if missing.keyframes:
-                by = f"{missing.keyframes} more keyframe{'s' if missing.keyframes > 1 else ''}"
-            elif missing.estimates:
+            lacking, by = self.missing, "frames of another speed or turn, which show whether the clocks agree"
+            if lacking.keyframes:
+                by = f"{lacking.keyframes} more keyframe{'s' if lacking.keyframes > 1 else ''}"
+            elif lacking.estimates:
                 by = "another estimate"
             reason = "; ".join(filter(None, [f"to be confirmed by {by}", result.reason]))
             result = replace(result, status=TENTATIVE, reason=reason)

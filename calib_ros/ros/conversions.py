@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from calib_ros_msgs.msg import Advice as AdviceMsg
@@ -15,7 +16,7 @@ from calib_ros_msgs.msg import Consumer as ConsumerMsg
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
-from sensor_msgs.msg import Image, PointCloud2, PointField
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from calib_ros import se3
@@ -192,4 +193,12 @@ def image_message(image: NDArray[np.uint8], frame_id: str, stamp: int) -> Image:
     data = array.array("B")
     data.frombytes(np.ascontiguousarray(image).data.cast("B"))
     msg.data = data
+    return msg
+
+
+def compressed_image_message(image: NDArray[np.uint8], frame_id: str, stamp: int) -> CompressedImage:
+    """BGR (H, W, 3) uint8 -> sensor_msgs/CompressedImage, a JPEG as image_transport's plugin `compressed` makes it."""
+    msg = CompressedImage(format="bgr8; jpeg compressed bgr8")
+    msg.header.frame_id, msg.header.stamp = frame_id, time_message(stamp)
+    msg.data = array.array("B", cv2.imencode(".jpg", image)[1].tobytes())
     return msg

@@ -17,6 +17,8 @@ OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 PROFILE, LARGE_PROFILE = "fastdds_profile.xml", "fastdds_profile_large.xml"
 PROFILE_BYTES = 6_000_000  # the largest message that PROFILE is made for: two of them and their like fit its memory
 
+_set_here = False  # a profile, by this process for itself
+
 
 def config_file(name: str) -> Path:
     """Path of a file of the config folder: in the source tree, the share folder of a ROS install, or sys.prefix.
@@ -36,17 +38,30 @@ def use_large_message_profile() -> None:
 
     Its default segment is smaller than one image, and best-effort messages get lost. Must run before rclpy.init().
     """
-    if not any(name in os.environ for name in PROFILE_VARIABLES):
+    global _set_here
+    if not given_profile():
         # The node works without; large best-effort messages may then get lost, as with any other node.
         with suppress(MissingDependencyError):
             os.environ[_profile_variable()] = str(config_file(PROFILE))
+            _set_here = True
+
+
+def given_profile() -> str:
+    """The profile that the user has set for this process, and most likely for drivers; "" if none."""
+    return "" if _set_here else next((os.environ[name] for name in PROFILE_VARIABLES if name in os.environ), "")
 
 
 def profile_for_sender(message_bytes: int) -> str:
-    """What to set where the driver of messages of this size runs, so that they arrive whole; 0 = of unknown size."""
+    """What to set where the driver of messages of this size runs, so that they arrive whole; "" where the user has done that
+    already. 0 bytes = of unknown size."""
     if "fastrtps" not in get_rmw_implementation_identifier():
         return "give the driver's DDS a shared memory or socket buffers (net.core.rmem_max) that hold several messages"
-    name = PROFILE if 0 < message_bytes <= PROFILE_BYTES else LARGE_PROFILE
+    name, given = PROFILE if 0 < message_bytes <= PROFILE_BYTES else LARGE_PROFILE, given_profile()
+    if Path(given).name in (name, LARGE_PROFILE):
+        return ""
+    if given and Path(given).name != PROFILE:
+        size = f" of {message_bytes / 1e6:.3g} MB" if message_bytes else ""
+        return f"let the profile {given} hold several messages{size} in shared memory"
     try:
         path = str(config_file(name))
     except MissingDependencyError:

@@ -8,22 +8,23 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from calib_ros.config.options import has_room
 from calib_ros.config.sensors import REFINE
+from calib_ros.errors import defect, raised_at
 from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, RefinedCamera
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
 from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
+from calib_ros.online.quiet_log import QuietLog
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
 from calib_ros.ros.publishers import STARVED
 
-REPEAT_S = 10.0  # the same problem is logged at most this often
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 SILENCE_S = 5.0  # a topic without messages for this long is reported
 # Where more of the pairs are dropped, of so many at least, keyframes and the test for blind sensors come late.
@@ -36,35 +37,35 @@ MANY_LEFT_OUT, FORCED_SHARE, MIN_KEYFRAMES = 3, 0.5, 3
 ERROR_SHOWN_S = 10.0  # a problem sets the level for this long
 # What an operator has to do for each status of the extrinsic; the others need nothing.
 LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
-MEANINGS = {BLINDED: "check the hardware: a sensor shows nothing"}
 
 
 class Health:
     """Collects what happens to the node, for log and diagnostics. Thread-safe, since every field is replaced whole.
 
-    last_error: the newest problem, and when it came by time.monotonic(). extrinsic: its newest state.
+    log: of problems. last_error: the newest of them, and when it came by time.monotonic(). extrinsic: its newest state.
+    losses: see set_losses. silence: why nothing comes on `image` and `points`, where nothing does.
     """
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger
-        self._logged: dict[str, float] = {}
+        self.log = QuietLog()
         self.last_error = ("", -1e9)
         self.extrinsic: Extrinsic | None = None
         self._estimated_at: float | None = None
         self.losses: dict[str, str] = {}
+        self.silence: dict[str, str] = {}
         self.callback_ms: deque[float] = deque(maxlen=2000)
         self.errors = 0
 
-    def error(self, text: str, kind: str = "") -> None:
-        """Log a problem in one line, a repeated one once in REPEAT_S. kind: what counts as the same, if not the text."""
-        now, kind = time.monotonic(), kind or text
+    def error(self, text: str, kind: str) -> None:
+        """A problem, in one line. kind: what counts as the same in the log, whatever figures the text gives."""
         self.errors += 1
-        self.last_error = (text, now)
-        if now - self._logged.get(kind, -1e9) >= REPEAT_S:
-            if len(self._logged) > 100:  # texts may hold numbers that never repeat
-                self._logged.clear()
-            self._logged[kind] = now
-            self._logger.warning(text)
+        self.last_error = (text, time.monotonic())
+        self.log.add(kind, text, lambda line: self._logger.warning(line))  # rclpy takes one level per place that logs
+
+    def note(self, text: str, kind: str) -> None:
+        """Something that is well again, in one line."""
+        self.log.add(kind, text, lambda line: self._logger.info(line))
 
     def set_losses(self, losses: dict[str, str]) -> None:
         """The topics whose messages get lost at present, each with one line for a person."""
@@ -74,12 +75,8 @@ class Health:
 
     def unexpected(self, error: BaseException) -> str:
         """A defect of ours: says where it is and what to do, and returns that line."""
-        trace = error.__traceback__
-        while trace is not None and trace.tb_next is not None:
-            trace = trace.tb_next
-        where = f" in {Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}" if trace is not None else ""
-        line = f"unexpected {type(error).__name__}{where}: {error}; please report it with the data that led to it"
-        self.error(line)
+        line = defect(error)
+        self.error(line, raised_at(error))
         return line
 
     def add_extrinsic(self, extrinsic: Extrinsic) -> None:
@@ -96,13 +93,13 @@ class Health:
                 + (f"; {result.reason}" if result.status != CONVERGED else "")
             )
         elif result.status == INITIAL or (result.status == CONVERGED and not extrinsic.accepted):
-            self._logger.info(
-                f"initial extrinsic {result.lidar_frame} -> {result.camera_frame}: {result.reason or 'from the saved state'}"
-            )
+            start = f"initial extrinsic {result.lidar_frame} -> {result.camera_frame}"
+            self.note(f"{start}: {result.reason or 'from the saved state'}", "initial extrinsic")
         elif result.status in (REFUSED, INSUFFICIENT):
-            self.error(f"estimate {result.status}: {result.reason}")
-        elif result.status not in (CONVERGED, TENTATIVE):  # published with every frame, with other figures each time
-            self.error(f"extrinsic {result.status}: {result.reason or extrinsic.monitor_message}", result.status)
+            kind = result.status if result.refusal is None else result.refusal.value
+            self.error(f"estimate {result.status}: {result.reason}", f"estimate {kind}")
+        elif result.status in (SUSPECT, MOVED):  # of blinded sensors the pipeline tells
+            self.error(f"extrinsic {_level(extrinsic)[1]}", result.status)
 
     @contextmanager
     def guard(self) -> Iterator[None]:
@@ -126,18 +123,31 @@ class Health:
         return None if self._estimated_at is None else time.monotonic() - self._estimated_at
 
 
+class _Window(NamedTuple):
+    """What has come in the last seconds. dropped_share: of the pairs. unpaired: what is said of messages without partner."""
+
+    seconds: float = 0.0
+    images: int = 0
+    clouds: int = 0
+    pairs: int = 0
+    dropped_share: float = 0.0
+    unpaired: str = ""
+
+
 class Diagnostics:
-    """Makes the /diagnostics message, about once a second: rates and loads count from the calls before."""
+    """Makes the /diagnostics message; rates and loads are those of the last count()."""
 
     def __init__(self, name: str, health: Health, pipeline: Pipeline) -> None:
         self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
         self._counts: deque[tuple[float, int, int, int, int]] = deque(maxlen=int(SILENCE_S) + 1)
-        self._busy = (time.monotonic(), 0.0, 0.0)
+        self._busy = (time.monotonic(), *pipeline.busy_seconds())
         self._pairing = PairingHealth(pipeline.synchronizer)
         self._loads: deque[_Load] = deque([_Load(time.monotonic())], maxlen=int(LOAD_WINDOW_S) + 1)
+        self._window, self._flow_values = _Window(), dict[str, str]()
+        self.count()
 
-    def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
-        """One status; stamp: builtin_interfaces/Time. extra: more values, by name."""
+    def count(self) -> None:
+        """To be called about once a second: rates and loads count from the calls before."""
         now = time.monotonic()
         counts = self._pipeline.synchronizer.counts
         self._counts.append((now, counts.images, counts.clouds, counts.pairs, self._pipeline.dropped_pairs))
@@ -148,14 +158,19 @@ class Diagnostics:
         if unpaired:
             self._health.error(unpaired, "unpaired")
         self._loads.append(_Load.of(now, self._pipeline))
-        level, text = self._summary(now, now - since, share, unpaired, *new)
-        values = {**self._flow(now, max(now - since, 1e-3), *new), **self._extrinsic(), **(extra or {})}
+        self._window = _Window(now - since, *new, share, unpaired)
+        self._flow_values = self._flow(now, max(now - since, 1e-3), *new)
+
+    def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
+        """One status, as of now; stamp: builtin_interfaces/Time. extra: more values, by name."""
+        level, text = self._summary()
+        values = {**self._flow_values, **self._extrinsic(), **(extra or {})}
         values |= {
             "callback 99th percentile, ms": f"{self._health.callback_p99_ms:.2f}",
             "errors": str(self._health.errors),
             "last error": self._health.last_error[0],
         }
-        status = DiagnosticStatus(level=level, name=f"{self._name}: extrinsic", message=text, hardware_id="")
+        status = DiagnosticStatus(level=level, name=f"{self._name}: extrinsic", message=text)
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         message = DiagnosticArray(status=[status])
         message.header.stamp = stamp
@@ -240,35 +255,39 @@ class Diagnostics:
             values |= refined_values(recalibrator.refined_camera)
         return values
 
-    def _summary(
-        self, now: float, watched: float, dropped_share: float, unpaired: str, images: int, clouds: int, pairs: int
-    ) -> tuple[bytes, str]:
+    def _summary(self) -> tuple[bytes, str]:
         """Level and message, worst first: an unreliable extrinsic, silent topics, its lesser problems, messages that get lost or
         find no partner, the newest problem, too little time, too few keyframes."""
-        extrinsic = self._health.extrinsic
-        level, text = _level(extrinsic)
+        window = self._window
+        level, text = _level(self._health.extrinsic)
         if level == ERROR:
             return level, text
-        if (silent := self._silence(watched, images, clouds, pairs)) is not None:
+        if (silent := self._silence()) is not None:
             return silent
-        input_problems = [*self._health.losses.values(), *filter(None, [unpaired, self._pipeline.clock_difference])]
+        input_problems = [*self._health.losses.values(), *filter(None, [window.unpaired, self._pipeline.clock_difference])]
         if level == WARN or input_problems:
             return WARN, "; ".join([text, *input_problems])
         problem, at = self._health.last_error
-        if now - at < ERROR_SHOWN_S:
+        if time.monotonic() - at < ERROR_SHOWN_S:
             return WARN, problem
-        if pairs >= MIN_PAIRS and dropped_share > DROPPED_SHARE:
-            return WARN, f"{text}; {dropped_share:.0%} of the pairs are dropped before they are looked at: {self._why_dropped()}"
+        if window.pairs >= MIN_PAIRS and window.dropped_share > DROPPED_SHARE:
+            dropped = f"{window.dropped_share:.0%} of the pairs are dropped before they are looked at"
+            return WARN, f"{text}; {dropped}: {self._why_dropped()}"
         limits = self._limits()
         return (WARN, f"{text}; {limits}") if limits else (level, text)
 
     def _why_dropped(self) -> str:
         """Cause and advice: the thread that looks at pairs computes itself, or waits to be let."""
-        first, last = self._loads[0], self._loads[-1]
+        first, last, config = self._loads[0], self._loads[-1], self._pipeline.config
         worked = sum(last.seconds(work) - first.seconds(work) for work in (Work.INTAKE, Work.KEYFRAMES))
+        cures = ["lower online.max_load"] if has_room(config.online, "max_load", up=False) else []
         if worked < COMPUTING_SHARE * (last.intake_busy - first.intake_busy):
-            return "the node gets too little CPU time; give it a core, or lower online.max_load, so that it asks for less"
-        return "keyframes take all the time; lower online.max_load or image.max_width, or raise online.keyframe_spacing_s"
+            return f"the node gets too little CPU time; {', or '.join(['give it a core', *cures])}"
+        if has_room(config.image, "max_width", up=False):
+            cures.append("lower image.max_width")
+        if has_room(config.online, "keyframe_spacing_s", up=True):
+            cures.append("raise online.keyframe_spacing_s")
+        return f"keyframes take all the time; {', or '.join(cures) or 'lower the rate of images and clouds'}"
 
     def _limits(self) -> str:
         """What has kept keyframes away for long, and what to do; "" if nothing has."""
@@ -281,23 +300,26 @@ class Diagnostics:
             )
         keyframes, forced = last.counts.keyframes - first.counts.keyframes, last.counts.forced - first.counts.forced
         if keyframes >= MIN_KEYFRAMES and forced > FORCED_SHARE * keyframes:
+            online = self._pipeline.config.online
             return (
-                f"online.max_load = {self._pipeline.config.online.max_load:g} does not even allow for a keyframe in "
-                f"{KEYFRAME_EVERY_S:g} s, and what has changed is noticed late; raise it, or lower the rate of images and clouds"
+                f"online.max_load = {online.max_load:g} does not even allow for a keyframe in {KEYFRAME_EVERY_S:g} s, and what "
+                f"has changed is noticed late; {'raise it, or ' if has_room(online, 'max_load', up=True) else ''}lower the rate "
+                "of images and clouds"
             )
         return ""
 
-    def _silence(self, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str] | None:
-        if watched <= SILENCE_S - 1.5:
+    def _silence(self) -> tuple[bytes, str] | None:
+        window = self._window
+        if window.seconds <= SILENCE_S - 1.5:
             return None
-        missing = [topic for topic, count in (("image", images), ("points", clouds)) if count == 0]
+        missing = [topic for topic, count in (("image", window.images), ("points", window.clouds)) if count == 0]
         if missing and self._health.losses:
             return WARN, "; ".join(self._health.losses.values())
         if missing:
-            return STALE, f"no messages on {' and '.join(missing)}; check the remapping and the publisher's QoS"
+            return STALE, "; ".join(self._health.silence.get(topic, f"no messages on {topic}") for topic in missing)
         if self._pipeline.data_age_s > SILENCE_S and self._pipeline.starved(SILENCE_S):
             return WARN, STARVED
-        if pairs:
+        if window.pairs:
             return None
         if self._pairing.waiting:
             return OK, "waiting for the next pair"
@@ -354,8 +376,7 @@ def _level(extrinsic: Extrinsic | None) -> tuple[bytes, str]:
     level = LEVELS.get(status, OK)
     if level == OK:
         return OK, f"{status}: {extrinsic.result.reason}" if status == TENTATIVE else status
-    reasons = [part for part in (MEANINGS.get(status, ""), extrinsic.result.reason or extrinsic.monitor_message) if part]
-    return level, ": ".join([status, *reasons])
+    return level, ": ".join(filter(None, [status, extrinsic.result.reason or extrinsic.monitor_message]))
 
 
 def _motion(recalibrator: Recalibrator | None) -> str:

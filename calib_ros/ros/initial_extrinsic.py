@@ -22,10 +22,10 @@ from calib_ros.ros.tf import StaticTf
 class InitialExtrinsic:
     """Chooses the initial extrinsic, and saves accepted ones.
 
-    parameters: gives the current ones. error: takes one line for a person.
+    parameters: gives the current ones. error: takes one line for a person, and its kind for the log.
     """
 
-    def __init__(self, parameters: Callable[[], Parameters], tf: StaticTf, error: Callable[[str], None]) -> None:
+    def __init__(self, parameters: Callable[[], Parameters], tf: StaticTf, error: Callable[[str, str], None]) -> None:
         self._parameters, self._tf, self._error = parameters, tf, error
         self._reported = ""
 
@@ -40,7 +40,7 @@ class InitialExtrinsic:
             except BadInputError as error:
                 if str(error) != self._reported:  # asked again with every pair while TF may still come
                     self._reported = str(error)
-                    self._error(str(error))
+                    self._error(str(error), "state file read")
         given = parameters.initial()
         if given is not None:
             return given
@@ -77,7 +77,7 @@ class InitialExtrinsic:
             newest = result.data_stamp or stamp
             save_state(path, result, camera, provenance_of(recalibrator.config, accepted, keyframes, newest))
         except BadInputError as error:
-            self._error(str(error))
+            self._error(str(error), "state file written")
             return False, str(error)
         return True, f"saved to {path}"
 

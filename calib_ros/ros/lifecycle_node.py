@@ -7,7 +7,7 @@ from typing import Any
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import CalibrationError, defect
 from calib_ros.ros.node import RosInterface
 
 
@@ -76,6 +76,6 @@ class CalibLifecycleNode(LifecycleNode):
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
-            self.get_logger().error(f"unexpected {type(error).__name__}: {error}; please report it with the parameters")
+            self.get_logger().error(defect(error))
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -16,7 +17,7 @@ from rclpy.timer import Timer
 from calib_ros.errors import CalibrationError
 from calib_ros.extensions import node_services
 from calib_ros.online.black_box import BlackBox, Occasion
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Notice, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
@@ -31,6 +32,7 @@ from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, StaticTf
 from calib_ros.ros.write_back import WriteBack
 
+DIAGNOSED_AGAIN_S = 0.2  # between two changes of status that /diagnostics follows at once
 INACTIVE = "the node is not active; activate it first"
 
 
@@ -70,6 +72,8 @@ class RosInterface:
         self.overlay = OverlayPublisher(node, self.parameters["overlay_period_s"])
         self._diagnostics_pub = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._diagnostics = Diagnostics(node.get_fully_qualified_name(), self.health, self.pipeline)
+        self._diagnosed_at = 0.0  # for a change of status, by time.monotonic()
+        self._status_changed = node.create_guard_condition(self._on_status_change)
         self._last_stamp = 0
         self._saved = 0  # accepted estimates when the extrinsic was saved
         self._ended: bool | None = None
@@ -139,7 +143,8 @@ class RosInterface:
             service.destroy()
         for part in (self.calibrating, self.serving, self.tf):
             part.destroy()
-        for publisher in (self._transform_pub, self._diagnostics_pub):
+        self._node.destroy_guard_condition(self._status_changed)
+        for publisher in (self._transform_pub, self._diagnostics_pub, self.overlay.compressed):
             self._node.destroy_publisher(publisher)
         for publishing in (self.extrinsic, self.overlay, self.processed):
             self._node.destroy_publisher(publishing.publisher)
@@ -153,7 +158,8 @@ class RosInterface:
             name = self.parameters[f"{sensor}_frame"] or message.header.frame_id
             if not name and sensor not in self._nameless:
                 self._nameless.add(sensor)
-                self.health.error(f"messages of the {sensor} have no frame_id: it is called '{sensor}'; set {sensor}_frame")
+                text = f"messages of the {sensor} have no frame_id: it is called '{sensor}'; set {sensor}_frame"
+                self.health.error(text, f"frame_id of the {sensor}")
             names.append(name or sensor)
         return names[0], names[1]
 
@@ -163,10 +169,13 @@ class RosInterface:
         if isinstance(event, ExtrinsicUpdated):
             extrinsic, result, stamp = event.extrinsic, event.extrinsic.result, event.stamp
             self._last_stamp = stamp
+            before = self.health.extrinsic
             self.health.add_extrinsic(extrinsic)
             self.extrinsic.publish(extrinsic, stamp)
             self._transform_pub.publish(transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp))
             self._publish_tf(extrinsic, stamp)
+            if before is None or before.result.status != result.status:
+                self._status_changed.trigger()
             self._saved = min(self._saved, extrinsic.accepted)  # counted anew after a reset
             if result.status == CONVERGED and extrinsic.accepted > self._saved:
                 self._saved = extrinsic.accepted
@@ -180,7 +189,9 @@ class RosInterface:
         elif isinstance(event, IntakeIdle):
             self.processed.publish()
         elif isinstance(event, Problem):
-            self.health.error(event.message)
+            self.health.error(event.message, event.kind)
+        elif isinstance(event, Notice):
+            self.health.note(event.message, event.kind)
         self.black_box.add(event)
         for service in self.beside.values():
             service.add(event)
@@ -223,6 +234,7 @@ class RosInterface:
 
     def _every_second(self) -> None:
         with self.health.guard():
+            self.health.log.catch_up()
             self.pipeline.load.count_messages()
             self.overlay.period_s = self.parameters["overlay_period_s"]
             self.capture.resize()
@@ -240,17 +252,39 @@ class RosInterface:
             if recalibrator is not None and self.initial.superseded_by_tf(recalibrator):
                 self._node.get_logger().info("TF connects camera and LiDAR by now: starting anew from it")
                 self.pipeline.restart()
-            extra = {"reliable topics": " ".join(s.topic for s in self.sensors.adaptive if s.reliable) or "none"}
-            extra["raw keyframes kept"] = str(len(self.capture))
-            if self.parameters["consumers"]:
-                extra["usable for"] = " ".join(self.extrinsic.served) or "none"
-            message = self._diagnostics.message(self._node.get_clock().now().to_msg(), extra)
-            message.status += [status for service in self.beside.values() if (status := service.status()) is not None]
-            self._diagnostics_pub.publish(message)
-            if (health := message.status[0].message) != self._noted:
-                self._noted = health
-                self.black_box.note(health, "health")
+            self._diagnostics.count()
+            self._publish_diagnostics()
             self.black_box.check()
+
+    def _on_status_change(self) -> None:
+        """/diagnostics at once, but not for a status that flickers: the next second is soon enough then."""
+        with self.health.guard():
+            now = time.monotonic()
+            if self._timers and now - self._diagnosed_at >= DIAGNOSED_AGAIN_S:
+                self._diagnosed_at = now
+                self._publish_diagnostics()
+
+    def _publish_diagnostics(self) -> None:
+        extra = {"reliable topics": " ".join(s.topic for s in self.sensors.adaptive if s.reliable) or "none"}
+        extra["raw keyframes kept"] = str(len(self.capture))
+        if self.parameters["consumers"]:
+            extra["usable for"] = " ".join(self.extrinsic.served) or "none"
+        message = self._diagnostics.message(self._node.get_clock().now().to_msg(), extra)
+        message.status += [status for service in self.beside.values() if (status := service.status()) is not None]
+        for status in message.status:
+            status.hardware_id = self._hardware_id()
+        self._diagnostics_pub.publish(message)
+        if (health := message.status[0].message) != self._noted:
+            self._noted = health
+            self.black_box.note(health, "health")
+
+    def _hardware_id(self) -> str:
+        """The vehicle and both sensors, as far as they are known."""
+        recalibrator = self.pipeline.recalibrator
+        frames = [self.parameters["camera_frame"], self.parameters["lidar_frame"]]
+        if recalibrator is not None:
+            frames = [recalibrator.tracker.initial.camera_frame, recalibrator.tracker.initial.lidar_frame]
+        return " ".join(filter(None, [self.parameters["vehicle"], *frames]))
 
     def _publish_again(self) -> None:
         """Others see that the node is alive, and whether its extrinsic still is."""

@@ -56,6 +56,9 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
     ),
     "camera_frame": option("", "name of the camera's optical frame; empty = the image's header.frame_id"),
     "lidar_frame": option("", "name of the LiDAR's frame; empty = the cloud's header.frame_id"),
+    "vehicle": option(
+        "", "name of the vehicle, for the hardware_id of /diagnostics before the names of both frames; empty = none"
+    ),
     "motion_source": option(
         "none",
         "source of the vehicle's velocity for online.max_speed and online.max_turn_deg_s: odom = topic odom (nav_msgs/Odometry), "
@@ -131,7 +134,7 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
 # Those that may change while the node runs, as all constants of the stages may.
 LIVE = {"image_is_rectified", "reliability", "state_file", "publish_tf", "tf_parent", "tf_child", "max_data_age_s"}
 LIVE |= {"consumers", "overlay_period_s", "capture_dir", "capture_frames", "capture.on", "capture.keep", "capture.max_mb"}
-LIVE |= {"export.on_converged", "export.joint"}
+LIVE |= {"export.on_converged", "export.joint", "vehicle"}
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from calib_ros.frame import NANOSECONDS, Frame
@@ -21,7 +21,15 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.overlay import caption, render
 from calib_ros.result import Extrinsic
-from calib_ros.ros.conversions import NO_ADVICE, UNKNOWN, Validity, duration_message, extrinsic_message, image_message
+from calib_ros.ros.conversions import (
+    NO_ADVICE,
+    UNKNOWN,
+    Validity,
+    compressed_image_message,
+    duration_message,
+    extrinsic_message,
+    image_message,
+)
 from calib_ros.ros.parameters import Parameters
 
 PROCESSED_KEPT = 100  # headers; more are of messages that are gone before a pair is worked off
@@ -62,7 +70,7 @@ class ExtrinsicPublisher:
             return Validity(False, 0, age, "not checked any more: the node is not active" if extrinsic.usable else "")
         starved = self._pipeline.starved(most)
         if age > (STARVED_PERIODS * most if starved else most):
-            seen = f"no usable pair of image and cloud for {age:.0f} s" if age < float("inf") else "no usable pair yet"
+            seen = f"no usable pair of image and cloud for {age:.1f} s" if age < float("inf") else "no usable pair yet"
             return Validity(False, 0, age, f"not checked any more: {STARVED if starved else seen}" if extrinsic.usable else "")
         until = self._node.get_clock().now().nanoseconds + round(self._valid_s * NANOSECONDS)
         return Validity(extrinsic.usable, until if extrinsic.usable else 0, age, STARVED if starved and age > most else "")
@@ -95,7 +103,8 @@ class ExtrinsicPublisher:
 
 
 class OverlayPublisher:
-    """~/overlay: the diagnostic picture, drawn only while someone listens, and at most once per period_s, which may be replaced.
+    """~/overlay and ~/overlay/compressed: the diagnostic picture, drawn once for both while someone listens to either, at most
+    once per period_s, which may be replaced.
 
     Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset.
     """
@@ -103,6 +112,7 @@ class OverlayPublisher:
     def __init__(self, node: Node, period_s: float) -> None:
         self._context = node.context
         self.publisher = node.create_publisher(Image, "~/overlay", 1)
+        self.compressed = node.create_publisher(CompressedImage, "~/overlay/compressed", 1)
         self.period_s = period_s
         self._last = 0.0
 
@@ -111,7 +121,8 @@ class OverlayPublisher:
         due = at_once or time.monotonic() - self._last >= self.period_s
         if recalibrator is None or frame is None or not due or not self._context.ok():  # not ok: the node is being stopped
             return
-        if self.publisher.get_subscription_count() == 0:
+        heard, heard_compressed = (own.get_subscription_count() > 0 for own in (self.publisher, self.compressed))
+        if not (heard or heard_compressed):
             return
         self._last = time.monotonic()
         extrinsic, initial = recalibrator.current, recalibrator.tracker.initial
@@ -126,7 +137,10 @@ class OverlayPublisher:
             lines=caption(extrinsic, len(recalibrator.buffer), initial.T_camera_lidar),
             status=extrinsic.result.status,
         )
-        self.publisher.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
+        if heard:
+            self.publisher.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
+        if heard_compressed:
+            self.compressed.publish(compressed_image_message(picture, extrinsic.result.camera_frame, frame.stamp))
 
 
 class ProcessedPublisher:

@@ -133,7 +133,8 @@ class SensorSubscriptions:
             subscription.preference = parameters["reliability"]
             problem = subscription.check()
             if problem:
-                self._health.error(problem)
+                self._health.error(problem, f"publishers of {subscription.topic}")
+        self._health.silence = {name: own.silence for name, own in zip(("image", "points"), self.adaptive, strict=False)}
         self._health.set_losses(self._losses())
         if parameters["image_is_rectified"] != self._rectified:
             self._rectified = parameters["image_is_rectified"]
@@ -160,7 +161,7 @@ class SensorSubscriptions:
             share = max(subscription.lost_share(), missing)
             if share >= MISSING_SHARE:
                 losses[subscription.topic] = (
-                    f"{share:.0%} of the messages on {subscription.topic} get lost; {_advice(subscription)}"
+                    f"{share:.0%} of the messages on {subscription.topic} get lost; {loss_advice(subscription)}"
                 )
         return losses
 
@@ -172,7 +173,7 @@ class SensorSubscriptions:
         try:
             camera = decode_camera_info(msg.message(), self._rectified)
         except CalibrationError as error:
-            self._health.error(str(error))
+            self._health.error(str(error), "CameraInfo")
             return
         self.camera_info = msg
         self._pipeline.set_camera(camera)
@@ -184,8 +185,9 @@ class AdaptiveSubscription:
     callback: called with stamp, ns, and message. preference: "auto", or "best_effort" or "reliable" whatever the publishers are;
     it may be replaced at any time and holds from the next check() on. latched: receive what was published before as well, where
     all publishers keep it. guard: context that callbacks run in. forms: types that are received, one at a time, the first that
-    somebody publishes. largest: bytes of data in the largest message so far. To be used on the executor's thread. No message is
-    lost or received twice in a change of reliability.
+    somebody publishes. largest: bytes of data in the largest message so far. reliability_offered: by all publishers, when check()
+    was called last. silence: why nothing comes on the topic, where nothing does. To be used on the executor's thread. No message
+    is lost or received twice in a change of reliability.
     """
 
     def __init__(
@@ -204,6 +206,8 @@ class AdaptiveSubscription:
         self._topic = topic
         self._forms, self._form = forms, forms[0]
         self.largest = 0
+        self.reliability_offered = False
+        self.silence = ""
         self._received = self._lost = 0
         self._history: deque[tuple[int, int]] = deque(maxlen=LOSS_CHECKS)  # received and lost so far, at every check
         self._old: list[tuple[Any, float]] = []
@@ -259,7 +263,11 @@ class AdaptiveSubscription:
             self._qos = wanted
             self._old.append((self._current, now))
             self._current = self._subscribe()
-        return self._problem(types, publishers)
+        self.reliability_offered = bool(publishers) and all(p.reliability != BEST_EFFORT for p in publishers)
+        problem = self._problem(types, publishers)
+        nothing = "is published, but nothing comes; check its driver" if publishers else ""
+        self.silence = problem or f"{self.topic} {nothing or 'has no publisher; check the remapping and ROS_DOMAIN_ID'}"
+        return problem
 
     def _wanted(self, publishers: list[QoSProfile]) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
         if not publishers:
@@ -324,12 +332,17 @@ def livox_forms() -> list[Form]:
     return forms
 
 
-def _advice(subscription: AdaptiveSubscription) -> str:
+def loss_advice(subscription: AdaptiveSubscription) -> str:
     """What to do about lost messages."""
     if subscription.reliable:
         return "its driver leaves them out, or queues too few of them: lower its rate, or raise its queue"
-    others = "let it publish reliably" + (" or compressed (image_transport: compressed)" if subscription.kind is Image else "")
-    return f"{profile_for_sender(subscription.largest)}, or {others}"
+    if subscription.reliability_offered:
+        return "set reliability: auto, since its publishers are reliable"
+    cures = [
+        profile_for_sender(subscription.largest) or "from another computer raise net.core.rmem_max on both",
+        "let it publish reliably" + (" or compressed (image_transport: compressed)" if subscription.kind is Image else ""),
+    ]
+    return ", or ".join(cures)
 
 
 def motion_source(name: str) -> MotionSource | None:

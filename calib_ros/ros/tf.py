@@ -39,10 +39,11 @@ def _tf_message() -> Any:
 class StaticTf:
     """Reads the static tree for an initial extrinsic, and publishes the extrinsic to it.
 
-    error: takes one line for a person. MissingDependencyError if `publish` is asked for without tf2_msgs.
+    error: takes one line for a person, and its kind for the log. MissingDependencyError if `publish` is asked for without
+    tf2_msgs.
     """
 
-    def __init__(self, node: Node, listen: bool, publish: bool, error: Callable[[str], None]) -> None:
+    def __init__(self, node: Node, listen: bool, publish: bool, error: Callable[[str, str], None]) -> None:
         self._node, self._error = node, error
         self._tree = StaticTransforms()  # of everybody but this node
         self._since = time.monotonic()
@@ -153,7 +154,7 @@ class StaticTf:
 
     def _withdraw(self, why: str) -> None:
         """Nothing is published any more: tf2 would take the tree apart, or a wrong edge stay in it."""
-        self._error(why)
+        self._error(why, "tf")
         if self._published is not None:
             self.switch(False)
             self.switch(True)

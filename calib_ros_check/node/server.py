@@ -51,7 +51,7 @@ class CheckServer(NodeService):
 
     def status(self) -> DiagnosticStatus:
         """The last check: its verdict sets the level as long as it is about the current extrinsic."""
-        status = DiagnosticStatus(level=OK, name=f"{self._name}: check", message="never run", hardware_id="")
+        status = DiagnosticStatus(level=OK, name=f"{self._name}: check", message="never run")
         values = {"checks so far": str(self._made), "verdict": "none", "age of the last check, s": "none", "cause": "none"}
         last = self._last
         if last is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import Frame
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, JobDone, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, JobDone, Notice, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import INITIAL, Extrinsic, Result
 from calib_ros_synthetic.drive import SyntheticDrive
@@ -28,6 +28,7 @@ class Driven:
     def __init__(self, drive: SyntheticDrive, settings: Config) -> None:
         self.settings = settings
         self.errors: list[str] = []
+        self.notices: list[str] = []
         self.states: list[Extrinsic] = []
         self.kept: list[int] = []
         self.outcomes: list[object] = []  # of deferred jobs
@@ -41,6 +42,8 @@ class Driven:
             self.states.append(event.extrinsic)
         elif isinstance(event, Problem):
             self.errors.append(event.message)
+        elif isinstance(event, Notice):
+            self.notices.append(event.message)
         elif isinstance(event, JobDone):
             self.outcomes.append(event.outcome)
         elif isinstance(event, FrameIngested) and event.is_keyframe:

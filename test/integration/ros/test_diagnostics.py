@@ -10,20 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
+from paths import ROOT
 from ros_peer import Peer, start_parameters
 from sensor_msgs.msg import Image
 from vehicle import QUICK, Vehicle
 from waiting import until
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config, OnlineConfig
+from calib_ros.config import Config, OnlineConfig, update
 from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.online.events import Inputs
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
+from calib_ros.ros import node
 from calib_ros.ros.conversions import time_message
 from calib_ros.ros.diagnostics import Diagnostics, Health, refined_values
 
@@ -46,6 +49,7 @@ class Watched:
         self.diagnostics = Diagnostics("/calib_ros", self.health, self.pipeline)
 
     def status(self, **extra: str) -> DiagnosticStatus:
+        self.diagnostics.count()
         return self.diagnostics.message(time_message(0), extra).status[0]
 
 
@@ -64,7 +68,7 @@ def watched():
         (INSUFFICIENT, WARN, "insufficient: because"),
         (SUSPECT, WARN, "suspect: because"),
         (MOVED, ERROR, "moved: because"),
-        (BLINDED, ERROR, "blinded: check the hardware: a sensor shows nothing: because"),
+        (BLINDED, ERROR, "blinded: because"),
     ],
 )
 def test_every_status_has_its_level(watched, status, level, text):
@@ -100,14 +104,18 @@ def motion_unknown(watched: Watched, keyframes: int) -> None:
     watched.pipeline.recalibrator.motion.left_out = keyframes
 
 
-def pairs_dropped(watched: Watched, computed: float) -> None:
+def pairs_dropped(watched: Watched, computed: float, **online: float) -> None:
+    watched.pipeline.config = update(
+        watched.pipeline.config, {"online": online or {"max_load": 0.5}, "image": {"max_width": 160}}
+    )
     watched.pipeline.synchronizer.counts.pairs += 20
     watched.pipeline.dropped_pairs += 15
     watched.pipeline._ingester.busy_s += 4.0
     watched.load.add(Work.KEYFRAMES, computed * 4.0)
 
 
-DROPPED = ("75% of the pairs are dropped", "lower online.max_load")
+DROPPED = "75% of the pairs are dropped before they are looked at: "
+AT_LIMITS = {"max_load": 0.05, "keyframe_spacing_s": 60.0}
 
 
 @pytest.mark.parametrize(
@@ -118,8 +126,17 @@ DROPPED = ("75% of the pairs are dropped", "lower online.max_load")
         (frames_wait, ()),
         (partial(motion_unknown, keyframes=2), ()),
         (partial(motion_unknown, keyframes=3), ("3 keyframes of the last", "motion from scans: none needed so far")),
-        (partial(pairs_dropped, computed=1.0), (*DROPPED, "keyframes take all the time")),
-        (partial(pairs_dropped, computed=0.2), (*DROPPED, "the node gets too little CPU time")),
+        (
+            partial(pairs_dropped, computed=1.0),
+            (f"{DROPPED}keyframes take all the time; lower online.max_load, or raise online.keyframe_spacing_s\n",),
+        ),
+        (
+            partial(pairs_dropped, computed=0.2),
+            (f"{DROPPED}the node gets too little CPU time; give it a core, or lower online.max_load\n",),
+        ),
+        # What is at the end of its range cannot be lowered or raised.
+        (partial(pairs_dropped, computed=1.0, **AT_LIMITS), ("all the time; lower the rate of images and clouds\n",)),
+        (partial(pairs_dropped, computed=0.2, **AT_LIMITS), ("too little CPU time; give it a core\n",)),
     ],
 )
 def test_what_keeps_keyframes_away_is_a_warning_with_cause_and_advice(watched, drive, happens, texts):
@@ -150,7 +167,7 @@ def test_refined_intrinsics_are_told_in_numbers():
 
 def test_a_node_at_work(street, drive, monkeypatch):
     """An exception in a callback ends neither node nor service."""
-    with Peer(**start_parameters(drive.reference), **QUICK, initial_from_tf=False) as peer:
+    with Peer(**start_parameters(drive.reference), **QUICK, initial_from_tf=False, vehicle="car 7") as peer:
 
         def broken(*_: Any) -> Any:
             raise ZeroDivisionError("by hand")
@@ -167,7 +184,11 @@ def test_a_node_at_work(street, drive, monkeypatch):
         peer.drive(street[1:5])
         peer.image_pub.publish(Image())  # that no cloud belongs to
         peer.until(lambda: peer.values.get("images") == "6" and peer.values["estimates accepted"] != "0")
-        said = peer.values
+        said, statuses = peer.values, peer.diagnostics[-1].status
+    assert {status.hardware_id for status in statuses} == {"car 7 camera velodyne"}
+    groups = yaml.safe_load((ROOT / "config/diagnostic_aggregator.yaml").read_text())["analyzers"]["ros__parameters"]
+    patterns = [pattern for group in groups.values() if isinstance(group, dict) for pattern in group["contains"]]
+    assert sorted(patterns) == sorted(status.name for status in statuses)
     assert said["status"] == "converged"
     assert (said["clouds"], said["pairs"], said["keyframes so far"]) == ("5", "5", "5")
     assert float(said["age of the last estimate, s"]) >= 0
@@ -176,6 +197,23 @@ def test_a_node_at_work(street, drive, monkeypatch):
     assert float(said["callback 99th percentile, ms"]) > 0
     assert said["motion from scans"].startswith("failed: the scans are 1 s apart")
     assert said["frames too fast for a keyframe"] == "0"
+
+
+def test_a_change_of_status_is_diagnosed_at_once(street, drive, monkeypatch):
+    monkeypatch.setattr(node, "DIAGNOSED_AGAIN_S", 0.0)
+    with Peer(**start_parameters(drive.reference), **QUICK, initial_from_tf=False) as peer:
+        for timer in peer.calibration._timers:  # nothing else diagnoses it
+            timer.cancel()
+        peer.drive(street[:5])
+        peer.until(lambda: peer.extrinsics and peer.extrinsics[-1].status == "converged", "a converged extrinsic")
+        peer.until(lambda: peer.values.get("status") == "converged", "its diagnosis")
+
+
+def test_topics_on_which_nothing_comes_are_named_with_what_is_known_of_them():
+    with Peer() as peer:
+        silent = "; ".join(f"/{topic} is published, but nothing comes; check its driver" for topic in ("image", "points"))
+        peer.until(lambda: peer.diagnostics and peer.diagnostics[-1].status[0].message == silent, silent)
+        assert peer.diagnostics[-1].status[0].level == DiagnosticStatus.STALE
 
 
 def test_the_nodes_own_accounting_keeps_to_the_budget(street, drive):

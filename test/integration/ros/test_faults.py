@@ -81,7 +81,7 @@ BAD: list[tuple[Callable[[Frame], dict[str, Any]], str]] = [
     (lambda f: of(f, encoding="", data=[]), "encoding ''"),
     (lambda f: of(f, width=0), "no pixels"),
     (lambda f: scan(f, np.zeros((0, 3), np.float32)), "the cloud has 0 usable points"),
-    (lambda f: scan(f, np.full((1000, 3), np.nan, np.float32)), "the cloud has 0 usable points"),
+    (lambda f: scan(f, np.full((1000, 3), np.nan, np.float32)), "the LiDAR shows nothing (no returns"),  # by now it is known
     (lambda f: scan(f, data=bytes(1000)), "PointCloud2"),
     (lambda f: scan(f, fields=[]), "PointCloud2"),
     (lambda f: scan(f, point_step=0), "PointCloud2"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +26,8 @@ from waiting import until
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import decode_cloud
 from calib_ros.messages.point_fields import decode_livox
-from calib_ros.ros.subscriptions import AdaptiveSubscription, Form, advice, livox_forms, serialized
+from calib_ros.ros import dds
+from calib_ros.ros.subscriptions import AdaptiveSubscription, Form, advice, livox_forms, loss_advice, serialized
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -97,8 +99,10 @@ def test_auto_follows_the_publishers_as_they_come_and_go(topic):
         return subscription.check() == "" and subscription.reliable == reliable
 
     assert follows(False)
+    assert subscription.silence == "/info has no publisher; check the remapping and ROS_DOMAIN_ID"
     first = topic.publisher(RELIABLE)
     assert follows(True)
+    assert subscription.silence == "/info is published, but nothing comes; check its driver"
     second = topic.publisher(BEST_EFFORT)
     assert follows(False)
     topic.until(lambda: first.get_subscription_count() and second.get_subscription_count())
@@ -136,6 +140,25 @@ def test_a_choice_that_cannot_work_is_named(topic):
     assert "/info offers best effort only and cannot be received; set reliability: auto" in subscription.check()
     subscription.preference = "auto"
     assert subscription.check() == ""
+
+
+def test_advice_on_losses_names_nothing_that_is_set_already(topic, monkeypatch):
+    monkeypatch.setattr(dds, "_set_here", False)
+    for name in dds.PROFILE_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    subscription = topic.subscribe("best_effort")
+    advised = loss_advice(subscription)
+    assert re.fullmatch(r"start its driver with FAST\w+=\S+/fastdds_profile_large.xml, or let it publish reliably", advised)
+    for profile, text in (
+        (dds.config_file(dds.LARGE_PROFILE), "from another computer raise net.core.rmem_max on both, or"),
+        (dds.config_file(dds.PROFILE), "fastdds_profile_large.xml, or"),
+        ("/own.xml", "let the profile /own.xml hold several messages"),
+    ):
+        monkeypatch.setenv(dds.PROFILE_VARIABLES[1], str(profile))
+        assert text in loss_advice(subscription)
+    topic.publisher(RELIABLE)
+    assert subscription.check() == ""
+    assert loss_advice(subscription) == "set reliability: auto, since its publishers are reliable"
 
 
 @contextmanager
