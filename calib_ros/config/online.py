@@ -37,8 +37,8 @@ class OnlineConfig(Stage):
     period_s: float = option(60.0, "time between estimates in mode periodic, by the data's stamps, s", low=0.1, high=86400.0)
     rest_period_s: float = option(
         5.0,
-        "time between estimates in mode continuous while the extrinsic is converged and all newer keyframes fit it, by "
-        "the data's stamps, s; 0 = no rest",
+        "shortest time between estimates in mode continuous while the extrinsic is converged and all newer keyframes fit it, by "
+        "the data's stamps, s; it grows as long as that lasts, up to a minute; 0 = no rest",
         low=0.0,
         high=3600.0,
     )

@@ -38,8 +38,9 @@ from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, RefusalCode, Resu
 
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 # Smallest time between keyframes at rest, from the first to the longest. An estimate is worth its time once there is as much to
-# go on again as there was, until the drift that the tracker expects of a minute; keyframes come this many times as often.
-REST_SPACING_S = (2.0, 10.0)
+# go on again as there was, until the drift that the tracker expects of a minute; keyframes come this many times as often, and
+# within the 5 s in which a displacement is to be told that a look does not see.
+REST_SPACING_S = (2.0, 5.0)
 LONGEST_REST_S = 60.0
 KEYFRAMES_PER_REST = 6
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from rclpy.serialization import deserialize_message, serialize_message
 from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
 from scenes import is_near
 from sensor_msgs.msg import CompressedImage
@@ -25,7 +27,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.online.black_box import Occasion
 from calib_ros.result import INITIAL, SUSPECT, Result, load
 from calib_ros.ros.capture import MEGABYTE, RawKeyframe, _write_bag
-from calib_ros.ros.conversions import image_message
+from calib_ros.ros.conversions import Serialized, image_message
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 
@@ -139,8 +141,18 @@ def test_callbacks_go_on_during_a_capture_and_the_node_finishes_it_before_it_end
 def test_clocks_of_clouds_may_count_from_elsewhere(street, tmp_path):
     """As those of a LiDAR that counts from its start: the bag tells which messages came together."""
     later = 10**18
-    messages = [(image_message(f.image, "camera", f.stamp), cloud_message(f.cloud, f.stamp - later)) for f in street]
-    kept = [RawKeyframe(image, cloud, camera_info_message(f)) for (image, cloud), f in zip(messages, street, strict=True)]
+
+    def received(message: Any) -> Serialized:
+        return Serialized.of(serialize_message(message), partial(deserialize_message, message_type=type(message)))
+
+    kept = [
+        RawKeyframe(
+            received(image_message(f.image, "camera", f.stamp)),
+            received(cloud_message(f.cloud, f.stamp - later)),
+            received(camera_info_message(f)),
+        )
+        for f in street
+    ]
     _write_bag(tmp_path / "bag", kept, Result(street[0].reference, INITIAL), False)
     with open_dataset(tmp_path / "bag") as source:
         assert len(source) == len(street)

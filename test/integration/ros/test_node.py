@@ -248,7 +248,7 @@ def test_usable_outlives_a_lack_of_cpu_time_for_a_while(peer, street, monkeypatc
     monkeypatch.setattr(peer.pipeline, "_inputs", inputs)
     peer.change(max_data_age_s=AGE_S)
     later = (
-        dataclasses.replace(frame, stamp=street[-1].stamp + k * NANOSECONDS // 10, cloud_stamp=None)
+        dataclasses.replace(frame, stamp=street[-1].stamp + 2 * k * NANOSECONDS, cloud_stamp=None)
         for k, frame in enumerate(cycle(street), 1)
     )
 
@@ -263,6 +263,7 @@ def test_usable_outlives_a_lack_of_cpu_time_for_a_while(peer, street, monkeypatc
     assert seconds(said(True).data_age) > AGE_S
     assert seconds(said(False).data_age) > 3 * AGE_S
     looked.set()
+    peer.settle()
     peer.change(max_data_age_s=3600.0)
     peer.until(lambda: peer.extrinsics[-1].usable, "that there is time again")
 
