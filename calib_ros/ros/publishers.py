@@ -37,7 +37,7 @@ VALID_PERIODS = 2.5  # of publishing: one message may be late, and another one l
 # Of max_data_age_s, for which an extrinsic stays usable while sensors deliver and only CPU time is missing: it may have moved
 # unnoticed, but nothing says so, and usable that comes and goes with the load helps nobody.
 STARVED_PERIODS = 3
-STARVED = "starved: pairs of image and cloud wait for CPU time; give the node a core, or a higher priority (launch argument nice)"
+STARVED = "starved: pairs of image and cloud wait for CPU time; give the node a core of its own, or let other work yield (nice)"
 
 
 class ExtrinsicPublisher:
