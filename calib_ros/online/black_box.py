@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
 
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Notice, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import BLINDED, INITIAL, MOVED, REFUSED, SUSPECT, Extrinsic, Result
 
@@ -74,7 +74,7 @@ class BlackBox:
                 self._events.append(self._keyframe(event.frame.stamp))
                 for pending in self._pending:
                     pending.keyframes -= 1
-        if isinstance(event, Problem):
+        if isinstance(event, (Problem, Notice)):
             self.note(event.message)
         self.check()
 

@@ -377,6 +377,7 @@ def cli(run: Run, seed: int, count: int) -> None:
 
 if __name__ == "__main__":
     warnings.simplefilter("error")
+    warnings.simplefilter("ignore", FutureWarning)  # names of former versions, which a mutation may make
     what, first, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     this = Run()
     work = {"messages": messages, "packed": packed, "pipeline": pipeline, "texts": texts, "folders": folders, "cli": cli}

@@ -135,8 +135,8 @@ def test_events_tell_what_led_to_it(box: Box) -> None:
     box.says(SUSPECT, p_value=1e-9, disputed_since=STAMP - 1)
     box.says(SUSPECT, p_value=1e-12, disputed_since=STAMP - 1)
     box.says(MOVED, accepted=2, refusal=RefusalCode.LOW_SCORE, refusal_figures={"score": 0.1}, optimum=np.eye(4))
-    box.add(Problem("the cloud has no intensity"))
-    box.add(Problem("the cloud has no intensity"))
+    box.add(Problem("the cloud has no intensity", "intensity"))
+    box.add(Problem("the cloud has no intensity", "intensity"))
     box.note("no messages on points", "health")
     box.flush()
     assert {*box.kinds_recorded} == {SUSPECT, MOVED, REFUSED}
