@@ -26,6 +26,9 @@ SAVED_S = 5.0
 KEYFRAME_EVERY_S = 5.0
 ESTIMATE_EVERY_S = 30.0
 CLASSES_EVERY_S = 30.0  # of one keyframe
+# At rest estimates are at most so far apart, s: the tracker expects the mount to drift in a minute. Keyframes come so many times
+# as often, from the first distance to the longest, s: within the 5 s in which a displacement is to be told that no look sees.
+LONGEST_REST_S, KEYFRAMES_PER_REST, REST_SPACING_S = 60.0, 6, (2.0, 5.0)
 CLASSES_RESERVE = 0.5  # share of what can be saved up that must be there for classes: keyframes and estimates have the rest
 
 
@@ -222,3 +225,36 @@ class Schedule:
             return True
         elapsed = (self.newest - self._estimated) / NANOSECONDS
         return elapsed < 0 or elapsed >= period_s
+
+
+class Rest:
+    """How much less is done while the extrinsic is at rest: the less, the longer it has been steady. Stamps are in ns.
+
+    An estimate is worth its time once there is as much to go on again as there was. Keyframes only test the extrinsic.
+    """
+
+    def __init__(self) -> None:
+        self._since: int | None = None  # of the first frame since which it is steady
+        self._steady_s = self._estimated_after_s = 0.0  # from then to the newest frame, and to the last estimate
+
+    def add_frame(self, stamp: int, steady: bool) -> None:
+        """A frame with its stamp, and whether the extrinsic is steady by now."""
+        if not steady:
+            self._since = None
+        elif self._since is None or stamp < self._since:
+            self._since = stamp
+        self._steady_s = 0.0 if self._since is None else (stamp - self._since) / NANOSECONDS
+
+    def start_estimate(self) -> None:
+        """An estimate begins, on request or not."""
+        self._estimated_after_s = self._steady_s
+
+    def estimates_s(self, shortest: float) -> float:
+        """Time from the last estimate to the next, s: as long as it was steady by then."""
+        return max(shortest, min(self._estimated_after_s, LONGEST_REST_S))
+
+    @property
+    def keyframes_s(self) -> float:
+        """Smallest time between keyframes, s."""
+        shortest, longest = REST_SPACING_S
+        return min(max(shortest, self._steady_s / KEYFRAMES_PER_REST), longest)

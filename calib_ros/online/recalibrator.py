@@ -23,7 +23,7 @@ from calib_ros.online.glance import Glance
 from calib_ros.online.keyframe_classes import KeyframeSegmenter
 from calib_ros.online.keyframes import Batch, EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, feature_config
 from calib_ros.online.monitor import Assessment, Monitor, Verdict
-from calib_ros.online.pacing import Schedule
+from calib_ros.online.pacing import Rest, Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
@@ -37,12 +37,6 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, RefusalCode, Result
 
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
-# Smallest time between keyframes at rest, from the first to the longest. An estimate is worth its time once there is as much to
-# go on again as there was, until the drift that the tracker expects of a minute; keyframes come this many times as often, and
-# within the 5 s in which a displacement is to be told that a look does not see.
-REST_SPACING_S = (2.0, 5.0)
-LONGEST_REST_S = 60.0
-KEYFRAMES_PER_REST = 6
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 DOUBTFUL_P = 0.05  # p value of a keyframe that asks for an estimate at rest: one in twenty of those that fit
 
@@ -96,15 +90,13 @@ class Recalibrator:
         self.selector = KeyframeSelector(self.config.online)
         self.motion = EgoMotion(self.config.motion, self.config.lidar.accumulate_s)
         self.speed_gate = speed_gate or SpeedGate(self.config.online)
-        self.schedule = Schedule(self.config.online)
+        self.schedule, self.rest = Schedule(self.config.online), Rest()
         self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
         self._calibrator = Calibrator(camera, self.config, self.segmentation)
         self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
-        self._steady_since: int | None = None  # stamp of the first frame since which the extrinsic is steady, ns
-        self._steady_s = self._estimated_after_s = 0.0  # from then to the newest frame, and to the last estimate
         self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
         self._test_wanted = False  # a look has struck, and the load has not allowed for a test yet
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
@@ -148,12 +140,6 @@ class Recalibrator:
         """True while the extrinsic is steady and every keyframe since the last estimate fits it: less is done then."""
         return self.config.online.rest_period_s > 0 and self.tracker.steady and self._keyframes_fit
 
-    @property
-    def rest_s(self) -> float:
-        """Time from the last estimate to the next at rest, s: as long as the extrinsic was steady by then. 0 if not at rest."""
-        shortest = self.config.online.rest_period_s
-        return max(shortest, min(self._estimated_after_s, LONGEST_REST_S)) if self.at_rest else 0.0
-
     def newest(self) -> FrameFeatures | None:
         """Features of the newest keyframe, None before the first."""
         with self._lock:
@@ -169,9 +155,10 @@ class Recalibrator:
         camera = self.calibrator.extract.camera
         with self._lock:
             tracker, keyframes = self.tracker, self.keyframes
+            fault = None if tracker.sensor_problem is None else tracker.sensor_problem.fault
             counted = Counted(
                 *(len(keyframes), keyframes.per_s(self.schedule.newest), tracker.fused_keyframes),
-                *(tracker.missing, tracker.confirmations, tracker.fault),
+                *(tracker.missing, tracker.confirmations, fault),
             )
             return advise((extrinsic or tracker.current).result, self.config, camera, counted)
 
@@ -180,7 +167,8 @@ class Recalibrator:
         with self._lock:
             if self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < self.config.online.min_keyframes:
                 return False
-            return self.schedule.due(self.rest_s, self.tracker.lost or self.tracker.tentative) and self._has_enough()
+            rest_s = self.rest.estimates_s(self.config.online.rest_period_s) if self.at_rest else 0.0
+            return self.schedule.due(rest_s, self.tracker.lost or self.tracker.tentative) and self._has_enough()
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
@@ -222,9 +210,8 @@ class Recalibrator:
         if self.first_guess.pending:
             self.first_guess.add(frame)
         self.schedule.add_frame(frame.stamp)
-        self._note_steadiness(frame.stamp)
-        shortest, longest = REST_SPACING_S
-        spacing_s = min(max(shortest, self._steady_s / KEYFRAMES_PER_REST), longest) if self.at_rest else 0.0
+        self.rest.add_frame(frame.stamp, self.tracker.steady)
+        spacing_s = self.rest.keyframes_s if self.at_rest else 0.0
         if problem is not None or not self.speed_gate.allows(frame):
             return False
         is_keyframe = self.selector.select(frame.image, frame.stamp, permit, spacing_s)
@@ -254,13 +241,6 @@ class Recalibrator:
         if current or is_keyframe:
             self._monitor_extrinsic(None if is_keyframe else features)
         return is_keyframe
-
-    def _note_steadiness(self, stamp: int) -> None:
-        if not self.tracker.steady:
-            self._steady_since = None
-        elif self._steady_since is None or stamp < self._steady_since:
-            self._steady_since = stamp
-        self._steady_s = 0.0 if self._steady_since is None else (stamp - self._steady_since) / NANOSECONDS
 
     def _worth_a_test(self, frame: Frame) -> bool:
         """Whether a frame that is no keyframe is to be tested by the monitor: it matches worse than others, or there is doubt."""
@@ -346,7 +326,7 @@ class Recalibrator:
         with self._lock:
             batch = self.keyframes.batch(self._informative() or list(self.buffer))
             self.schedule.start_estimate()
-            self._estimated_after_s = self._steady_s
+            self.rest.start_estimate()
             fitted, self._keyframes_fit = self._keyframes_fit, self.config.monitor.enabled  # until one from now on does not
         names, force_search = self.tracker.initial, force_search and bool(batch.features)
         try:

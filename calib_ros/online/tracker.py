@@ -14,7 +14,7 @@ from calib_ros.config.online import MANUAL
 from calib_ros.online.clocks import ClockEvidence
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
-from calib_ros.online.sensor_health import SensorFault, SensorProblem
+from calib_ros.online.sensor_health import SensorProblem
 from calib_ros.online.tracker_states import NOTHING, TRANSITIONS, Confirmations, TrackerEvent, TrackerState
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, pose_constraints
@@ -36,7 +36,8 @@ class Tracker:
 
     config may be replaced at any time. current: what to publish, a new object after every change. state: what it rests on.
     last_good: the newest extrinsic to rely on, None before the first. settled: successive estimates agree, so that they refine
-    instead of searching. fused_keyframes: how many the covariance rests on.
+    instead of searching. fused_keyframes: how many the covariance rests on. sensor_problem: what is wrong with a
+    sensor; None while both work.
     """
 
     def __init__(self, initial: Result, current: Result | None = None, config: Config | None = None) -> None:
@@ -58,7 +59,7 @@ class Tracker:
         self._consistent_keyframes, self._agreed = 0, False  # confirmations: keyframes, and another estimate
         self._clocks = ClockEvidence()
         self._objection = result.reason if self.lost else None  # of the monitor
-        self._sensor_problem: SensorProblem | None = None
+        self.sensor_problem: SensorProblem | None = None
         self._assessment: Assessment | None = None
         self._search_start = result.T_camera_lidar
         self.filter = PoseFilter(self._search_start, self._box_covariance())
@@ -90,11 +91,6 @@ class Tracker:
     def suspect(self) -> bool:
         """True while the monitor has yet to decide whether the extrinsic still holds."""
         return self._objection is not None and not self.lost
-
-    @property
-    def fault(self) -> SensorFault | None:
-        """Of a sensor that shows nothing."""
-        return None if self._sensor_problem is None else self._sensor_problem.fault
 
     @property
     def steady(self) -> bool:
@@ -185,15 +181,10 @@ class Tracker:
             self.current = self._extrinsic()
         return self.current
 
-    @property
-    def sensor_problem(self) -> SensorProblem | None:
-        """What is wrong with a sensor; None while both work."""
-        return self._sensor_problem
-
     def set_sensor_problem(self, problem: SensorProblem | None) -> Extrinsic:
         """A sensor shows nothing; None when both work again. Another figure of the same problem changes nothing."""
-        if problem != self._sensor_problem:
-            self._sensor_problem = problem
+        if problem != self.sensor_problem:
+            self.sensor_problem = problem
             self.current = self._extrinsic()
         return self.current
 
@@ -369,7 +360,7 @@ class Tracker:
     def _extrinsic(self) -> Extrinsic:
         """The newest result under the status that outweighs the others: moved, blinded, suspect, then the estimate's own."""
         result, assessment = self._result, self._assessment
-        blinded = "" if self._sensor_problem is None else self._sensor_problem.message
+        blinded = "" if self.sensor_problem is None else self.sensor_problem.message
         if self.lost:
             estimated = self._accepted_since_moved or self._rejected_in_a_row
             more = RECOVERING - self._agreeing_in_a_row
@@ -377,7 +368,7 @@ class Tracker:
             reason = f"estimate {result.status}: {result.reason or missing}" if estimated else self._objection
             by_hand = "online.mode is manual: call ~/calibrate" if self.config.online.mode == MANUAL else ""
             result = replace(result, status=MOVED, reason="; ".join(filter(None, [reason, by_hand, blinded])))
-        elif self._sensor_problem is not None:
+        elif self.sensor_problem is not None:
             result = replace(result, status=BLINDED, reason=blinded)
         elif self.suspect:
             result = replace(result, status=SUSPECT, reason=self._objection or "")

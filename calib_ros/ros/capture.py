@@ -66,7 +66,7 @@ class Capture:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def add(self, image: Any, cloud: Any) -> None:
+    def add(self, image: Serialized, cloud: Serialized) -> None:
         """Add the messages of a new keyframe. Keeps references: nothing is copied."""
         self.resize()
         with self._lock:

@@ -7,13 +7,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from driven import Driven, config
 
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.online import recalibrator as recalibrator_module
+from calib_ros.online import pacing
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.result import CONVERGED, MOVED, SUSPECT
+from calib_ros.result import BLINDED, CONVERGED, MOVED, SUSPECT
 from calib_ros_synthetic.drive import SyntheticDrive
 
 GAP_S = 1.0  # between frames
@@ -94,7 +95,7 @@ def gaps(times: list[float]) -> list[float]:
 @pytest.fixture(autouse=True)
 def without_spacing(monkeypatch: pytest.MonkeyPatch) -> None:
     """At rest as many keyframes as else, unless the test says otherwise."""
-    monkeypatch.setattr(recalibrator_module, "REST_SPACING_S", (0.0, 0.0))
+    monkeypatch.setattr(pacing, "REST_SPACING_S", (0.0, 0.0))
 
 
 @pytest.fixture
@@ -134,7 +135,7 @@ def test_a_steady_extrinsic_is_estimated_seldom_and_the_same_recording_gives_the
 def test_at_rest_keyframes_are_taken_seldom_until_one_does_not_fit(
     street: list[Frame], start: np.ndarray, drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recalibrator_module, "REST_SPACING_S", (3.0, 3.0))
+    monkeypatch.setattr(pacing, "REST_SPACING_S", (3.0, 3.0))
     parade = Parade(street, start)
     parade(18)
     seen, now, between = len(parade.keyframes), parade.n * GAP_S, gaps(parade.keyframes)
@@ -232,3 +233,28 @@ def test_a_look_that_struck_is_followed_by_a_test_once_the_load_allows_for_it(st
     assert standing.stand(6, 0.0)[-1] == CONVERGED
     assert standing.stand(3, 1.5, permit=False)[-1] == CONVERGED  # no CPU time is left
     assert standing.stand(0.5, 1.5)[-1] == SUSPECT
+
+
+def test_at_rest_pairs_between_two_looks_are_not_even_decoded_unless_something_is_in_doubt(
+    street: list[Frame], drive: SyntheticDrive
+) -> None:
+    settings = update(config(rest_period_s=100.0, min_keyframes=3, buffer_size=6), {"motion": {"max_time_offset_s": 0.0}})
+    with Driven(drive, settings) as driven:
+        pipeline, stamp = driven.pipeline, street[0].stamp
+
+        def feed(frame: Frame, after_s: float) -> int:
+            """How many pairs were left out."""
+            nonlocal stamp
+            stamp, before = stamp + round(after_s * NANOSECONDS), pipeline.rested_pairs
+            driven.feed(dataclasses.replace(frame, stamp=stamp, cloud_stamp=stamp, compensated=True))
+            return pipeline.rested_pairs - before
+
+        for k in range(15):
+            assert feed(street[k % len(street)], GAP_S) == 0
+        assert pipeline.recalibrator.at_rest
+        assert sum(feed(street[14 % len(street)], 0.1) for _ in range(12)) == 9  # a look in 0.4 s
+        covered = dataclasses.replace(street[0], image=np.zeros_like(street[0].image))
+        while feed(covered, 0.1):
+            pass
+        assert [feed(covered, 0.1) for _ in range(5)] == [0] * 5
+        assert pipeline.recalibrator.current.result.status == BLINDED
