@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
@@ -17,7 +17,7 @@ import yaml
 
 from calib_ros import __version__, io, se3
 from calib_ros.arrays import Covariance, Transform
-from calib_ros.errors import BadInputError
+from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.io import write_atomically
 
@@ -29,6 +29,8 @@ TENTATIVE = "tentative"  # accepted, but not confirmed by further keyframes yet
 SUSPECT = "suspect"  # the newest keyframes do not fit it; being checked
 MOVED = "moved"  # the calibration has moved; it is searched anew
 BLINDED = "blinded"  # a sensor shows nothing: covered lens, frozen image, empty cloud
+
+CONSUMERS_SIGMAS = 2.0  # an error is within so many standard deviations with 95 %
 
 
 class RefusalCode(Enum):
@@ -320,3 +322,37 @@ class Extrinsic:
     usable: bool = False
     estimated_at: int = 0
     disputed_since: int = 0
+
+
+@dataclass(frozen=True)
+class Consumer:
+    """deg, m: the largest errors of rotation and translation that it can live with."""
+
+    name: str
+    deg: float
+    m: float
+
+    def is_served(self, covariance: Covariance | None) -> bool:
+        """Whether the tolerances hold along every direction, by a covariance (6, 6) of a left perturbation, rad and m; None =
+        unknown: it is not."""
+        if covariance is None:
+            return False
+        turn, shift = (
+            CONSUMERS_SIGMAS * math.sqrt(np.linalg.eigvalsh(block)[-1]) for block in (covariance[:3, :3], covariance[3:, 3:])
+        )
+        return bool(np.rad2deg(turn) <= self.deg and shift <= self.m)
+
+
+def parse_consumers(texts: Sequence[str]) -> tuple[Consumer, ...]:
+    """Texts "NAME DEG M" -> consumers. ConfigError for another form, tolerances that are no positive numbers, or a name twice."""
+    found: dict[str, Consumer] = {}
+    for text in texts:
+        words, deg, m = text.split(), math.nan, math.nan
+        with suppress(ValueError):
+            deg, m = map(float, words[1:])
+        if not (0 < deg < math.inf and 0 < m < math.inf):
+            raise ConfigError(f"consumers: {text!r} must be NAME DEG M with tolerances above 0, such as 'planner 0.5 0.10'")
+        if words[0] in found:
+            raise ConfigError(f"consumers: {words[0]} is named twice; name each consumer once, such as 'planner 0.5 0.10'")
+        found[words[0]] = Consumer(words[0], deg, m)
+    return tuple(found.values())

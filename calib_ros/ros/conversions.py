@@ -21,13 +21,12 @@ from std_msgs.msg import Header
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.consumers import Consumer
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
 from calib_ros.messages.point_fields import LIVOX_FIELDS, LIVOX_OFFSETS, LIVOX_STRIDE, livox_scan
 from calib_ros.messages.wire import WireHeader, wire_header
 from calib_ros.online.coach import Advice
-from calib_ros.result import Extrinsic
+from calib_ros.result import Consumer, Extrinsic
 
 # ROS orders covariances of poses translation first; calib_ros has rotation first. The way back is the same.
 _ROS_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])

@@ -20,13 +20,12 @@ from calib_ros import se3
 from calib_ros.config import Config, former_names, load_stages, preset, stages, update
 from calib_ros.config.options import checked, option
 from calib_ros.config.removed import REMOVED, notices
-from calib_ros.consumers import Consumer, parse_consumers
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.export import DESCRIPTIONS, WRITABLE
 from calib_ros.extensions import PRESETS, names
 from calib_ros.image.mask import check_mask
 from calib_ros.online.black_box import KINDS
-from calib_ros.result import INITIAL, InitialSource, Result
+from calib_ros.result import INITIAL, Consumer, InitialSource, Result, parse_consumers
 
 # Prefixes of the parameters that every ROS node has.
 OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib_ros import se3
-from calib_ros.consumers import Consumer, parse_consumers
 from calib_ros.errors import ConfigError
+from calib_ros.result import Consumer, parse_consumers
 
 SIGMA = np.array([0.1, 0.1, 0.2, 0.01, 0.01, 0.04])  # deg and m, before it is turned
 UNITS = np.r_[np.deg2rad(np.ones(3)), np.ones(3)]
