@@ -80,7 +80,8 @@ def knocked(frame: Frame, T: Matrix, knock: Matrix) -> Frame:
 def fed(recalibrator: Recalibrator, frame: Frame) -> str:
     """The status after a frame."""
     try:
-        recalibrator.ingest(frame)
+        if recalibrator.wants(frame.stamp):
+            recalibrator.ingest(frame)
     except CalibrationError:
         return recalibrator.current.result.status
     if recalibrator.ready():

@@ -23,7 +23,9 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH, blurred_levels, oriented_edges
 from calib_ros.lidar.deskew import image_times, moved, used_twist
 
-EVERY_S = 0.35  # between looks, by the data's stamps: every fourth frame at 10 Hz, for a knock is to be told within a second
+# Between looks, s of the data's stamps, for a knock is to be told within a second: at 10 Hz every fourth frame, at rest every
+# sixth.
+EVERY_S, REST_EVERY_S = 0.35, 0.55
 KEPT = 50  # looks that tell what is usual: of as many more, one is by chance worse than all of these, in a quarter of a minute
 LEAST_KEPT = 10
 WIDTH = 320  # px of the small picture: a pixel is a quarter of a degree of usual lenses
@@ -50,9 +52,10 @@ class Glance:
         self._losses: deque[float] = deque(maxlen=KEPT)
         self._looked_at: int | None = None  # stamp, ns
 
-    def is_due(self, stamp: int) -> bool:
+    def is_due(self, stamp: int, at_rest: bool = False) -> bool:
         """Whether the last look is long enough ago."""
-        return self._looked_at is None or not 0 <= (stamp - self._looked_at) / NANOSECONDS < EVERY_S
+        every_s = REST_EVERY_S if at_rest else EVERY_S
+        return self._looked_at is None or not 0 <= (stamp - self._looked_at) / NANOSECONDS < every_s
 
     def put_off(self, stamp: int) -> None:
         """A keyframe tells more than a look."""

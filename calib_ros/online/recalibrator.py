@@ -23,7 +23,7 @@ from calib_ros.online.glance import Glance
 from calib_ros.online.keyframe_classes import KeyframeSegmenter
 from calib_ros.online.keyframes import Batch, EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, feature_config
 from calib_ros.online.monitor import Assessment, Monitor, Verdict
-from calib_ros.online.pacing import Rest, Schedule
+from calib_ros.online.pacing import LONGEST_REST_S, REST_SPACING_S, Rest, Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
@@ -38,7 +38,8 @@ from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, RefusalCode, Resu
 
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
-DOUBTFUL_P = 0.05  # p value of a keyframe that asks for an estimate at rest: one in twenty of those that fit
+# p value of a keyframe that asks for an estimate at rest: by chance, of the two tests at each, one rest in twenty ends early.
+DOUBTFUL_P = 0.05 * REST_SPACING_S[1] / (2 * LONGEST_REST_S)
 
 
 class Recalibrator:
@@ -192,7 +193,7 @@ class Recalibrator:
         """False if a frame of this stamp, ns, need not even be decoded: at rest, between two looks, and without any doubt."""
         if not self.at_rest or self.config.lidar.accumulate_s > 0:
             return True
-        return self._test_wanted or self.monitor.in_doubt or self.sensors.faulty_frames > 0 or self.glance.is_due(stamp)
+        return self._test_wanted or self.monitor.in_doubt or self.sensors.faulty_frames > 0 or self.glance.is_due(stamp, True)
 
     def ingest(
         self, frame: Frame, scan_before: ScanBefore = lambda since: None, permit: Callable[[], bool] = lambda: True
@@ -244,7 +245,7 @@ class Recalibrator:
 
     def _worth_a_test(self, frame: Frame) -> bool:
         """Whether a frame that is no keyframe is to be tested by the monitor: it matches worse than others, or there is doubt."""
-        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(frame.stamp)):
+        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(frame.stamp, self.at_rest)):
             return False
         if self._test_wanted or self.monitor.in_doubt or self.tracker.suspect:
             self.glance.put_off(frame.stamp)  # no need to look, nor to get used to what may be a knock

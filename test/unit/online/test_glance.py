@@ -11,6 +11,7 @@ from scenes import RenderedDrive, Scene
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online import glance as module
 from calib_ros.online.glance import EVERY_S, LEAST_KEPT, Glance, depth_edges, in_view, match_loss, nearness_picture
 
 CONFIG = Config()
@@ -52,6 +53,10 @@ def test_what_strikes_is_usual_afterwards(scene):
 
 def test_looks_are_no_more_often_than_needed():
     glance = Glance()
+    glance.put_off(0)
+    spacing = round(module.REST_EVERY_S * NANOSECONDS)
+    assert [glance.is_due(t, at_rest=True) for t in (spacing - 1, spacing)] == [False, True]
+    glance.reset()
     assert glance.is_due(0)
     glance.put_off(5 * NANOSECONDS)
     spacing = round(EVERY_S * NANOSECONDS)

@@ -126,7 +126,9 @@ def test_a_steady_extrinsic_is_estimated_seldom_and_the_same_recording_gives_the
         assert parade.recalibrator.current.result.status == CONVERGED
         assert 6 <= len(parade.estimates) <= 10  # 5 of them until it is steady
         assert max(gaps(parade.estimates[:7])) == 5.0
-        assert max(gaps(parade.estimates)) >= 10.0  # as long as it has been steady
+        steady = [gap for gap in gaps(parade.estimates) if gap > 5.0]
+        assert steady
+        assert steady == sorted(steady)  # as long as it has been steady
     first, second = parades
     assert first.estimates == second.estimates
     np.testing.assert_array_equal(*(p.recalibrator.current.result.T_camera_lidar for p in parades))
@@ -221,7 +223,7 @@ def standing(street: list[Frame], start: np.ndarray) -> Parade:
 
 
 def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(standing: Parade) -> None:
-    assert set(standing.stand(5, 0.0)) == {CONVERGED}
+    assert set(standing.stand(8, 0.0)) == {CONVERGED}  # ten looks tell what is usual
     keyframes = len(standing.keyframes)
     after = standing.stand(3, 1.5)
     assert SUSPECT in after[:10]
@@ -230,7 +232,7 @@ def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(standing: Parade) ->
 
 
 def test_a_look_that_struck_is_followed_by_a_test_once_the_load_allows_for_it(standing: Parade) -> None:
-    assert standing.stand(6, 0.0)[-1] == CONVERGED
+    assert standing.stand(8, 0.0)[-1] == CONVERGED
     assert standing.stand(3, 1.5, permit=False)[-1] == CONVERGED  # no CPU time is left
     assert standing.stand(0.5, 1.5)[-1] == SUSPECT
 
@@ -252,7 +254,7 @@ def test_at_rest_pairs_between_two_looks_are_not_even_decoded_unless_something_i
         for k in range(15):
             assert feed(street[k % len(street)], GAP_S) == 0
         assert pipeline.recalibrator.at_rest
-        assert sum(feed(street[14 % len(street)], 0.1) for _ in range(12)) == 9  # a look in 0.4 s
+        assert sum(feed(street[14 % len(street)], 0.1) for _ in range(12)) == 10  # a look in 0.6 s
         covered = dataclasses.replace(street[0], image=np.zeros_like(street[0].image))
         while feed(covered, 0.1):
             pass
