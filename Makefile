@@ -1,6 +1,8 @@
 # Everything runs in .venv, which `make env` makes from wheels: no ROS install needed. For another Python, give
 # PYTHON=python3.12 every time or export it, else .venv is made again with python3.
 PYTHON ?= python3
+ROS ?= kilted
+VENV := .venv$(if $(filter-out kilted,$(ROS)),-$(ROS))
 PYTEST_ARGS ?=
 # One more than the two cores of a small machine: tests of nodes mostly wait for messages and clocks.
 TEST_PROCESSES ?= 3
@@ -10,7 +12,7 @@ unexport CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONP
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Some hundred processes start in a run of the tests, and each would compile all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
-export AMENT_PREFIX_PATH := $(CURDIR)/.venv
+export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 
 .PHONY: help env demo test test-all bench lint docs clean distclean
 
@@ -24,13 +26,14 @@ help:
 	@echo "make lint               ruff and mypy"
 	@echo "make docs               the documentation site in site/"
 	@echo "make env                the environment in .venv; every target above brings it up to date first"
+	@echo "make test ROS=jazzy     any target with another distribution than Kilted, in .venv-jazzy"
 	@echo "make clean, distclean   what was built; and .venv too"
 
 env:
-	@$(PYTHON) tools/make_env.py
+	@$(PYTHON) tools/make_env.py $(ROS)
 
 demo: env
-	.venv/bin/calib-ros demo --out demo_out
+	$(VENV)/bin/calib-ros demo --out demo_out
 
 # `make test` guards the product in a few minutes. It leaves out two markers of pytest:
 #   slow        a scenario that takes long; a shorter test of the same behaviour stays in `make test`
@@ -41,7 +44,7 @@ ROOM ?=
 TESTS = $(if $(ROOM),$(or $(wildcard test/$(ROOM) test/*/$(ROOM) test/unit/test_$(ROOM).py),$(error no tests of "$(ROOM)": see test/*/)),test)
 # The tests of a file stay in one process, since they share rendered scenes and running nodes; and files begin in the order of
 # test/conftest.py, the longest first, instead of the order of their number of tests.
-PYTEST = .venv/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder $(TESTS)
+PYTEST = $(VENV)/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 test: env
 	$(PYTEST) $(if $(ROOM),,-m "not slow and not laboratory") $(PYTEST_ARGS)
@@ -50,18 +53,18 @@ test-all: env
 	$(PYTEST) $(PYTEST_ARGS)
 
 bench: env
-	.venv/bin/python -m benchmarks.bench
+	$(VENV)/bin/python -m benchmarks.bench
 
 lint: env
-	.venv/bin/ruff check .
-	.venv/bin/ruff format --check .
-	.venv/bin/mypy
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
 
 # The site's tools are no part of `make env`: they are installed here when they are missing or others.
 docs: env
-	@cmp -s requirements-docs.txt .venv/stamps/docs || \
-		{ .venv/bin/pip install -q --disable-pip-version-check -r requirements-docs.txt && cp requirements-docs.txt .venv/stamps/docs; }
-	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict --quiet
+	@cmp -s requirements-docs.txt $(VENV)/stamps/docs || \
+		{ $(VENV)/bin/pip install -q --disable-pip-version-check -r requirements-docs.txt && cp requirements-docs.txt $(VENV)/stamps/docs; }
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet
 	@echo "site/index.html"
 
 # Leaves .venv, which takes a download to make again; distclean does not.
@@ -70,4 +73,4 @@ clean:
 	find calib_ros* benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv calib_ros/registration/score/kernel*.so calib_ros_thesis/kernel*.so
+	rm -rf .venv .venv-* calib_ros/registration/score/kernel*.so calib_ros_thesis/kernel*.so

@@ -138,7 +138,8 @@ def rotation_from_euler(yaw: float, pitch: float, roll: float) -> Matrix:
 
 def quaternion_from_rotation(R: ArrayLike) -> Matrix:
     """(3, 3) -> unit quaternion (x, y, z, w) with w >= 0; ROS order (eq. 2.14 writes the real part first)."""
-    return np.asarray(Rotation.from_matrix(np.asarray(R, float)).as_quat(canonical=True))
+    x, y, z, w = q = Rotation.from_matrix(np.asarray(R, float)).as_quat()
+    return np.asarray(q if (w, x, y, z) > (0, 0, 0, 0) else -q)  # as canonical=True of SciPy 1.11; Ubuntu 22.04 has 1.8
 
 
 def rotation_from_quaternion(xyzw: ArrayLike) -> Matrix:

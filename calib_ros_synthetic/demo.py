@@ -54,6 +54,7 @@ def run(out: str, seed: int, preset: str = "") -> bool:
     the node."""
     try:
         from calib_ros.ros.client import ExtrinsicClient
+        from calib_ros.ros.distributions import on_this_machine_only
     except ImportError as error:
         raise MissingDependencyError(
             f"the demo needs ROS 2 ({error.name} is missing); source your ROS install or run make env"
@@ -69,18 +70,17 @@ def run(out: str, seed: int, preset: str = "") -> bool:
     initial = Result(start, "initial", "wrong on purpose", camera_frame=drive.camera_frame, lidar_frame=drive.lidar_frame)
     initial.save(folder / "initial.json")
     domain = random.SystemRandom().randrange(1, 101)  # so that a demo beside a running system does not meet it
-    env = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(domain)}
-    os.environ.update({key: env[key] for key in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DOMAIN_ID")})
+    os.environ.update({**on_this_machine_only(), "ROS_DOMAIN_ID": str(domain)})
     print(f"starting node and player as processes on ROS domain {domain}", flush=True)
     goal = f"an extrinsic that the node calls converged, within {GOAL_DEG} deg and {100 * GOAL_M:g} cm of the truth"
     print(f"goal: {goal}", flush=True)
     with (
-        _Process("node", _node_command(start, folder, preset), env, folder / "node.log") as node,
+        _Process("node", _node_command(start, folder, preset), folder / "node.log") as node,
         ExtrinsicClient(domain_id=domain) as client,
     ):
         client.get_extrinsic(timeout_s=IDLE_S)  # the node is up
         play = [sys.executable, "-m", "calib_ros", "play", str(folder / "bag"), "--loop", "--follow", "/calib_ros"]
-        with _Process("player", play, env, folder / "player.log") as player:
+        with _Process("player", play, folder / "player.log") as player:
             result, drift = _drive(client, node, player)
         node.must_stop()
     return _report(folder, drive, start, result, drift, client)
@@ -166,10 +166,10 @@ def _fresh_folder(folder: Path) -> Path:
 class _Process:
     """A child process with a log file; stopped by SIGINT when the block ends."""
 
-    def __init__(self, name: str, command: Sequence[str], env: dict[str, str], log: Path) -> None:
+    def __init__(self, name: str, command: Sequence[str], log: Path) -> None:
         self.name, self.log = name, log
         self._log = log.open("wb")
-        self._child = subprocess.Popen(command, env=env, stdout=self._log, stderr=subprocess.STDOUT)
+        self._child = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT)
 
     def __enter__(self) -> _Process:
         return self

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Make .venv: ROS 2 from wheels, the libraries, the generated messages, calib_ros itself.
+"""Make .venv: ROS 2 from wheels, the libraries, the generated messages, calib_ros itself. `make_env.py jazzy` makes .venv-jazzy.
 
 Quick when nothing changed; a run that was cut off is made good by the next one.
 """
@@ -20,7 +20,9 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-VENV = ROOT / ".venv"
+DISTRIBUTION = (sys.argv[1:] or ["kilted"])[0]
+VENV = ROOT / (".venv" if DISTRIBUTION == "kilted" else f".venv-{DISTRIBUTION}")
+REQUIREMENTS = ["requirements.txt", "constraints.txt"] + [f"requirements-{DISTRIBUTION}.txt"] * (DISTRIBUTION != "kilted")
 PYTHON = VENV / "bin" / "python"
 STAMPS = VENV / "stamps"
 PIP_INSTALL = [PYTHON, "-m", "pip", "install", "-q", "--no-input", "--disable-pip-version-check"]
@@ -108,6 +110,18 @@ def create_venv() -> None:
     run(sys.executable, "-m", "venv", "--clear", VENV)
 
 
+def merged_requirements() -> Path:
+    """The requirements, where another distribution than Kilted replaces the lines of the ROS packages."""
+    common, constraints, *own = [(ROOT / name).read_text() for name in REQUIREMENTS]
+    if not own:
+        return ROOT / "requirements.txt"
+    folder = VENV / "requirements"
+    folder.mkdir(exist_ok=True)
+    for name, text, more in (("requirements.txt", common, own[0]), ("constraints.txt", constraints, "")):
+        (folder / name).write_text(re.sub(r"(?m)^ros-.*\n", "", text) + more)
+    return folder / "requirements.txt"
+
+
 def install_requirements() -> None:
     # pip takes a package that was cut off half way for installed, so the next run has to start afresh.
     PIP_RUNNING.touch()
@@ -116,7 +130,7 @@ def install_requirements() -> None:
         " requirements.txt` on a machine that has one and the same Python, bring the folder WHEELS over, then"
         " `PIP_NO_INDEX=1 PIP_FIND_LINKS=$PWD/WHEELS make env`."
     )
-    run(*PIP_INSTALL, "-r", "requirements.txt", advice=advice)
+    run(*PIP_INSTALL, "-r", merged_requirements(), advice=advice)
     PIP_RUNNING.unlink()
     # The wheels name include folders of the machine that built them; CMake refuses folders that do not exist.
     numpy_include = run(PYTHON, "-c", "import numpy; print(numpy.get_include())").strip()
@@ -150,13 +164,13 @@ def install_package() -> None:
         link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
         link.symlink_to(ROOT / source)
-    run(PYTHON, "-c", SMOKE, advice="The environment is broken; delete .venv and run this again.")
+    run(PYTHON, "-c", SMOKE, advice=f"The environment is broken; delete {VENV.name} and run this again.")
 
 
 # A step is redone when one of its inputs, or a step before it, changed.
 STEPS = [
     ("create .venv", create_venv, ["tools/make_env.py"]),
-    ("install requirements", install_requirements, ["requirements.txt", "constraints.txt"]),
+    ("install requirements", install_requirements, REQUIREMENTS),
     ("build messages", build_messages, MESSAGE_PACKAGES),
     ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/__init__.py", *KERNELS]),
 ]
@@ -174,6 +188,8 @@ def digest(seed: str, inputs: list[str]) -> str:
 
 def main() -> None:
     check_platform()
+    if missing := [name for name in REQUIREMENTS if not (ROOT / name).exists()]:
+        raise EnvError(f"no wheels of {DISTRIBUTION} are known: {missing[0]} is missing")
     # Two runs at once, as from `make -j test lint`, wait for each other.
     with open(__file__) as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

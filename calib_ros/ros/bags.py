@@ -18,7 +18,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
@@ -120,7 +119,7 @@ class Follower:
         return any(a == b for ends in product(told, owners) for a, b in zip(*ends, strict=True))
 
 
-def _owner(endpoint: TopicEndpointInfo) -> tuple[bytes, tuple[str, str]]:
+def _owner(endpoint: Any) -> tuple[bytes, tuple[str, str]]:
     """The participant, that is, the prefix of a DDS GUID (DDSI-RTPS 8.2.4.1), and the node, by which other middlewares go: Fast
     DDS may lose names of nodes, which come by a topic of depth 1 (ros2/rmw_fastrtps#792)."""
     return bytes(endpoint.endpoint_gid[:12]), (endpoint.node_namespace, endpoint.node_name)

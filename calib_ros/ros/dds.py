@@ -7,13 +7,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from rclpy.utilities import get_rmw_implementation_identifier
-
 from calib_ros.errors import MissingDependencyError
+from calib_ros.ros.distributions import is_fast_dds, large_messages, profile_variables
 
-# The name changed with Kilted, which warns about the old one; Jazzy and older do not know the new one.
-PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 PROFILE, LARGE_PROFILE = "fastdds_profile.xml", "fastdds_profile_large.xml"
 PROFILE_BYTES = 6_000_000  # the largest message that PROFILE is made for: two of them and their like fit its memory
 
@@ -42,20 +38,20 @@ def use_large_message_profile() -> None:
     if not given_profile():
         # The node works without; large best-effort messages may then get lost, as with any other node.
         with suppress(MissingDependencyError):
-            os.environ[_profile_variable()] = str(config_file(PROFILE))
+            os.environ[profile_variables()[0]] = str(config_file(PROFILE))
             _set_here = True
 
 
 def given_profile() -> str:
     """The profile that the user has set for this process, and most likely for drivers; "" if none."""
-    return "" if _set_here else next((os.environ[name] for name in PROFILE_VARIABLES if name in os.environ), "")
+    return "" if _set_here else next((os.environ[name] for name in profile_variables() if name in os.environ), "")
 
 
 def profile_for_sender(message_bytes: int) -> str:
     """What to set where the driver of messages of this size runs, so that they arrive whole; "" where the user has done that
     already. 0 bytes = of unknown size."""
-    if "fastrtps" not in get_rmw_implementation_identifier():
-        return "give the driver's DDS a shared memory or socket buffers (net.core.rmem_max) that hold several messages"
+    if not is_fast_dds():
+        return large_messages()
     name, given = PROFILE if 0 < message_bytes <= PROFILE_BYTES else LARGE_PROFILE, given_profile()
     if Path(given).name in (name, LARGE_PROFILE):
         return ""
@@ -66,8 +62,4 @@ def profile_for_sender(message_bytes: int) -> str:
         path = str(config_file(name))
     except MissingDependencyError:
         path = f"config/{name}"
-    return f"start its driver with {_profile_variable()}={path}"
-
-
-def _profile_variable() -> str:
-    return PROFILE_VARIABLES[os.environ.get("ROS_DISTRO", "") in OLD_DISTRIBUTIONS]
+    return f"start its driver with {profile_variables()[0]}={path}"

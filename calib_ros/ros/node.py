@@ -25,6 +25,7 @@ from calib_ros.ros.calibrate import CalibrateServers
 from calib_ros.ros.capture import Capture
 from calib_ros.ros.conversions import cloud_from_message, frame_from_messages, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
+from calib_ros.ros.distributions import remark
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, ProcessedPublisher
 from calib_ros.ros.services import Services
@@ -107,6 +108,8 @@ class RosInterface:
         ]
         models = self.pipeline.segmentation.in_use()
         node.get_logger().info(f"semantics: {'; '.join(models) or 'no models'}")
+        if said := remark():
+            node.get_logger().info(said)
         node.get_logger().info("waiting for images, clouds and CameraInfo")
 
     def deactivate(self) -> None:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import TwistStamped
-from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -29,6 +28,7 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros.conversions import Serialized, cloud_of_livox
 from calib_ros.ros.dds import profile_for_sender
 from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.distributions import SubscriptionEventCallbacks, UnsupportedEventTypeError, where_nobody_publishes
 from calib_ros.ros.parameters import Parameters
 
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
@@ -266,7 +266,7 @@ class AdaptiveSubscription:
         self.reliability_offered = bool(publishers) and all(p.reliability != BEST_EFFORT for p in publishers)
         problem = self._problem(types, publishers)
         nothing = "is published, but nothing comes; check its driver" if publishers else ""
-        self.silence = problem or f"{self.topic} {nothing or 'has no publisher; check the remapping and ROS_DOMAIN_ID'}"
+        self.silence = problem or f"{self.topic} {nothing or f'has no publisher; {where_nobody_publishes()}'}"
         return problem
 
     def _wanted(self, publishers: list[QoSProfile]) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
@@ -297,7 +297,9 @@ class AdaptiveSubscription:
         subscribe = partial(self._node.create_subscription, kind, self._topic, receive, qos, raw=restore is not None)
         try:
             return subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
-        except UnsupportedEventTypeError:  # by this middleware; gaps in the stamps remain
+        except UnsupportedEventTypeError:
+            text = "this middleware does not report lost messages: only gaps in the stamps tell of them"
+            self._node.get_logger().info(text, once=True)
             return subscribe()
 
     def _on_lost(self, event: Any) -> None:

@@ -108,8 +108,8 @@ def said_of(watch: Watch, now: float) -> Said:
         seen = watch.nodes_seen()
         words = f"No node {watch.name} is heard in ROS domain {watch.domain_id}. The page goes on once it is."
         hint = (
-            "To check: is the node running, active, and called so (--node)? Has it the same ROS_DOMAIN_ID and "
-            f"ROS_AUTOMATIC_DISCOVERY_RANGE? Nodes seen: {', '.join(seen) if seen else 'none'}."
+            "To check: is the node running, active, and called so (--node)? Has it the same ROS_DOMAIN_ID, "
+            f"discovery range and RMW_IMPLEMENTATION? Nodes seen: {', '.join(seen) if seen else 'none'}."
         )
         return Said("waiting", NEUTRAL, "", words, hint)
     if presence is Presence.GONE:

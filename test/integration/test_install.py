@@ -40,7 +40,9 @@ def wheel(tmp_path_factory):
     """Built from a copy, since a build leaves folders behind."""
     folder = tmp_path_factory.mktemp("wheel")
     copy = folder / "calib_ros"
-    skipped = shutil.ignore_patterns(".git", ".venv", "build", "install", "log", "*.egg-info", "__pycache__", "*_out", ".*_cache")
+    skipped = shutil.ignore_patterns(
+        ".git", ".venv*", "build", "install", "log", "*.egg-info", "__pycache__", "*_out", ".*_cache"
+    )
     shutil.copytree(ROOT, copy, ignore=skipped)
     options = ["--no-deps", "--no-build-isolation", "-q", "-w", folder]
     done = run(sys.executable, "-m", "pip", "wheel", *options, copy)

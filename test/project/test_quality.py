@@ -105,4 +105,5 @@ def test_large_message_profiles_are_well_formed(name: str, largest: int) -> None
     tree = ET.parse(ROOT / "config" / name)
     names = {element.tag.split("}")[1]: element.text for element in tree.iter()}
     assert int(names["segment_size"]) >= int(names["maxMessageSize"]) > 2 * largest
+    assert int(names["receiveBufferSize"]) > 2 * largest
     assert names["useBuiltinTransports"] == "false"

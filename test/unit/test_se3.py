@@ -80,6 +80,9 @@ def test_euler_angles_are_those_of_eq_2_7():
 def test_quaternions_are_in_ros_order_and_have_no_negative_w():
     quarter = rotations_about("z", np.pi / 2)
     assert np.allclose(se3.quaternion_from_rotation(quarter), [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+    for k, axis in enumerate("xyz"):  # w = 0: both signs would do
+        half = se3.quaternion_from_rotation(np.round(rotations_about(axis, -np.pi)))
+        assert np.array_equal(half, np.eye(4)[k])
     far = [rotations_about(axis, sign * np.deg2rad(200)) for axis in "xyz" for sign in (1, -1)]
     for R in [*far, *(random_transform(seed)[:3, :3] for seed in range(6))]:
         x, y, z, w = se3.quaternion_from_rotation(R)

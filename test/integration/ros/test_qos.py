@@ -27,6 +27,7 @@ from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import decode_cloud
 from calib_ros.messages.point_fields import decode_livox
 from calib_ros.ros import dds
+from calib_ros.ros.distributions import profile_variables
 from calib_ros.ros.subscriptions import AdaptiveSubscription, Form, advice, livox_forms, loss_advice, serialized
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -144,7 +145,7 @@ def test_a_choice_that_cannot_work_is_named(topic):
 
 def test_advice_on_losses_names_nothing_that_is_set_already(topic, monkeypatch):
     monkeypatch.setattr(dds, "_set_here", False)
-    for name in dds.PROFILE_VARIABLES:
+    for name in profile_variables():
         monkeypatch.delenv(name, raising=False)
     subscription = topic.subscribe("best_effort")
     advised = loss_advice(subscription)
@@ -154,7 +155,7 @@ def test_advice_on_losses_names_nothing_that_is_set_already(topic, monkeypatch):
         (dds.config_file(dds.PROFILE), "fastdds_profile_large.xml, or"),
         ("/own.xml", "let the profile /own.xml hold several messages"),
     ):
-        monkeypatch.setenv(dds.PROFILE_VARIABLES[1], str(profile))
+        monkeypatch.setenv(profile_variables()[-1], str(profile))
         assert text in loss_advice(subscription)
     topic.publisher(RELIABLE)
     assert subscription.check() == ""
