@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
 from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets.rig import Timed
+from calib_ros.datasets.recent import Recent, Timed
 from calib_ros.datasets.source import Source, describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -116,16 +114,15 @@ class SyntheticRig:
         self.knocked = tuple(named("knock", own, {n: n for n in self._sensors}) for own in filter(None, knock.split("+")))
         self.knock_at: float = self.duration / 2 if knock_at is None else p["knock_at"]
         self._knock = self._knock_of(p["knock_deg"], p["knock_m"]) if self.knocked else np.eye(4)
-        self._made: OrderedDict[Hashable, Any] = OrderedDict()
+        self._made = Recent(CACHED)
         self._installed = lru_cache(maxsize=None)(self._install)
         self._view = lru_cache(maxsize=None)(self._view_of)
         self._own = lru_cache(maxsize=None)(self._own_layer)
 
     @classmethod
     def from_text(cls, text: str) -> SyntheticRig:
-        """`synthetic:rig=six_cameras_one_lidar,seed=3`; which camera and LiDAR the text may also name is left out."""
-        given = parsed(text, RIG_LIMITS, (*RIG_NAMES, *OF_PAIR))
-        return cls(**{name: value for name, value in given.items() if name not in OF_PAIR})
+        """Of `synthetic:rig=six_cameras_one_lidar,seed=3` or the like."""
+        return cls(**parsed(text, RIG_LIMITS, RIG_NAMES))
 
     def camera(self, name: str) -> Camera:
         """The intrinsics of a camera."""
@@ -173,13 +170,11 @@ class SyntheticRig:
 
     def scan(self, lidar: str, index: int) -> Scan:
         """Scan `index` of a LiDAR, with the scanner's twist (6,)."""
-        made: Scan = self._once(("scan", lidar, index), lambda: self._scan(lidar, index))
-        return made
+        return self._made((lidar, index), lambda: self._scan(lidar, index))
 
     def picture(self, camera: str, index: int) -> Picture:
         """Image `index` of a camera, with the classes of its pixels."""
-        made: Picture = self._once(("picture", camera, index), lambda: self._picture(camera, index))
-        return made
+        return self._made((camera, index), lambda: self._picture(camera, index))
 
     def T_camera_lidar(self, camera: str, image: int, lidar: str, scan: int) -> Floats:
         """The exact extrinsic (4, 4) between the sensors where they were at an image and at a scan."""
@@ -244,14 +239,6 @@ class SyntheticRig:
     def _own_layer(self, camera: str, after: bool) -> Any:
         own = self._installed(camera, after)
         return own.own_layer(self._view(camera), own.reference)
-
-    def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        if key not in self._made:
-            self._made[key] = make()
-        self._made.move_to_end(key)
-        while len(self._made) > CACHED:
-            self._made.popitem(last=False)
-        return self._made[key]
 
     def _scan(self, lidar: str, index: int) -> Scan:
         seconds, number, trip = self._time(lidar, index), self._number(lidar), self.trip
@@ -330,16 +317,20 @@ def open_drive(text: str, camera: str | int | None = None) -> Source:
     if not is_multi_rig(text):
         named("rig", _rig_in(text) or next(iter(RIGS)), dict.fromkeys((*RIGS, *MULTI_RIGS)))
         return SyntheticDrive.from_text(text)
-    rig, asked = SyntheticRig.from_text(text), parsed(text, RIG_LIMITS, (*RIG_NAMES, *OF_PAIR))
-    name = asked.get("camera", rig.cameras[0]) if camera is None else camera
+    asked = parsed(text, RIG_LIMITS, (*RIG_NAMES, *OF_PAIR))
+    own, lidar = (asked.pop(name, None) for name in OF_PAIR)
+    rig = SyntheticRig(**asked)
+    name = (own or rig.cameras[0]) if camera is None else camera
     if isinstance(name, int) and 0 <= name < len(rig.cameras):
         name = rig.cameras[name]
-    return rig.pair(str(name), asked.get("lidar", rig.lidars[0]))
+    return rig.pair(str(name), lidar or rig.lidars[0])
 
 
 def open_rig(text: str) -> SyntheticRig | None:
-    """The rig of several sensors that a text stands for; None if it is a drive of one camera and one LiDAR."""
-    return SyntheticRig.from_text(text) if is_multi_rig(text) else None
+    """The rig of several sensors that a text stands for; None if it is of one camera and one LiDAR, or names a pair."""
+    if not is_multi_rig(text) or parsed(text, RIG_LIMITS, (*RIG_NAMES, *OF_PAIR)).keys() & set(OF_PAIR):
+        return None
+    return SyntheticRig.from_text(text)
 
 
 def is_multi_rig(text: str) -> bool:

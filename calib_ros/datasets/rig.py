@@ -1,82 +1,142 @@
-"""Recordings of several cameras and LiDARs: the protocol, and opening one by the description of its sensors."""
+"""Opening the recording of several cameras and LiDARs by the description of its sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, overload
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
+from calib_ros.datasets.kitti import KittiSource
+from calib_ros.datasets.nuscenes import NuScenesSource
+from calib_ros.datasets.open import is_bag, open_dataset
+from calib_ros.datasets.recent import Recent, Timed
+from calib_ros.datasets.rig_source import (
+    CAMERA,
+    KEPT_CLOUDS,
+    ByDescription,
+    DescribedRig,
+    DescribedSensor,
+    RecordedRig,
+    RigSource,
+)
 from calib_ros.datasets.source import Source
-from calib_ros.frame import PointCloud
+from calib_ros.errors import BadInputError
+from calib_ros.extensions import RIGS, source_of
+
+__all__ = ["RecordedRig", "RigSource", "named_rig", "open_rig"]
 
 
-class RigSource(Protocol):
-    """The recording of a rig: every pair of a camera and a LiDAR is a Source of its own. What several of them need is read once,
-    as long as it is among the newest. BadInputError for names that are none of its sensors."""
+def open_rig(path_or_text: str | Path, description: DescribedRig, **options: Any) -> RigSource:
+    """Open the recording of the rig that is described: a bag by the topics of its sensors; or a synthetic rig, nuScenes or KITTI,
+    where `topic` is the recording's own name of a sensor (nuScenes: channel; KITTI: number of the camera), by default its name.
 
-    @property
-    def name(self) -> str:
-        """For display."""
+    options : of a bag, see `BagSource`: tolerance_s, rectified, motion, windows, clock, incomplete.
 
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
+    Raises BadInputError for other recordings, and for sensors that the recording does not have.
+    """
+    text, path = str(path_or_text), Path(path_or_text).expanduser()
+    if not path.exists() and (rig := named_rig(text)) is not None:
+        return ChosenSensors(rig, description)
+    if path.exists() and is_bag(path):
+        from calib_ros.datasets.bag_rig import BagRig
 
-    @property
-    def lidars(self) -> tuple[str, ...]:
-        """Names of the LiDARs."""
+        return BagRig(path, description, **options)
+    return OneLidarRig(text, description)
 
-    @property
-    def reference_sensor(self) -> str:
-        """The sensor that `reference` is relative to."""
+
+def named_rig(text: str) -> RecordedRig | None:
+    """The rig that another package brings by its name, as "synthetic:rig=..."; None where the text is something else."""
+    opened_by_name = None if Path(text).expanduser().exists() else source_of(text, RIGS)
+    rig: RecordedRig | None = None if opened_by_name is None else opened_by_name(text)
+    return rig
+
+
+class ChosenSensors(ByDescription):
+    """Some sensors of a rig, under the names of a description."""
+
+    def __init__(self, rig: RigSource, description: DescribedRig) -> None:
+        super().__init__(rig.name, description)
+        self.rig = rig
+        self._own = {sensor.name: _own_name(sensor, rig) for sensor in description.sensors}
 
     def camera(self, name: str) -> Camera:
-        """The intrinsics of a camera."""
+        """As of any rig."""
+        return self.rig.camera(self._own[name])
 
     def frame_id(self, name: str) -> str:
-        """TF frame of a sensor."""
+        """As of any rig."""
+        return self.sensors[name].frame or self.rig.frame_id(self._own[name])
 
     def reference(self, name: str) -> Transform | None:
-        """T_reference_sensor (4, 4) of a sensor as the recording states it at its beginning; None if unknown."""
+        """As of any rig."""
+        base, own = self.rig.reference(self._own[self.reference_sensor]), self.rig.reference(self._own[name])
+        return None if base is None or own is None else np.asarray(se3.inverse(base) @ own)
 
     def pair(self, camera: str, lidar: str) -> Source:
-        """Images of a camera with the scans of a LiDAR that are next to them; the reference is T_camera_lidar."""
+        """As of any rig."""
+        return self.rig.pair(self._own[camera], self._own[lidar])
 
-    def scans(self, lidar: str) -> Sequence[tuple[int, PointCloud]]:
-        """All scans of a LiDAR with their stamps, ns, in time."""
-
-
-class RecordedRig(RigSource, Protocol):
-    """A rig whose images can be read for themselves, so that all of it can be written to a bag."""
-
-    def pictures(self, camera: str) -> Sequence[tuple[int, NDArray[np.uint8]]]:
-        """All images of a camera with their stamps, ns, in time."""
-
-    def prior(self, name: str) -> Transform:
-        """T_reference_sensor (4, 4) as somebody who mounts the sensors believes it."""
+    def scans(self, lidar: str) -> Timed:
+        """As of any rig."""
+        return self.rig.scans(self._own[lidar])
 
 
-class Timed(Sequence[tuple[int, Any]]):
-    """What a sensor measured, with its stamps, ns (n,): read when asked for."""
+def _own_name(sensor: DescribedSensor, rig: RigSource) -> str:
+    names = rig.cameras if sensor.kind == CAMERA else rig.lidars
+    found = [name for name in (sensor.topic, sensor.name) if name in names]
+    if not found:
+        raise BadInputError(
+            f"{rig.name} has no {sensor.kind} {sensor.name}; name by topic one that it has: {', '.join(names) or 'none'}"
+        )
+    return found[0]
 
-    def __init__(self, stamps: NDArray[np.int64], read: Callable[[int], Any]) -> None:
-        self.stamps, self._read = stamps, read
 
-    def __len__(self) -> int:
-        return len(self.stamps)
+class OneLidarRig(ByDescription):
+    """KITTI or nuScenes: several cameras around one LiDAR."""
 
-    @overload
-    def __getitem__(self, index: int) -> tuple[int, Any]: ...
+    def __init__(self, text: str, description: DescribedRig) -> None:
+        super().__init__(text, description)
+        if len(self.lidars) != 1 or not self.cameras:
+            raise BadInputError(
+                f"{text} has one LiDAR, but the description has {len(self.lidars)} and {len(self.cameras)} cameras; "
+                "list the LiDAR and one camera or more"
+            )
+        recent = Recent(KEPT_CLOUDS)
+        self._sources: dict[str, KittiSource | NuScenesSource] = {}
+        for name in self.cameras:
+            source = open_dataset(text, self.sensors[name].topic or name)
+            if not isinstance(source, (KittiSource, NuScenesSource)):
+                raise BadInputError(f"{text} is no recording of a rig; give a bag, KITTI, nuScenes or synthetic:rig=NAME")
+            source.recent = recent
+            self._sources[name] = source
 
-    @overload
-    def __getitem__(self, index: slice) -> list[tuple[int, Any]]: ...
+    def camera(self, name: str) -> Camera:
+        """As of any rig."""
+        return self._sources[name].camera
 
-    def __getitem__(self, index: int | slice) -> tuple[int, Any] | list[tuple[int, Any]]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        index = range(len(self))[index]
-        return int(self.stamps[index]), self._read(index)
+    def frame_id(self, name: str) -> str:
+        """As of any rig."""
+        own = self._first.lidar_frame if name in self.lidars else self._sources[name].camera_frame
+        return self.sensors[name].frame or own
+
+    def reference(self, name: str) -> Transform | None:
+        """As of any rig; of nuScenes and KITTI objects, of the first frames."""
+        base, own = (np.eye(4) if of in self.lidars else self._sources[of].reference for of in (self.reference_sensor, name))
+        return np.asarray(base @ se3.inverse(own))
+
+    def pair(self, camera: str, lidar: str) -> Source:
+        """As of any rig."""
+        self.lidars.index(lidar)
+        return self._sources[camera]
+
+    def scans(self, lidar: str) -> Timed:
+        """As of any rig."""
+        return self._first.scans()
+
+    @property
+    def _first(self) -> KittiSource | NuScenesSource:
+        return self._sources[self.cameras[0]]
