@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TextIO
 
 from calib_ros.cli.arguments import BAD_INPUT, parser
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.extensions import commands
 
 OK, NOT_CONVERGED = 0, 1
@@ -114,7 +114,18 @@ def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.output import progress_bar
     from calib_ros.datasets.bag_writer import write_bag
     from calib_ros.datasets.positions import frame_positions
+    from calib_ros.datasets.rig import named_rig
 
+    rig = named_rig(args.source) if args.camera is None else None
+    if rig is not None:
+        from calib_ros.datasets.bag_rig import write_rig_bag
+
+        if args.frames != "all":
+            raise BadInputError(f"--frames {args.frames} does not go with a rig, which is written as a whole; make it shorter")
+        with progress_bar("writing") as step:
+            path, described = write_rig_bag(rig, args.bag, args.storage, step)
+        print(f"{len(rig.cameras)} cameras and {len(rig.lidars)} LiDARs written to {path}, described by {described}")
+        return OK
     source = open_named_source(args)
     positions = frame_positions(args.frames, len(source))
     with progress_bar("writing") as step:
