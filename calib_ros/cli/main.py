@@ -109,6 +109,12 @@ def _calibrate(args: argparse.Namespace) -> int:
     return OK if result.converged else NOT_CONVERGED
 
 
+def _rig(args: argparse.Namespace) -> int:
+    from calib_ros.cli.rig import run
+
+    return OK if run(args) else NOT_CONVERGED
+
+
 def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import open_named_source
     from calib_ros.cli.output import progress_bar
@@ -190,7 +196,15 @@ def _play(args: argparse.Namespace) -> int:
     return OK
 
 
-_RUN = {"info": _info, "calibrate": _calibrate, "convert": _convert, "replay": _replay, "export": _export, "play": _play}
+_RUN = {
+    "info": _info,
+    "calibrate": _calibrate,
+    "rig": _rig,
+    "convert": _convert,
+    "replay": _replay,
+    "export": _export,
+    "play": _play,
+}
 
 
 if __name__ == "__main__":

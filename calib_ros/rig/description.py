@@ -31,9 +31,9 @@ PRIOR_KEYS = {"translation_m", "quaternion_xyzw"}
 class Sensor:
     """A sensor of a rig.
 
-    kind: camera or lidar. topic: of a bag, else the source's own name of it. camera_info: its topic. frame: of TF, "" = as
-    recorded. prior: T_reference_sensor (4, 4); None = as the recording states it. sigma_deg, sigma_m: standard deviations of the
-    prior along every axis. mask: image file of what a camera's pictures leave out, "" = none.
+    kind: camera or lidar. topic: of a bag, else the recording's own name of it, "" = `name`. camera_info: its topic. frame: of
+    TF, "" = as recorded. prior: T_reference_sensor (4, 4); None = as the recording states it. sigma_deg, sigma_m: standard
+    deviations of the prior along every axis. mask: image file of what a camera's pictures leave out, "" = none.
     """
 
     name: str
@@ -149,7 +149,7 @@ class _Reader:
         for sensor in sensors:
             value = getattr(sensor, key)
             if value and value in seen:
-                raise self.wrong(f"sensors.{sensor.name}.{key}", f"is {value}, as of {seen[value]}; give each sensor its own")
+                raise self.wrong(f"sensors.{sensor.name}.{key}", f"is {value}, as of {seen[value]}; give each its own")
             seen[value] = sensor.name
 
     def sensor(self, name: str, value: Any) -> Sensor:
@@ -170,7 +170,7 @@ class _Reader:
         limits = (("sigma_deg", SIGMA_DEG, MAX_SIGMA_DEG), ("sigma_m", SIGMA_M, MAX_SIGMA_M))
         deg, m = (self.sigma(entry.get(k, usual), f"{key}.{k}", most) for k, usual, most in limits)
         topic, info, frame, mask = (texts.get(k, "") for k in ("topic", "camera_info", "frame", "mask"))
-        return Sensor(name, kind, topic or name, info, frame, prior, deg, m, mask)
+        return Sensor(name, kind, topic, info, frame, prior, deg, m, mask)
 
     def file(self, text: str, key: str) -> Path:
         path = self.path.parent / Path(text).expanduser()

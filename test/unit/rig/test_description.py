@@ -37,7 +37,7 @@ def test_sensors_priors_and_defaults(tmp_path: Path) -> None:
     assert (front.sigma_deg, front.sigma_m) == (2.0, 0.1)
     assert front.prior is not None
     np.testing.assert_allclose(front.prior[:3, 2], [1, 0, 0], atol=1e-12)  # looks ahead
-    assert (rig["rear"].topic, rig["rear"].prior) == ("rear", None)
+    assert (rig["rear"].topic, rig["rear"].prior) == ("", None)
 
 
 def test_a_result_file_is_a_prior_of_camera_or_lidar(tmp_path: Path) -> None:
@@ -72,9 +72,7 @@ MISTAKES = {
     GOOD.replace("sigma_deg: 2", "sigma_deg: 0"): "sensors.front.sigma_deg = 0 is no standard deviation; give a number above 0",
     GOOD.replace("sigma_m: 0.1", "sigma_m: 200"): "up to 5",
     GOOD.replace("{kind: camera}", "{kind: camera, topic: 3}"): "sensors.rear.topic must be a text, got 3; quote it",
-    GOOD.replace(
-        "{kind: camera}", "{kind: camera, topic: /front/image}"
-    ): "is /front/image, as of front; give each sensor its own",
+    GOOD.replace("{kind: camera}", "{kind: camera, topic: /front/image}"): "is /front/image, as of front; give each its own",
     GOOD.replace("{kind: camera}", "{kind: camera, mask: m.png}"): "which is no file; give a path from the folder of rig.yaml",
     GOOD.replace("{kind: camera}", "{kind: camera, prior: x.json}"): "sensors.rear.prior names",
     GOOD.replace("[1, 0, -0.2]", "[1, 0]"): "sensors.front.prior needs translation_m of 3 and quaternion_xyzw of 4 numbers",
