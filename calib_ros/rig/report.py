@@ -98,8 +98,8 @@ class RigReport:
     def _direction(self, name: str, twist: Matrix) -> str:
         """An unobservable direction at the sensor, in the reference's axes."""
         v = se3.parts_jacobian(self.solution.poses[name]) @ twist
-        prior = se3.parts_jacobian(self.solution.prior[name][0]) @ self.solution.prior[name][1]
-        sigma = np.sqrt(np.diag(prior @ se3.parts_jacobian(self.solution.prior[name][0]).T))
+        T, C = self.solution.prior[name]
+        sigma = np.sqrt(np.diag(se3.parts_jacobian(T) @ C @ se3.parts_jacobian(T).T))
         axis = int(np.argmax(np.abs(v) / sigma))
         own = float(np.sqrt(self.at_sensor(name)[axis, axis]))
         if axis < 3:
