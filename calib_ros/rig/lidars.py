@@ -141,15 +141,19 @@ def scan_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], T:
     for k in b.chosen(SCANS):
         j = a.nearest(int(b.stamps[k]))
         late_s = int(b.stamps[k] - a.stamps[j]) / NANOSECONDS
-        A, twist = a.still(j)
-        B, _ = b.still(k)
-        if abs(late_s) > MAX_GAP_S or min(len(A), len(B)) < MIN_POINTS or (twist is None and late_s):
+        if abs(late_s) > MAX_GAP_S:
+            continue
+        (A, twist), (B, _) = a.still(j), b.still(k)
+        if min(len(A), len(B)) < MIN_POINTS or (twist is None and late_s):
+            reason = f"too few points in their scans, or the motion of {name_a} is unknown"
             continue
         between = se3.exp(np.zeros(6) if twist is None else twist * late_s)
         guess = between @ T
         # The narrower scanner's points are looked for among the wider one's.
         turned, matched = len(B) > len(A), 0.0
         for reach in REACHES_M:
+            if not np.isfinite(guess).all():
+                break
             if turned:
                 result = align(B, A, se3.inverse(guess), reach)
                 guess = se3.inverse(np.asarray(result.T_target_source, float))
@@ -160,7 +164,7 @@ def scan_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], T:
                 matched = result.num_inliers / min(len(A), len(B))
         H = np.asarray(result.H, float)
         curvature = float(np.linalg.eigvalsh(H[3:, 3:])[0]) / max(result.num_inliers, 1)
-        if not result.converged or matched < MIN_MATCHED or curvature < MIN_CURVATURE:
+        if not result.converged or not np.isfinite(guess).all() or matched < MIN_MATCHED or curvature < MIN_CURVATURE:
             reason = f"their scans match at {matched:.0%} of the points, {MIN_MATCHED:.0%} are needed, or slide along each other"
             continue
         # From a right twist of what was aligned to a left one of T_target_source.
