@@ -121,7 +121,10 @@ setup(
             "thesis-literal = calib_ros_thesis.presets:LITERAL",
         ],
         "calib_ros.sources": [
-            "synthetic = calib_ros_synthetic.drive:SyntheticDrive.from_text",
+            "synthetic = calib_ros_synthetic.rig:open_drive",
+        ],
+        "calib_ros.rigs": [
+            "synthetic = calib_ros_synthetic.rig:open_rig",
         ],
         "calib_ros.commands": [
             "check = calib_ros_check.commands:CHECK",

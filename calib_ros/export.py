@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.parsers import expat
@@ -88,10 +88,39 @@ def urdf_joint(pose: Pose) -> str:
     )
 
 
-def autoware_yaml(pose: Pose) -> str:
-    """An entry of Autoware's sensors_calibration.yaml or sensor_kit_calibration.yaml."""
-    entry = dict(zip(POSE_NAMES, (*pose.xyz, *pose.rpy), strict=True))
-    return str(yaml.safe_dump({pose.parent: {pose.child: entry}}, sort_keys=False))
+def autoware_yaml(*poses: Pose) -> str:
+    """Entries of Autoware's sensors_calibration.yaml or sensor_kit_calibration.yaml."""
+    entries: dict[str, dict[str, dict[str, float]]] = {}
+    for pose in poses:
+        entry = dict(zip(POSE_NAMES, (*pose.xyz, *pose.rpy), strict=True))
+        entries.setdefault(pose.parent, {})[pose.child] = entry
+    return str(yaml.safe_dump(entries, sort_keys=False))
+
+
+KALIBR = {"plumb_bob": "radtan", "equidistant": "equidistant"}  # names of distortion models
+
+
+def kalibr_camchain(cameras: Mapping[str, tuple[Camera, Transform, str]]) -> str:
+    """Kalibr's camera chain, of cameras in this order: intrinsics, T_common_camera (4, 4) in one frame, and topic. BadInputError
+    for a lens that Kalibr has no model of."""
+    chain: dict[str, dict[str, object]] = {}
+    before: Transform | None = None
+    for k, (name, (camera, T, topic)) in enumerate(cameras.items()):
+        D = [] if camera.is_pinhole else camera.D.tolist()
+        if D and (camera.model not in KALIBR or (camera.model == "plumb_bob" and any(D[4:]))):
+            raise BadInputError(f"camera {name}: Kalibr has no {camera.model} lens of {len(D)} numbers; write another file")
+        K = camera.K
+        entry: dict[str, object] = {} if before is None else {"T_cn_cnm1": (se3.inverse(T) @ before).tolist()}
+        entry |= {
+            "camera_model": "pinhole",
+            "intrinsics": [float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            "distortion_model": KALIBR[camera.model] if D else "none",
+            "distortion_coeffs": D[:4],
+            "resolution": [camera.width, camera.height],
+            "rostopic": topic,
+        }
+        chain[f"cam{k}"], before = entry, T
+    return str(yaml.safe_dump(chain, sort_keys=False, default_flow_style=None))
 
 
 def kitti_odometry(result: Result, camera: Camera | None = None) -> str:
@@ -196,6 +225,28 @@ def write_back(path: str, result: Result, edges: Edges, joint: str) -> None:
         io.write_atomically(path, data)
 
 
+def write_joints(path: str, poses: Sequence[Pose], edges: Edges) -> None:
+    """Write to a robot's description: the origins of all joints between frames of `edges` change, and the former file is kept as
+    NAME.former; a missing file is made of joints of the poses. Raises BadInputError as `write_back`."""
+    try:
+        before = Path(path).read_bytes()
+    except FileNotFoundError:
+        joints = "".join(map(urdf_joint, poses))
+        io.write_atomically(path, f'<?xml version="1.0"?>\n<robot name="rig">\n{joints}</robot>\n'.encode())
+        return
+    except OSError as error:
+        raise BadInputError(f"cannot read {path}: {error.strerror}; name a file") from None
+    data = before
+    ours = [n for n, (joint, *more) in _joints(data, path).items() if not more and _links(joint) in edges]
+    if not ours:
+        raise BadInputError(f"{path} has no joint between frames of the rig; {_no_edge(edges)}")
+    for name in ours:
+        data = _with_origin(data, path, name, edges)
+    if data != before:
+        io.write_atomically(path + FORMER, before)
+        io.write_atomically(path, data)
+
+
 @dataclass
 class _Joint:
     """Of a robot's description. links: of parent and child. link_at, origins: where these elements begin, byte offsets."""
@@ -203,6 +254,11 @@ class _Joint:
     links: dict[str, str] = field(default_factory=dict)
     link_at: int = 0
     origins: list[int] = field(default_factory=list)
+
+
+def _links(joint: _Joint) -> tuple[str, str]:
+    """Names of parent and child."""
+    return joint.links.get("parent", ""), joint.links.get("child", "")
 
 
 def _joints(data: bytes, path: str) -> dict[str, list[_Joint]]:
@@ -244,7 +300,7 @@ def _with_origin(data: bytes, path: str, name: str, edges: Edges) -> bytes:
             f"{path} has {count} joints named '{name}'; set export.joint to one of: {there or 'none, it has no joint'}"
         )
     (joint,) = joints[name]
-    parent, child = (joint.links.get(end, "") for end in ("parent", "child"))
+    parent, child = _links(joint)
     if (parent, child) not in edges:
         raise BadInputError(f"{path}: joint '{name}' connects '{parent}' and '{child}'; {_no_edge(edges)}, and set export.joint")
     pose = Pose(parent, child, edges[parent, child])

@@ -4,7 +4,9 @@ The core imports none of them. What is not installed is missing as if it had nev
 
 ================================  ===========================================================================================
 ``calib_ros.commands``            a command of ``calib-ros``: a `Command`
-``calib_ros.sources``             a kind of dataset, opened as ``NAME`` or ``NAME:...``: a callable, text -> `Source`
+``calib_ros.sources``             a kind of dataset, opened as ``NAME`` or ``NAME:...``: a callable, text -> `Source`; with
+                                  the camera, name or number, as second argument where one is asked for
+``calib_ros.rigs``                one of several sensors, opened likewise: a callable, text -> `RecordedRig`, None = a pair
 ``calib_ros.objectives``          a score by the name of ``refine.objective``: an `ObjectiveKind` of registration/objective.py
 ``calib_ros.classes``             what recognises classes of points and pixels: a `ClassModels` of registration/classes.py
 ``calib_ros.stages``              a stage of the configuration: a frozen dataclass made with `calib_ros.config.options`
@@ -23,6 +25,7 @@ from importlib.util import find_spec
 from typing import Any, Protocol
 
 COMMANDS, SOURCES, NODE_SERVICES = "calib_ros.commands", "calib_ros.sources", "calib_ros.node_services"
+RIGS = "calib_ros.rigs"
 OBJECTIVES, CLASSES = "calib_ros.objectives", "calib_ros.classes"
 STAGES, PRESETS = "calib_ros.stages", "calib_ros.presets"
 
@@ -82,10 +85,10 @@ def commands() -> dict[str, Command]:
     return {name: load(COMMANDS, name) for name in names(COMMANDS)}
 
 
-def source_of(text: str) -> Callable[[str], Any] | None:
+def source_of(text: str, group: str = SOURCES) -> Callable[..., Any] | None:
     """What opens ``NAME`` or ``NAME:...``; None where no package brings such datasets."""
     name = text.partition(":")[0]
-    return load(SOURCES, name) if name in _entries(SOURCES) else None
+    return load(group, name) if name in _entries(group) else None
 
 
 def node_services(warn: Callable[[str], None]) -> dict[str, Callable[[Any, Any, Any], NodeService]]:

@@ -6,11 +6,11 @@ Everything follows from the parameters and the number of the frame, not from the
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from inspect import signature
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,20 +18,18 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
-from calib_ros.frame import NANOSECONDS, UNLABELLED, Frame
-from calib_ros.frame import SemanticClass as Label
-from calib_ros_synthetic.camera import Scene, render
+from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.ego import OwnLayer
 from calib_ros_synthetic.installation import Installation
-from calib_ros_synthetic.lidar import scan
-from calib_ros_synthetic.rays import CameraView, row_motion
+from calib_ros_synthetic.rays import CameraView
 from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, StampErrors, Timetable
 from calib_ros_synthetic.rigs import RIGS, Fields
 from calib_ros_synthetic.scanners import PERIOD, PLAIN, SpinningScanner, in_frame, plain_scanner
 from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Floats, Solids
 from calib_ros_synthetic.street import BLOCK, VIEW_AHEAD
+from calib_ros_synthetic.trip import Ids, Trip, labels_of, named
 
 START = 1_600_000_000 * NANOSECONDS  # stamp of the first frame; 0 would mean "no stamp" to many tools
 CACHED_FRAMES = 4
@@ -40,7 +38,8 @@ CAMERA_IN_LIDAR = (0.29, 0.05, -0.11)  # m; position of the lens
 FOCAL = 0.58  # focal length as a share of the image width, as KITTI's
 
 # Parameter -> type, lowest and highest value.
-LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
+Limits = Mapping[str, tuple[type[int] | type[float], float, float]]
+LIMITS: Limits = {
     "seed": (int, 0, 2**31 - 1),
     "frames": (int, 1, 100_000),
     "rings": (int, 0, 128),
@@ -53,7 +52,6 @@ LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
     "image_late_ms": (float, -500.0, 500.0),
     "jitter_ms": (float, 0.0, 100.0),
 }
-V = TypeVar("V")
 NAMED = ("rig", "scene", "condition", "fields", "ride", "stamp_at", "spin")  # parameters whose value is a name
 
 
@@ -65,8 +63,9 @@ class Labels:
     image: NDArray[np.uint8]
 
 
-def _checked(name: str, value: Any) -> Any:
-    kind, low, high = LIMITS[name]
+def checked(name: str, value: Any, limits: Limits = LIMITS) -> Any:
+    """A parameter as a number of its type. BadInputError for what is none, or out of range."""
+    kind, low, high = limits[name]
     allowed = "one of " + ", ".join(map(str, sorted(PLAIN))) if name == "rings" else f"from {low:g} to {high:g}"
     try:
         number = float(value)
@@ -77,6 +76,21 @@ def _checked(name: str, value: Any) -> Any:
         what = "a whole number" if kind is int else "a number"
         raise BadInputError(f"synthetic drive: {name}={value} is not allowed; it must be {what} {allowed}")
     return kind(number)
+
+
+def parsed(text: str, limits: Limits = LIMITS, names: Sequence[str] = NAMED) -> dict[str, Any]:
+    """The parameters in the text of a source. limits: of those that are numbers. names: of those whose value is a name."""
+    kind, _, rest = text.strip().partition(":")
+    if kind != "synthetic":
+        raise BadInputError(f"'{text}' is no synthetic drive; write 'synthetic' or 'synthetic:seed=3,frames=16'")
+    parameters: dict[str, Any] = {}
+    for item in filter(None, (part.strip() for part in rest.split(","))):
+        key, equals, value = (part.strip() for part in item.partition("="))
+        if (key not in limits and key not in names) or not equals:
+            known = ", ".join((*limits, *names))
+            raise BadInputError(f"synthetic drive: '{item}' is not understood; write key=value with {known}")
+        parameters[key] = value if key in names else checked(key, value, limits)
+    return parameters
 
 
 class SyntheticDrive:
@@ -134,8 +148,8 @@ class SyntheticDrive:
     ) -> None:
         values = locals()
         given = {name: values[name] for name in (*LIMITS, *NAMED)}
-        world = _named("scene", scene, SCENES)
-        model = None if rig is None else _named("rig", rig, RIGS)
+        world = named("scene", scene, SCENES)
+        model = None if rig is None else named("rig", rig, RIGS)
         cruise = world.cruise if model is None else min(world.cruise, model.top_speed)
         if model is not None and rings is not None:
             raise BadInputError(
@@ -144,9 +158,9 @@ class SyntheticDrive:
         self._defaults = {name: p.default for name, p in signature(SyntheticDrive).parameters.items() if name in given}
         self._defaults |= {"speed": cruise} | ({"rings": 64, "width": 1242, "height": 375} if model is None else {})
         p: dict[str, Any] = {name: self._defaults[name] if value is None else value for name, value in given.items()}
-        p |= {name: _checked(name, given[name]) for name in LIMITS if given[name] is not None}
+        p |= {name: checked(name, given[name]) for name in LIMITS if given[name] is not None}
         for name, known in (("ride", RIDES), ("stamp_at", STAMP_AT), ("spin", SPINS)):
-            _named(name, p[name], dict.fromkeys(known))
+            named(name, p[name], dict.fromkeys(known))
         self._parameters = p
         self.seed: int = p["seed"]
         self.rings: int | None = p["rings"]
@@ -155,8 +169,8 @@ class SyntheticDrive:
         self.noise: float = p["noise"]
         self._frames: int = p["frames"]
         usual = Fields.ALL if model is None else model.fields
-        self._fields = usual if fields is None else _named("fields", fields, {f.value: f for f in Fields})
-        self._condition = _named("condition", condition or ("clear" if model is None else model.condition), CONDITIONS)
+        self._fields = usual if fields is None else named("fields", fields, {f.value: f for f in Fields})
+        weather = named("condition", condition or ("clear" if model is None else model.condition), CONDITIONS)
         self._installed = None if model is None else Installation(model, self.seed, p["tilt_deg"], p["width"], p["height"])
         if self._installed is None:
             self.lidar_frame = "velodyne"
@@ -173,10 +187,11 @@ class SyntheticDrive:
         if empty is not None and not -np.inf < empty[0] < empty[1] < np.inf:
             raise BadInputError(f"synthetic drive: empty={empty} is not allowed; give the stations in m where it begins and ends")
         weaving = ride == WEAVING
-        self._timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
+        timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
         self._stamps = StampErrors(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
-        self._street = world(self.seed, self._station(self._frames), empty)
-        self._ride = Ride(self._street.path, self.seed, self._street.lane, weaving)
+        street = world(self.seed, timetable.station(self._seconds(self._frames)), empty)
+        way = Ride(street.path, self.seed, street.lane, weaving)
+        self._trip = Trip(street, way, timetable, weather, self.noise, self.speed > 0, spin)
         self._view: CameraView | None = None
         self._own: OwnLayer | None = None
         self._made: OrderedDict[int, tuple[Frame, Labels]] = OrderedDict()
@@ -185,17 +200,7 @@ class SyntheticDrive:
     def from_text(cls, text: str) -> SyntheticDrive:
         """`synthetic`, `synthetic:seed=3,frames=16,rings=32` or `synthetic:rig=os1_128_windshield,scene=park`: any parameters
         that are numbers or names."""
-        kind, _, rest = text.strip().partition(":")
-        if kind != "synthetic":
-            raise BadInputError(f"'{text}' is no synthetic drive; write 'synthetic' or 'synthetic:seed=3,frames=16'")
-        parameters: dict[str, Any] = {}
-        for item in filter(None, (part.strip() for part in rest.split(","))):
-            key, equals, value = (part.strip() for part in item.partition("="))
-            if (key not in LIMITS and key not in NAMED) or not equals:
-                known = ", ".join((*LIMITS, *NAMED))
-                raise BadInputError(f"synthetic drive: '{item}' is not understood; write key=value with {known}")
-            parameters[key] = value if key in NAMED else _checked(key, value)
-        return cls(**parameters)
+        return cls(**parsed(text))
 
     @property
     def name(self) -> str:
@@ -226,7 +231,7 @@ class SyntheticDrive:
 
     def emptied(self, start_s: float, end_s: float) -> SyntheticDrive:
         """The same drive, with only the road visible ahead from start_s to end_s after the first frame."""
-        station = self._timetable.station
+        station = self._trip.station
         empty = (station(start_s) - LONGEST, station(end_s) + VIEW_AHEAD + BLOCK)
         drive = SyntheticDrive(**self._parameters, camera=self.camera, empty=empty)
         drive.reference = self.reference
@@ -234,7 +239,7 @@ class SyntheticDrive:
 
     def pose(self, index: int) -> Floats:
         """T_world_lidar (4, 4) at the frame's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
-        ride = self._ride.pose(self._station(self._position(index)))
+        ride = self._trip.pose(self._seconds(self._position(index)))
         return ride if self._installed is None else self._installed.pose(ride, self._installed.T_base_frame)
 
     def twist(self, index: int) -> Floats:
@@ -242,7 +247,7 @@ class SyntheticDrive:
 
         It is constant during a scan: at `time` the scanner stands at pose(index) @ se3.exp(twist * time).
         """
-        ride = self._ride_twist(self._position(index))
+        ride = self._trip.twist(self._seconds(self._position(index)))
         return ride if self._installed is None else self._installed.twist(ride, self._installed.T_base_frame)
 
     def describe(self) -> dict[str, str]:
@@ -250,9 +255,10 @@ class SyntheticDrive:
         c, t = self.camera, self.reference[:3, 3]
         tilt = se3.rotation_error_deg(_nominal(), self.reference)
         rig, scene = self._parameters["rig"], self._parameters["scene"]
+        length = self._trip.station(self._seconds(len(self)))
         facts = {
             "source": f"{self.name}, a ray-cast {scene.replace('_', ' ')} with exact ground truth",
-            "frames": f"{len(self)}, every {self.stride * PERIOD:g} s, {self._station(len(self)) / len(self):.3g} m apart",
+            "frames": f"{len(self)}, every {self.stride * PERIOD:g} s, {length / len(self):.3g} m apart",
             "camera": f"{c.width}x{c.height}, fx {c.K[0, 0]:.1f} px, {c.model if len(c.D) else 'no distortion'}",
             "LiDAR": self._scanner.describe(),
             "motion": f"{self.speed:g} m/s, {self._parameters['ride']}" if self.speed else "stops for every frame",
@@ -261,12 +267,8 @@ class SyntheticDrive:
         }
         return facts if rig is None else facts | {"rig": f"{rig}: {RIGS[rig].why}"}
 
-    def _station(self, index: int) -> float:
-        return self._timetable.station(index * self.stride * PERIOD)
-
-    def _ride_twist(self, index: int) -> Floats:
-        speed = self._timetable.speed_at(index * self.stride * PERIOD) if self.speed else 0.0
-        return self._ride.twist(self._station(index), speed)
+    def _seconds(self, index: int) -> float:
+        return index * self.stride * PERIOD
 
     def _position(self, index: int) -> int:
         if not -self._frames <= index < self._frames:
@@ -286,19 +288,15 @@ class SyntheticDrive:
         if self._view is None:
             self._view = CameraView(self.camera) if self._installed is None else self._installed.view(self.camera)
         view = self._view
-        station, installed = self._station(index), self._installed
-        ride, ride_twist = self._ride.pose(station), self._ride_twist(index)
+        seconds, installed, trip = self._seconds(index), self._installed, self._trip
+        ride, ride_twist = trip.pose(seconds), trip.twist(seconds)
         T_world_lidar, twist, own = ride, ride_twist, None
         if installed is not None:
             mount, own = installed.T_base_lidar, installed.own_returns
             T_world_lidar, twist = installed.pose(ride, mount), installed.twist(ride_twist, mount)
-        solids = self._street.around(station)
-        # Everything is cast relative to the sensor: far from the world's origin float32 would be too coarse.
-        cloud, hit = scan(
-            self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),
-            T_world_lidar, twist, self.noise, np.random.default_rng([self.seed, 5, index]),
-            visibility=self._condition.visibility, own=own, reverse=self._parameters["spin"] != SPINS[0],
-        )  # fmt: skip
+        solids = trip.street.around(trip.station(seconds))
+        rng = np.random.default_rng([self.seed, 5, index])
+        cloud, hit = trip.scan(solids, self._scanner, index * self.stride, T_world_lidar, twist, own, rng)
         image, seen = self._picture(index, solids, T_camera_lidar, age_s, view)
         cloud_stamp = START + index * round(self.stride * PERIOD * NANOSECONDS)
         stamp = cloud_stamp
@@ -310,9 +308,7 @@ class SyntheticDrive:
         period = PERIOD if installed is None else 1 / installed.rig.rate
         cloud_stamp, cloud = self._stamps.cloud(cloud_stamp, cloud, period)
         stamp = self._stamps.image(stamp, index)
-        # Ids below 0 index this table from its end: own vehicle, curb, pavement and road, then the sky.
-        table = np.r_[solids.label, UNLABELLED, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
-        labels = Labels(table[hit], table[seen])
+        labels = Labels(labels_of(solids, hit), labels_of(solids, seen))
         frame = Frame(
             *(image, replace(cloud, label=labels.points), self.camera, stamp, cloud_stamp, T_camera_lidar, f"{index:06d}", twist),
             compensated=installed is not None and installed.rig.compensated,
@@ -322,11 +318,10 @@ class SyntheticDrive:
 
     def _picture(
         self, index: int, solids: Solids, T_camera_lidar: Floats, age_s: float, view: CameraView
-    ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    ) -> tuple[NDArray[np.uint8], Ids]:
         """The image of a frame and what each pixel sees; solids: in the world."""
         installed = self._installed
-        seconds = index * self.stride * PERIOD - (age_s if self.speed else 0.0)
-        T_world_frame = self._ride.pose(self._timetable.station(seconds))
+        T_world_frame = self._trip.pose(self._seconds(index) - (age_s if self.speed else 0.0))
         R_vehicle, own = None, None
         if installed is not None:
             R_vehicle = T_world_frame[:3, :3]
@@ -339,21 +334,9 @@ class SyntheticDrive:
             else:
                 own = installed.own_layer(view, T_camera_lidar)
         T_world_camera = T_world_frame @ se3.inverse(T_camera_lidar)
-        lens = T_world_camera[:3, 3]
         twist = in_frame(self.twist(index), se3.inverse(T_camera_lidar))
-        scene = Scene(
-            *(self._street, solids.moved(-lens), lens, T_world_camera[:3, :3]),
-            *(self._condition.lit(self._street.indoors), own, R_vehicle),
-            *(row_motion(T_world_camera, twist, self._condition.readout, self.camera.height), twist),
-        )
-        noise = self.noise * self._condition.noise
-        return render(scene, view, noise, np.random.default_rng([self.seed, 6, index]), self._condition)
-
-
-def _named(parameter: str, name: str, known: Mapping[str, V]) -> V:
-    if name not in known:
-        raise BadInputError(f"synthetic drive: {parameter}={name} is not known; choose one of {', '.join(known)}")
-    return known[name]
+        rng = np.random.default_rng([self.seed, 6, index])
+        return self._trip.picture(solids, view, T_world_camera, twist, own, R_vehicle, rng)
 
 
 def _nominal() -> Floats:

@@ -30,15 +30,19 @@ class Installation:
     """What follows from a rig, the seed and the size of the picture.
 
     camera, scanner. T_base_lidar, T_base_camera: poses (4, 4) on the vehicle. T_base_frame: of the frame that clouds are given
-    in. reference: T_camera_frame (4, 4). frame: name of that frame.
+    in. reference: T_camera_frame (4, 4). frame: name of that frame. displaced: (4, 4) that moves the sensors on the vehicle.
     """
 
-    def __init__(self, rig: Rig, seed: int, tilt_deg: float, width: int | None, height: int | None) -> None:
+    def __init__(
+        self, rig: Rig, seed: int, tilt_deg: float, width: int | None, height: int | None, displaced: Floats | None = None
+    ) -> None:
         self.rig = rig
         self.camera: Camera = rig.lens.camera(width, height)
         self.scanner = scanner(rig.scanner, rig.rate)
         self.T_base_lidar = rig.lidar.pose()
         self.T_base_camera = rig.T_base_camera(seed, tilt_deg)
+        if displaced is not None:
+            self.T_base_lidar, self.T_base_camera = displaced @ self.T_base_lidar, displaced @ self.T_base_camera
         self.T_base_frame: Floats = np.eye(4) if rig.base_frame else self.T_base_lidar
         self.reference = np.asarray(se3.inverse(self.T_base_camera) @ self.T_base_frame)
         self.frame = "base_link" if rig.base_frame else "lidar"

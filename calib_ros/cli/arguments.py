@@ -125,6 +125,23 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
     command.add_argument("--seed", type=int, help="seed of the search")
     command.add_argument("--threads", type=int, help="threads of the search (default 1); the result is the same")
 
+    command = add("rig", "estimate the extrinsics of several cameras and LiDARs together", source=False)
+    command.add_argument("source", help=SOURCE)
+    command.add_argument("--rig", required=True, metavar="YAML", help="its sensors and where they are believed to be")
+    command.add_argument("--frames", default="all", help="of every pair: all, 0,4,8 or 0:100:5")
+    command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
+    command.add_argument("--json", metavar="FILE", help="write the result as JSON; - = standard output")
+    command.add_argument("--report", metavar="HTML", help="write a page")
+    command.add_argument("--before", metavar="JSON", help="a former result of this rig: say which sensor has moved since")
+    command.add_argument(
+        "--out",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="write for other tools: .urdf or .xacro (joints change in place), .yaml (Autoware), camchain*.yaml (Kalibr)",
+    )
+    command.add_argument("--seed", type=int, help="seed of the search")
+
     command = add("convert", "write a source as a ROS 2 bag")
     command.add_argument("bag", help="folder to create")
     command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5")

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TextIO
 
 from calib_ros.cli.arguments import BAD_INPUT, parser
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.extensions import commands
 
 OK, NOT_CONVERGED = 0, 1
@@ -109,12 +109,29 @@ def _calibrate(args: argparse.Namespace) -> int:
     return OK if result.converged else NOT_CONVERGED
 
 
+def _rig(args: argparse.Namespace) -> int:
+    from calib_ros.cli.rig import run
+
+    return OK if run(args) else NOT_CONVERGED
+
+
 def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import open_named_source
     from calib_ros.cli.output import progress_bar
     from calib_ros.datasets.bag_writer import write_bag
     from calib_ros.datasets.positions import frame_positions
+    from calib_ros.datasets.rig import named_rig
 
+    rig = named_rig(args.source) if args.camera is None else None
+    if rig is not None:
+        from calib_ros.datasets.bag_rig import write_rig_bag
+
+        if args.frames != "all":
+            raise BadInputError(f"--frames {args.frames} does not go with a rig, which is written as a whole; make it shorter")
+        with progress_bar("writing") as step:
+            path, described = write_rig_bag(rig, args.bag, args.storage, step)
+        print(f"{len(rig.cameras)} cameras and {len(rig.lidars)} LiDARs written to {path}, described by {described}")
+        return OK
     source = open_named_source(args)
     positions = frame_positions(args.frames, len(source))
     with progress_bar("writing") as step:
@@ -179,7 +196,15 @@ def _play(args: argparse.Namespace) -> int:
     return OK
 
 
-_RUN = {"info": _info, "calibrate": _calibrate, "convert": _convert, "replay": _replay, "export": _export, "play": _play}
+_RUN = {
+    "info": _info,
+    "calibrate": _calibrate,
+    "rig": _rig,
+    "convert": _convert,
+    "replay": _replay,
+    "export": _export,
+    "play": _play,
+}
 
 
 if __name__ == "__main__":

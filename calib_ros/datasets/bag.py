@@ -36,6 +36,7 @@ from calib_ros.datasets.bag_index import (
 )
 from calib_ros.datasets.bag_video import KEY_FRAMES, BagVideo
 from calib_ros.datasets.positions import spread_positions
+from calib_ros.datasets.recent import Recent
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -101,6 +102,7 @@ class BagSource:
         self.points_topic = choose_points(self._bag, points_topic)
         self.camera_info_topic = choose_camera_info(self._bag, camera_info_topic, self.image_topic)
         self.rectified = is_rectified(self.image_topic) if rectified is None else rectified
+        self.recent = Recent(0)  # clouds that are kept
         self._tolerance_s, self._motion, self._view = tolerance_s, motion or MotionConfig(), T_camera_lidar
         is_video = self._bag.topics[self.image_topic].type in VIDEO
         self._video = BagVideo(self._bag, self.image_topic) if is_video else None
@@ -241,11 +243,9 @@ class BagSource:
         return decode_compressed_image(message) if compressed else decode_image(message)
 
     def _cloud(self, position: int) -> PointCloud:
-        message = self._fetch(self._index.cloud, position)
-        if isinstance(message, PointCloud):
-            return message
-        compressed = self._bag.topics[self.points_topic].type == COMPRESSED_POINTS
-        return decode_compressed_cloud(message) if compressed else decode_cloud(message)
+        index = self._index.cloud
+        key = (index.topic, int(index.recorded[position]), int(index.headers[position]))
+        return self.recent(key, lambda: cloud_of(self._fetch(index, position), self._bag.topics[index.topic].type))
 
     def _fetch(self, index: TopicIndex, position: int) -> Any:
         recorded = int(index.recorded[position])
@@ -286,6 +286,13 @@ class BagSource:
             return "of the recording" + ("" if self._clock == RECORDING else " (headers have none)")
         ahead = self._index.clock_difference / NANOSECONDS
         return "of the headers" + (f", of clouds {-ahead:+.2f} s" if ahead else "")
+
+
+def cloud_of(message: Any, kind: str) -> PointCloud:
+    """The cloud in a decoded message of a type that `choose_points` finds."""
+    if isinstance(message, PointCloud):
+        return message
+    return decode_compressed_cloud(message) if kind == COMPRESSED_POINTS else decode_cloud(message)
 
 
 class Slots:

@@ -195,8 +195,9 @@ class StaticTransforms:
         return found
 
 
-def choose_image(bag: BagFile, requested: str | None) -> str:
-    """The image topic: the requested one, or the only one. A raw image wins over its compressed transport."""
+def choose_image(bag: BagFile, requested: str | None, option: str = "image_topic") -> str:
+    """The image topic: the requested one, or the only one. A raw image wins over its compressed transport. option: what to set,
+    if it is not there."""
     candidates = _with_type(bag, IMAGE, COMPRESSED)
     if requested is None:
         candidates = [name for name in candidates if not name.endswith(DEPTH)]
@@ -204,24 +205,25 @@ def choose_image(bag: BagFile, requested: str | None) -> str:
         candidates = [name for name in candidates if name not in transports]
     if requested is not None or not candidates:
         candidates += _with_type(bag, *VIDEO)
-    return _choose(bag, requested, candidates, "Image, CompressedImage or video", "image_topic")
+    return _choose(bag, requested, candidates, "Image, CompressedImage or video", option)
 
 
-def choose_points(bag: BagFile, requested: str | None) -> str:
-    """The cloud topic: the requested one, or the only one."""
+def choose_points(bag: BagFile, requested: str | None, option: str = "points_topic") -> str:
+    """The cloud topic: the requested one, or the only one. option: what to set, if it is not there."""
     candidates = _with_type(bag, POINTS)
     if requested is not None or not candidates:
         candidates += _with_type(bag, *LIVOX, COMPRESSED_POINTS)
-    return _choose(bag, requested, candidates, "PointCloud2", "points_topic")
+    return _choose(bag, requested, candidates, "PointCloud2", option)
 
 
-def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str) -> str:
-    """The requested CameraInfo topic, or the one beside the image (image_transport's rule), or the only one."""
+def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str, option: str = "camera_info_topic") -> str:
+    """The requested CameraInfo topic, or the one beside the image (image_transport's rule), or the only one. option: what to set,
+    if it is not there."""
     candidates = _with_type(bag, CAMERA_INFO)
     beside = re.sub(r"/(compressed|ffmpeg|foxglove)$", "", image_topic).rpartition("/")[0] + "/camera_info"
     if requested is None and beside in candidates:
         return beside
-    return _choose(bag, requested, candidates, "CameraInfo", "camera_info_topic")
+    return _choose(bag, requested, candidates, "CameraInfo", option)
 
 
 def is_rectified(image_topic: str) -> bool:
@@ -247,7 +249,7 @@ def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: st
     names = dict.fromkeys(topic.type.rpartition("/")[2] for topic in bag.topics.values() if topic.messages)
     depth = [f"{shown(topic)} is a depth image, no camera picture" for topic in bag.topics if topic.endswith(DEPTH)]
     known = [f"{name}: {REMEDIES[name]}" for name in names if name in REMEDIES]
-    advice = "; ".join([*(depth if option == "image_topic" else []), *known]) or "record that topic too"
+    advice = "; ".join([*(depth if kind.startswith("Image") else []), *known]) or "record that topic too"
     raise BadInputError(f"bag {bag.path} has no {kind} messages, only {others}; {advice}")
 
 

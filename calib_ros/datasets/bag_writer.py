@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -56,20 +56,25 @@ def write_bag(
 
     Raises BadInputError if the path exists or cannot be written; then, as after an interruption, nothing is left behind.
     """
-    path, positions = Path(path), range(len(source)) if positions is None else positions
+    positions = range(len(source)) if positions is None else positions
+    if not len(positions):
+        raise BadInputError(f"{source.name} has no frames to write; give a source with frames")
+    return write_messages(_in_stamp_order(_messages(source, positions, progress)), Path(path), storage)
+
+
+def write_messages(messages: Iterable[Message], path: Path, storage: str) -> Path:
+    """Write messages, in the order of their stamps, into a new bag folder and return its path, as `write_bag`."""
     if storage not in STORAGE:
         raise BadInputError(f"storage '{storage}' is unknown; use one of {', '.join(STORAGE)}")
     if path.exists() or path.is_symlink():
         raise BadInputError(f"{path} exists already and is not overwritten; remove it or give another path")
-    if not len(positions):
-        raise BadInputError(f"{source.name} has no frames to write; give a source with frames")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # An interrupted conversion leaves no partial bag: the folder gets its name when it is complete.
         with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
             partial = Path(scratch) / path.name
             with Writer(partial, version=BAG_VERSION, storage_plugin=STORAGE[storage]) as writer:
-                _write(writer, _in_stamp_order(_messages(source, positions, progress)))
+                _write(writer, messages)
             partial.rename(path)
     except OSError as error:
         raise BadInputError(
@@ -146,15 +151,20 @@ class MessageBuilder:
 
     def static_transform(self, stamp: int, T_camera_lidar: NDArray[np.float64]) -> Any:
         """TFMessage with the camera frame as parent of the LiDAR frame; TF maps points of the child into the parent."""
-        x, y, z = (float(v) for v in T_camera_lidar[:3, 3])
-        quaternion = (float(v) for v in se3.quaternion_from_rotation(T_camera_lidar[:3, :3]))
-        transform = self._types["geometry_msgs/msg/Transform"](
-            self._types["geometry_msgs/msg/Vector3"](x, y, z), self._types["geometry_msgs/msg/Quaternion"](*quaternion)
-        )
-        stamped = self._types["geometry_msgs/msg/TransformStamped"](
-            self._header(stamp, self._camera_frame), self._lidar_frame, transform
-        )
-        return self._types["tf2_msgs/msg/TFMessage"]([stamped])
+        return self.static_transforms(stamp, {self._lidar_frame: T_camera_lidar})
+
+    def static_transforms(self, stamp: int, children: Mapping[str, NDArray[np.float64]]) -> Any:
+        """TFMessage with the camera frame as parent of other frames: their poses (4, 4) in it, by name."""
+        stamped = []
+        for child, T in children.items():
+            x, y, z = (float(v) for v in T[:3, 3])
+            quaternion = (float(v) for v in se3.quaternion_from_rotation(T[:3, :3]))
+            transform = self._types["geometry_msgs/msg/Transform"](
+                self._types["geometry_msgs/msg/Vector3"](x, y, z), self._types["geometry_msgs/msg/Quaternion"](*quaternion)
+            )
+            header = self._header(stamp, self._camera_frame)
+            stamped.append(self._types["geometry_msgs/msg/TransformStamped"](header, child, transform))
+        return self._types["tf2_msgs/msg/TFMessage"](stamped)
 
     def _header(self, stamp: int, frame: str) -> Any:
         time = self._types["builtin_interfaces/msg/Time"](stamp // NANOSECONDS, stamp % NANOSECONDS)

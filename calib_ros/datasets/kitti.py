@@ -23,9 +23,10 @@ from calib_ros.datasets.kitti_files import (
     read_picture,
     read_scan,
 )  # fmt: skip
+from calib_ros.datasets.recent import Recent, Timed
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 
 # As kitti2bag names them.
 CAMERA_FRAMES = ("camera_gray_left", "camera_gray_right", "camera_color_left", "camera_color_right")
@@ -62,6 +63,7 @@ class KittiSource:
         self.name = root.resolve().name
         self.camera_frame = f"image_0{camera}" if of_360 else CAMERA_FRAMES[camera]
         self.lidar_frame = LIDAR_FRAME
+        self.recent = Recent(0)  # scans that are kept
         self._camera_number = camera
         self._images = numbered_files(self._layout.images[camera], IMAGE_SUFFIXES)
         self._scans = numbered_files(self._layout.scans, (".bin",))
@@ -86,12 +88,10 @@ class KittiSource:
         P, T_camera_lidar = self._layout.calibrate(number)
         stamp, cloud_stamp = self._layout.stamps(number)
         height, width = image.shape[:2]
-        cloud, motion = read_scan(self._scans[number]), self._layout.motion
-        if motion is not None:
-            cloud = replace(cloud, time=motion.times(cloud, number))
+        motion = self._layout.motion
         return Frame(
             image=image,
-            cloud=cloud,
+            cloud=self._cloud(number),
             camera=Camera(P[:, :3], width, height),
             stamp=stamp,
             cloud_stamp=cloud_stamp,
@@ -100,6 +100,17 @@ class KittiSource:
             twist=None if motion is None else motion.twist(number),
             compensated=self._layout.compensated,
         )
+
+    def scans(self) -> Timed:
+        """The scans of all frames with their stamps, ns."""
+        stamps = [self._layout.stamps(number) for number in self.numbers]
+        moments = np.array([image if scan is None else scan for image, scan in stamps], np.int64)
+        return Timed(moments, lambda index: self._cloud(self.numbers[index]))
+
+    def _cloud(self, number: int) -> PointCloud:
+        path, motion = self._scans[number], self._layout.motion
+        cloud = self.recent(path, lambda: read_scan(path))
+        return cloud if motion is None else replace(cloud, time=motion.times(cloud, number))
 
     def describe(self) -> dict[str, str]:
         """What the folder holds: label -> text."""

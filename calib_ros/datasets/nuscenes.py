@@ -15,6 +15,7 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.kitti_files import read_picture, read_points
+from calib_ros.datasets.recent import Recent, Timed
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -52,6 +53,7 @@ class NuScenesSource:
         self._tables = SceneTables(folder, scene)
         self.name = self._tables.scene
         self.lidar_frame = self._tables.lidar
+        self.recent = Recent(0)  # scans that are kept
         self.camera_frame = self._tables.choose_camera(camera)
         found = self._tables.pairs(self.camera_frame)
         self._pairs = [pair for pair in found if all((folder.parent / record.filename).is_file() for record in pair)]
@@ -71,7 +73,7 @@ class NuScenesSource:
         camera, reference = self._calibration(picture, scan)
         return Frame(
             image=read_picture(self.path.parent / picture.filename),
-            cloud=read_sweep(self.path.parent / scan.filename),
+            cloud=self._cloud(scan),
             camera=camera,
             stamp=picture.stamp,
             cloud_stamp=scan.stamp,
@@ -80,6 +82,15 @@ class NuScenesSource:
             twist=self._tables.twist(scan),
             compensated=True,
         )
+
+    def scans(self) -> Timed:
+        """All scans of the scene that are there, also between the key frames, with their stamps, ns."""
+        found = [scan for scan in self._tables.of(self.lidar_frame) if (self.path.parent / scan.filename).is_file()]
+        return Timed(np.array([scan.stamp for scan in found], np.int64), lambda index: self._cloud(found[index]))
+
+    def _cloud(self, scan: Record) -> PointCloud:
+        path = self.path.parent / scan.filename
+        return self.recent(path, lambda: read_sweep(path))
 
     def _calibration(self, picture: Record, scan: Record) -> tuple[Camera, Matrix]:
         camera = Camera(picture.sensor.K, *picture.size)
@@ -179,8 +190,8 @@ class SceneTables:
 
     def pairs(self, channel: str) -> list[tuple[Record, Record]]:
         """Image of a camera and scan of each key frame, in time."""
-        scans = {scan.sample: scan for scan in self._of(self.lidar) if scan.key}
-        return [(image, scans[image.sample]) for image in self._of(channel) if image.key and image.sample in scans]
+        scans = {scan.sample: scan for scan in self.of(self.lidar) if scan.key}
+        return [(image, scans[image.sample]) for image in self.of(channel) if image.key and image.sample in scans]
 
     def twist(self, scan: Record) -> Matrix | None:
         """(rx, ry, rz, tx, ty, tz) of the LiDAR at a scan's stamp, rad/s and m/s, in its own frame; None without neighbours."""
@@ -195,7 +206,7 @@ class SceneTables:
     @cached_property
     def _lidar_poses(self) -> tuple[NDArray[np.int64], list[Matrix]]:
         """Stamps (n,) in ns, and T_global_lidar, of all scans of the scene."""
-        scans = self._of(self.lidar)
+        scans = self.of(self.lidar)
         wanted = {scan.pose for scan in scans}
         rows = self._rows("ego_pose", ("token", "translation", "rotation"), lambda row: row.get("token") in wanted)
         poses = {row["token"]: self._typed(row, _pose) for row in rows}
@@ -206,7 +217,8 @@ class SceneTables:
             )
         return np.array([scan.stamp for scan in scans], np.int64), [poses[scan.pose] @ scan.sensor.T_ego_sensor for scan in scans]
 
-    def _of(self, channel: str) -> list[Record]:
+    def of(self, channel: str) -> list[Record]:
+        """What a sensor measured, in time."""
         return [record for record in self._records if record.sensor.channel == channel]
 
     def _rows(self, table: str, fields: tuple[str, ...], keep: Callable[[Row], bool] = lambda _: True) -> list[Row]:

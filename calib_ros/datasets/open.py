@@ -31,7 +31,7 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         default the first scene; see `NuScenesSource`). Or ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as
         ``"synthetic[:name=value,...]"``, the simulated drive.
     camera : of a KITTI folder, 0 to 3 (default 2; of KITTI-360 0 or 1), of nuScenes, its channel or number (default CAM_FRONT),
-        of ONCE or a plain folder, a name or number in its calibration (default the first).
+        of ONCE, a plain folder or a synthetic rig of several, a name or number in its calibration (default the first).
     **options : of a bag or capture, see `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, rectified,
         motion, T_camera_lidar, windows; None = default.
 
@@ -45,7 +45,7 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     opened_by_name = None if path.exists() else source_of(text)
     if opened_by_name is not None:
         _refuse(options, text)
-        named: Source = opened_by_name(text)
+        named: Source = opened_by_name(text) if camera is None else opened_by_name(text, camera)
         return named
     if is_nuscenes(path):
         _refuse(options, text)

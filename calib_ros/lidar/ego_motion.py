@@ -58,7 +58,7 @@ def estimate_motion(
     known; zero is tried too if that fails. Raises MissingDependencyError without small_gicp."""
     if not MIN_GAP_S <= gap_s <= MAX_GAP_S:
         return Motion(None, f"the scans are {gap_s:.3g} s apart, outside {MIN_GAP_S:g} to {MAX_GAP_S:g} s")
-    scans = _downsampled(before, config), _downsampled(cloud, config)
+    scans = thinned(before, config), thinned(cloud, config)
     for points, time in scans:
         if len(points) < MIN_POINTS:
             return Motion(None, f"a scan has {len(points)} points to align, {MIN_POINTS} are needed")
@@ -76,15 +76,15 @@ def estimate_motion(
 Scan = tuple[Floats, Floats]  # points (n, 3) m as measured, times (n,) s after the stamp
 
 
-def _downsampled(cloud: PointCloud, config: MotionConfig) -> Scan:
-    """The first point of every voxel, of up to MAX_POINTS, with its time."""
+def thinned(cloud: PointCloud, config: MotionConfig, voxel_m: float = VOXEL_M) -> Scan:
+    """The first point of every voxel, of up to MAX_POINTS: (n, 3) m as measured, with times (n,) s after the stamp."""
     # An odd step, so that all rings remain in a scan stored firing by firing.
     step = -(-len(cloud) // MAX_POINTS)
     part = cloud.select(np.arange(0, len(cloud), max(step + (step % 2 == 0), 1)))
     points = part.xyz.astype(np.float64)
     square = (points * points).sum(axis=1)
     keep = np.flatnonzero((square > MIN_RANGE**2) & (square < MAX_RANGE**2))  # NaN is neither
-    cell = np.floor(points[keep] / VOXEL_M).astype(np.int64) + (1 << 20)
+    cell = np.floor(points[keep] / voxel_m).astype(np.int64) + (1 << 20)
     _, first = np.unique((cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2], return_index=True)
     keep = keep[first]
     timed = has_times(cloud) and part.time is not None
@@ -93,25 +93,32 @@ def _downsampled(cloud: PointCloud, config: MotionConfig) -> Scan:
 
 
 def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats) -> Motion:
-    gicp = _library()
     twist = start
     T = se3.exp(twist * gap_s)
     for reach in MATCH_DISTANCES:
-        target, source = (gicp.PointCloud(moved(points, twist, time)) for points, time in (before, scan))
-        tree, own_tree = gicp.KdTree(target, 1), gicp.KdTree(source, 1)
-        gicp.estimate_covariances(target, tree, NEIGHBOURS, 1)
-        gicp.estimate_covariances(source, own_tree, NEIGHBOURS, 1)
-        # One thread: sums in another order would make results differ from run to run.
-        found = gicp.align(
-            target, source, tree, init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach,
-            num_threads=1, max_iterations=30, rotation_epsilon=MIN_STEP, translation_epsilon=MIN_STEP,
-        )  # fmt: skip
+        target, source = (moved(points, twist, time) for points, time in (before, scan))
+        found = align(target, source, T, reach)
         T = np.asarray(found.T_target_source, float)
         if not np.isfinite(T).all():
             return Motion(None, "the alignment of the scans diverged")
         # T_before_now of a LiDAR with a constant twist is exp(twist gap).
         twist = se3.log(T) / gap_s
     return _validated(twist, found, len(scan[0]))
+
+
+def align(target: Floats, source: Floats, T: Floats, reach_m: float) -> Any:
+    """small_gicp's result of GICP from T_target_source (4, 4): points (n, 3) m, matched up to reach_m apart. Its H is of a right
+    twist. Raises MissingDependencyError without the library."""
+    gicp = _library()
+    clouds = [gicp.PointCloud(points) for points in (target, source)]
+    trees = [gicp.KdTree(cloud, 1) for cloud in clouds]
+    for cloud, tree in zip(clouds, trees, strict=True):
+        gicp.estimate_covariances(cloud, tree, NEIGHBOURS, 1)
+    # One thread: sums in another order would make results differ from run to run.
+    return gicp.align(
+        *clouds, trees[0], init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach_m,
+        num_threads=1, max_iterations=30, rotation_epsilon=MIN_STEP, translation_epsilon=MIN_STEP,
+    )  # fmt: skip
 
 
 def _validated(twist: Floats, found: Any, n: int) -> Motion:

@@ -30,7 +30,7 @@ from calib_ros.registration.camera_rounds import refined_with_camera
 from calib_ros.registration.classes import ALL, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.estimate import Estimate, insufficient, observable_pose, refine_start, reject_outlier_frames
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective, views_of
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, other_objective, views_of
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import JointSearch
@@ -57,6 +57,8 @@ class Calibrator:
         Watches the optimisation of every estimate and does not change it.
     given : Camera, optional
         The intrinsics that were stated, where `camera` corrects them: what they leave open is then told by the joint estimate.
+    scans : ScanEdges, optional
+        Edges of scans by their stamps, shared with the calibrators of other cameras beside the same LiDAR.
     """
 
     def __init__(
@@ -66,10 +68,11 @@ class Calibrator:
         segmentation: Segmentation | None = None,
         observer: Observer | None = None,
         given: Camera | None = None,
+        scans: ScanEdges | None = None,
     ) -> None:
         self.config = config or Config()
         self._given = given
-        self.extract = FeatureExtractor(camera, self.config)
+        self.extract = FeatureExtractor(camera, self.config, scans)
         self.segmentation = segmentation or models_of(self.config.semantics)
         self.objectives = ObjectiveMaker(self.config, camera, observer)
 
@@ -138,7 +141,9 @@ class Calibrator:
         return replace(result, origin=first.origin, elapsed_s=first.elapsed_s + time.perf_counter() - started)
 
     def _with_camera(self, camera: Camera) -> Calibrator:
-        return Calibrator(camera, self.config, self.segmentation, self.objectives.observer, self.extract.source_camera)
+        return Calibrator(
+            camera, self.config, self.segmentation, self.objectives.observer, self.extract.source_camera, self.extract.scans
+        )
 
     def _calibrated(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -67,11 +67,17 @@ class FrameFeatures:
         return self if self.own is None else replace(self, own=None)
 
 
-class FeatureExtractor:
-    """Turns frames of one camera into features; look-up tables for the lens are made once."""
+# What does not depend on a camera: whether a scan has reflectivities, and its edges as measured, by its stamp.
+ScanEdges = MutableMapping[int, tuple[bool, EdgePoints]]
 
-    def __init__(self, camera: Camera, config: Config | None = None) -> None:
+
+class FeatureExtractor:
+    """Turns frames of one camera into features; look-up tables for the lens are made once. scans: shared with the extractors of
+    other cameras beside the same LiDAR, whose scans are then searched once."""
+
+    def __init__(self, camera: Camera, config: Config | None = None, scans: ScanEdges | None = None) -> None:
         self.config = config or Config()
+        self.scans = scans
         self.source_camera = camera
         self._other = other_objective(self.config)
         self._rectify = Rectifier(camera, rectified_camera(camera, self.config))
@@ -117,25 +123,37 @@ class FeatureExtractor:
 
     def _of_edges(self, frame: Frame, image: NDArray[np.uint8], plain: FrameFeatures | None) -> FrameFeatures:
         """Edges of scan and image. plain: whose edge maps are taken over."""
-        scan = range_image(frame.cloud, self.config.lidar)
-        twist, still = used_twist(frame, self.config.motion), frame
-        if scan.layout == "projection" and twist is not None:
-            # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
-            still = deskewed_frame(frame, self.config.motion)
-            scan = range_image(still.cloud, self.config.lidar)
+        twist = used_twist(frame, self.config.motion)
+        still, reflectivity, edges = self._scan_edges(frame, twist)
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
-        points = deskewed_edges(edge_points(scan, self.config.lidar), still, self.config.motion)
+        points = deskewed_edges(edges, still, self.config.motion)
         if plain is not None:
             levels = plain.levels
         else:
             levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, used=self.used, across=self.across)
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
-        facts = (self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist, by_azimuth)
+        facts = (self.camera, frame.stamp, frame.name, reflectivity, twist, by_azimuth)
         features = FrameFeatures(points, levels, *facts)
         if twist is None and not frame.compensated and self.config.motion.deskew != "off":
             sweep_s = self.config.motion.scan_period_s * self.source_camera.field_deg / 720
             features = replace(features, unknown_motion_s=sweep_s)
         return features
+
+    def _scan_edges(self, frame: Frame, twist: NDArray[np.float64] | None) -> tuple[Frame, bool, EdgePoints]:
+        """A frame as its scan was searched, whether that has reflectivities, and its edges."""
+        stamp = frame.cloud_stamp if self.scans is not None and frame.cloud.label is None else None
+        known = self.scans.get(stamp) if self.scans is not None and stamp is not None else None
+        if known is not None:
+            return frame, *known
+        scan, still = range_image(frame.cloud, self.config.lidar), frame
+        if scan.layout == "projection" and twist is not None:
+            # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
+            still = deskewed_frame(frame, self.config.motion)
+            scan = range_image(still.cloud, self.config.lidar)
+        found = scan.reflectivity is not None, edge_points(scan, self.config.lidar)
+        if self.scans is not None and stamp is not None and still is frame:
+            self.scans[stamp] = found
+        return still, *found
 
     def seen_anew(self, features: FrameFeatures, image: NDArray[np.uint8]) -> FrameFeatures:
         """Features of the same scan, had this camera taken the image; without semantics."""

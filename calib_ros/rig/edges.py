@@ -1,0 +1,219 @@
+"""From the recording of a rig to the edges of its graph: every pair of sensors that shares a view is registered, the others are
+joined by how they move. Scans are read, searched for edges and aligned once, whatever the number of cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.camera import Camera
+from calib_ros.config import Config, update
+from calib_ros.datasets.positions import frame_positions
+from calib_ros.datasets.rig_source import RigSource
+from calib_ros.datasets.source import neighbours
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.frame import Frame
+from calib_ros.lidar.ego_motion import needs_ego_motion
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import FeatureExtractor, ScanEdges
+from calib_ros.registration.motion_guess.guess import motion_guess
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.result import Result
+from calib_ros.rig.description import CAMERA, RigDescription, prior_covariance
+from calib_ros.rig.graph import Edge, RigSolution, solve
+from calib_ros.rig.lidars import SHARED, UNKNOWN_M, LidarScans, motion_edge, scan_edge, shared_view
+
+# Half width of a search: two standard deviations of what the priors say, but no less than the odd centimetre of a mount.
+SIGMAS, LEAST_DEG, LEAST_M = 2.0, 0.5, 0.05
+GRID, SEEN = (16, 9), 0.1  # cells of a picture, and the share of them with points which is a shared view
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What became of a pair of sensors. edge: None where it failed. reason: why it did, or what else there is to know. result: of
+    the registration of a camera and a LiDAR."""
+
+    target: str
+    source: str
+    kind: str
+    edge: Edge | None
+    reason: str = ""
+    result: Result | None = None
+
+
+def priors_of(description: RigDescription, rig: RigSource) -> dict[str, tuple[Transform, Covariance]]:
+    """T_reference_sensor and its covariance of every sensor but the reference, by the description or the recording. BadInputError
+    names a sensor of which neither says anything."""
+    found = {}
+    for sensor in description.sensors:
+        if sensor.name == description.reference:
+            continue
+        T = sensor.prior if sensor.prior is not None else rig.reference(sensor.name)
+        if T is None:
+            raise BadInputError(
+                f"{rig.name} does not state where {sensor.name} is; set sensors.{sensor.name}.prior to translation_m and "
+                "quaternion_xyzw, or a result file"
+            )
+        found[sensor.name] = T, prior_covariance(T, sensor.sigma_deg, sensor.sigma_m)
+    return found
+
+
+class RigMeasurer:
+    """Measures the edges of a rig. config: of all its cameras. frames: which of every pair, as --frames. progress: gets what is
+    done and the share of it."""
+
+    def __init__(
+        self, rig: RigSource, description: RigDescription, config: Config, frames: str = "all", progress: Progress | None = None
+    ) -> None:
+        self.rig, self.description, self.config, self.frames = rig, description, config, frames
+        self.priors = priors_of(description, rig)
+        self.progress = progress or (lambda text, share: None)
+        self.scans = {name: LidarScans(rig.scans(name), config.motion, self._window(name)) for name in description.lidars}
+        self._shared: dict[str, ScanEdges] = {name: {} for name in description.lidars}
+
+    def _window(self, lidar: str) -> tuple[int, int] | None:
+        """From and to which scan the chosen frames last; None = all."""
+        if self.frames == "all" or not self.description.cameras:
+            return None
+        source = self.rig.pair(self.description.cameras[0], lidar)
+        positions = frame_positions(self.frames, len(source))
+        first, last = (source[k].moment_of_cloud for k in (min(positions), max(positions)))
+        return first, last
+
+    def measure(self) -> list[Measurement]:
+        """All edges: LiDARs first, whose places narrow the search for cameras. Deterministic. Raises what reading raises."""
+        out = self.between_lidars()
+        known = self.solution(out)
+        pairs = self.camera_pairs(known)
+        for k, (camera, lidar) in enumerate(pairs):
+            self.progress(f"{camera} with {lidar}", k / len(pairs))
+            out.append(self.camera_edge(camera, lidar, known))
+        joined = {m.target for m in out if m.edge is not None}
+        for camera in (name for name in self.description.cameras if name not in joined):
+            out += self.by_motion(camera, known)
+        return out
+
+    def solution(self, measured: Sequence[Measurement]) -> RigSolution:
+        """The graph's estimate from what was measured."""
+        return solve([m.edge for m in measured if m.edge is not None], self.priors, self.description.reference)
+
+    def between_lidars(self) -> list[Measurement]:
+        """Edges of all pairs of LiDARs."""
+        given, prior = self.description.pairs, self.solution([])
+        pairs = list(combinations(self.description.lidars, 2))
+        if given is not None:
+            pairs = [(a, b) for a, b in given if self.description[a].kind != CAMERA]
+        out = []
+        for k, (a, b) in enumerate(pairs):
+            self.progress(f"{a} with {b}", k / len(pairs))
+            T, _ = prior.between(a, b)
+            ends = (a, self.scans[a]), (b, self.scans[b])
+            out.append(self._tried(a, b, "scans", scan_edge, *ends, T) if self._share(a, b, T) else _apart(a, b))
+            if out[-1].edge is None:
+                out.append(self._tried(a, b, "motion", motion_edge, *ends, T))
+        return out
+
+    def _share(self, a: str, b: str, T: Transform) -> bool:
+        return shared_view(self.scans[a], self.scans[b], T) >= SHARED
+
+    def _tried(self, target: str, source: str, kind: str, make: Callable[..., Edge], *given: Any) -> Measurement:
+        try:
+            return Measurement(target, source, kind, make(*given))
+        except CalibrationError as error:
+            return Measurement(target, source, kind, None, str(error))
+
+    def camera_pairs(self, known: RigSolution) -> list[tuple[str, str]]:
+        """The pairs of a camera and a LiDAR to register: as described, else all that share a view."""
+        if self.description.pairs is not None:
+            return [(a, b) for a, b in self.description.pairs if self.description[a].kind == CAMERA]
+        return [(c, lid) for lid in self.description.lidars for c in self.description.cameras if self._sees(c, lid, known)]
+
+    def _sees(self, camera: str, lidar: str, known: RigSolution) -> bool:
+        scans = self.scans[lidar]
+        if not len(scans.used):
+            return False
+        points, _ = scans.still(int(scans.used[len(scans.used) // 2]))
+        return seen_share(self.rig.camera(camera), known.between(camera, lidar)[0], points) >= SEEN
+
+    def camera_edge(self, camera: str, lidar: str, known: RigSolution) -> Measurement:
+        """Registration of a camera with a LiDAR, around where they are by what is known."""
+        T, C = known.between(camera, lidar)
+        source, config = self.rig.pair(camera, lidar), self._config(camera)
+        positions = frame_positions(self.frames, len(source))
+        try:
+            frames = [self._with_motion(source[i], lidar, config) for i in positions]
+            calibrator = Calibrator(frames[0].camera, config, scans=self._shared[lidar])
+            result = calibrator.calibrate(frames, T, box_of(C))
+        except CalibrationError as error:
+            return Measurement(camera, lidar, "registration", None, str(error))
+        result = replace(result, camera_frame=source.camera_frame, lidar_frame=source.lidar_frame)
+        if not result.converged or result.covariance is None:
+            return Measurement(camera, lidar, "registration", None, result.reason or result.status, result)
+        twists = [frame.twist for frame in frames if frame.twist is not None]
+        edge = Edge(
+            camera, lidar, result.T_camera_lidar, result.covariance, "registration", result.time_offset_s,
+            result.time_offset_sigma_s, np.asarray(np.mean(twists, axis=0)) if twists else None, result.frames_used,
+        )  # fmt: skip
+        return Measurement(camera, lidar, "registration", edge, result.reason, result)
+
+    def by_motion(self, camera: str, known: RigSolution) -> list[Measurement]:
+        """A camera that no scan can be seen with turns as the vehicle does: its rotation by tracked points and the motion of a
+        LiDAR (hand-eye), the first of which that tells it. Its place is not told."""
+        out = []
+        for lidar in self.description.lidars:
+            out.append(self._tried(camera, lidar, "motion", self._turns, camera, lidar, known))
+            if out[-1].edge is not None:
+                break
+        return out
+
+    def _turns(self, camera: str, lidar: str, known: RigSolution) -> Edge:
+        source, config = self.rig.pair(camera, lidar), self._config(camera)
+        positions = frame_positions(self.frames, len(source))
+        frames = [self._with_motion(frame, lidar, config) for frame in neighbours(source, positions)]
+        guess = motion_guess(frames, FeatureExtractor(source.camera, config), config.search.seed)
+        T, _ = known.between(camera, lidar)
+        R = min((h[:3, :3] for h in guess.hypotheses), key=lambda R: se3.rotation_error_deg(R, T))
+        C = np.diag(np.repeat([0.0, UNKNOWN_M**2], 3))
+        C[:3, :3] = guess.covariance
+        at = se3.inverse(T)[:3, 3]  # the camera stays where it is believed to be: it turns about itself
+        return Edge(camera, lidar, se3.from_parts(R, -R @ at), C, "motion", samples=len(frames))
+
+    def _config(self, camera: str) -> Config:
+        mask = self.description[camera].mask
+        return update(self.config, {"image": {"mask": mask}}) if mask else self.config
+
+    def _with_motion(self, frame: Frame, lidar: str, config: Config) -> Frame:
+        if not needs_ego_motion(frame, config.motion):
+            return frame
+        return replace(frame, twist=self.scans[lidar].twist_at(frame.cloud_stamp))
+
+
+def _apart(a: str, b: str) -> Measurement:
+    return Measurement(a, b, "scans", None, "by their priors they share no view")
+
+
+def box_of(covariance: Covariance) -> SearchBox:
+    """Where to search around an extrinsic of this covariance (6, 6)."""
+    sigma = SIGMAS * np.sqrt(np.diag(covariance))
+    rx, ry, rz = np.clip(np.rad2deg(sigma[:3]), LEAST_DEG, SearchBox.MAX_DEG).tolist()
+    tx, ty, tz = np.clip(sigma[3:], LEAST_M, SearchBox.MAX_M).tolist()
+    return SearchBox((rx, ry, rz), (tx, ty, tz))
+
+
+def seen_share(camera: Camera, T: Transform, points: Matrix) -> float:
+    """Share of the cells of a camera's picture in which points (n, 3) lie by T_camera_lidar (4, 4)."""
+    uv, inside = camera.project(se3.transform(T, points))
+    cell = np.floor((uv[inside] + 0.5) / [camera.width, camera.height] * GRID)
+    return len(np.unique(cell, axis=0)) / (GRID[0] * GRID[1])
+
+
+def errors(solution: RigSolution, truth: Mapping[str, Transform]) -> dict[str, tuple[float, float]]:
+    """deg and m of every sensor's pose against a known one."""
+    return {name: se3.error(T, solution.poses[name]) for name, T in truth.items() if name in solution.columns}

@@ -1,0 +1,329 @@
+"""What is told of a rig: the result as JSON, in words, as a page, and in the files of other tools."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_ros import export, io, se3
+from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.camera import Camera
+from calib_ros.config import RefineConfig
+from calib_ros.errors import BadInputError
+from calib_ros.result import CONSUMERS_SIGMAS, CONVERGED, INSUFFICIENT, REFUSED, VERSION, Consumer
+from calib_ros.rig.description import CAMERA, RigDescription
+from calib_ros.rig.edges import Measurement, RigMeasurer
+from calib_ros.rig.graph import PRIOR, Edge, RigSolution
+from calib_ros.rig.moved import RigHypothesis, hypotheses, verdict
+
+REFERENCE = "reference"
+AXES = "xyz"
+WRITABLE = (*export.DESCRIPTIONS, *export.AUTOWARE)
+CAMCHAIN = "camchain"  # begins the names of Kalibr's files
+
+
+@dataclass(frozen=True, eq=False)
+class RigReport:
+    """The result of a rig.
+
+    frames: of TF, by the sensors' names. cameras: intrinsics. truth: T_reference_sensor (4, 4) as the recording states it, as far
+    as it does. limits: what every sensor has to be known to. before: an earlier solution, to be compared.
+    """
+
+    description: RigDescription
+    solution: RigSolution
+    measured: Sequence[Measurement]
+    frames: Mapping[str, str]
+    cameras: Mapping[str, Camera]
+    truth: Mapping[str, Transform] = field(default_factory=dict)
+    limits: RefineConfig = field(default_factory=RefineConfig)
+    source: str = ""
+    before: RigSolution | None = None
+
+    @classmethod
+    def of(cls, measurer: RigMeasurer, measured: Sequence[Measurement], before: RigSolution | None = None) -> RigReport:
+        """The report on what was measured."""
+        rig, description = measurer.rig, measurer.description
+        known = {s.name: rig.reference(s.name) for s in description.sensors}
+        truth = {name: T for name, T in known.items() if T is not None}
+        frames = {s.name: s.frame or rig.frame_id(s.name) for s in description.sensors}
+        cameras = {name: rig.camera(name) for name in description.cameras}
+        return cls(
+            *(description, measurer.solution(measured), measured, frames, cameras, truth, measurer.config.refine, rig.name),
+            before=before,
+        )
+
+    def at_sensor(self, name: str) -> Covariance:
+        """Covariance (6, 6) of a sensor's turn and place in the reference's axes, rad and m."""
+        J = se3.parts_jacobian(self.solution.poses[name])
+        return np.asarray(J @ self.solution.marginal(name) @ J.T)
+
+    def status(self, name: str) -> tuple[str, str]:
+        """Status of a sensor and its reason: reference, converged, insufficient (nothing measured, or directions that the prior
+        alone tells), refused (its edges contradict others, or are too uncertain)."""
+        if name == self.solution.reference:
+            return REFERENCE, "the others are stated in its frame"
+        if name not in self._joined():
+            why = [m.reason for m in self.measured if name in (m.target, m.source) and m.edge is None and m.reason]
+            return INSUFFICIENT, "no edge joins it to the reference, its pose is the prior" + "".join(f"; {w}" for w in why[:2])
+        doubted = [e.name for e in self.solution.doubted if name in (e.target, e.source)]
+        if doubted:
+            return REFUSED, f"these contradict each other, and which is wrong cannot be told: {', '.join(doubted)}"
+        open_axes = [self._direction(name, v) for v in self.solution.open.get(name, ())]
+        if open_axes:
+            return INSUFFICIENT, f"rests on the prior, since no edge tells: {', '.join(open_axes)}"
+        C = self.at_sensor(name)
+        if not Consumer(name, self.limits.tolerance_deg, self.limits.tolerance_m).is_served(C):
+            deg, m = _sigmas(C)
+            return REFUSED, (
+                f"too uncertain: 1 sigma {deg:.2f} deg and {100 * m:.1f} cm, and {CONSUMERS_SIGMAS:g} of them must be within "
+                f"{self.limits.tolerance_deg:g} deg and {100 * self.limits.tolerance_m:g} cm; give more frames or a better prior"
+            )
+        return CONVERGED, ""
+
+    def _joined(self) -> set[str]:
+        """Sensors that edges join to the reference."""
+        known = {self.solution.reference}
+        for _ in self.solution.edges:
+            known |= {n for e in self.solution.edges if {e.target, e.source} & known for n in (e.target, e.source)}
+        return known
+
+    def _direction(self, name: str, twist: Matrix) -> str:
+        """An unobservable direction at the sensor, in the reference's axes."""
+        v = se3.parts_jacobian(self.solution.poses[name]) @ twist
+        T, C = self.solution.prior[name]
+        sigma = np.sqrt(np.diag(se3.parts_jacobian(T) @ C @ se3.parts_jacobian(T).T))
+        axis = int(np.argmax(np.abs(v) / sigma))
+        own = float(np.sqrt(self.at_sensor(name)[axis, axis]))
+        if axis < 3:
+            return f"its rotation about {AXES[axis]} ({np.rad2deg(own):.2f} deg)"
+        return f"its place along {AXES[axis - 3]} ({100 * own:.0f} cm)"
+
+    @cached_property
+    def changes(self) -> tuple[tuple[RigHypothesis, ...], str]:
+        """What may have happened since `before`, and a line about it; nothing where that is unknown."""
+        if self.before is None:
+            return (), ""
+        return verdict(hypotheses(self.before, [m.edge for m in self.measured if m.edge is not None]))
+
+    @property
+    def converged(self) -> bool:
+        """Whether all sensors are to be used."""
+        return all(self.status(name)[0] in (CONVERGED, REFERENCE) for name in self.solution.poses)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, lists and texts; see docs/rig.md."""
+        s = self.solution
+        return {
+            "reference": s.reference,
+            "status": CONVERGED if self.converged else REFUSED,
+            "source": self.source,
+            "sensors": {name: self._sensor(name) for name in s.poses},
+            "covariance_of": list(s.columns),
+            "covariance": s.covariance.tolist(),
+            "edges": [self._edge(m) for m in self.measured],
+            "rejected": [e.name for e in s.rejected],
+            "doubted": [e.name for e in s.doubted],
+            "loops": [
+                {"sensors": list(loop.sensors), "rotation_deg": loop.size[0], "translation_m": loop.size[1],
+                 "p_value": loop.p_value, "closes": loop.closes}
+                for loop in s.loops
+            ],
+            **({} if self.before is None else {"changes": [_change(h) for h in self.changes[0]], "change": self.changes[1]}),
+            "version": VERSION,
+        }  # fmt: skip
+
+    def _sensor(self, name: str) -> dict[str, Any]:
+        T, (status, reason) = self.solution.poses[name], self.status(name)
+        found: dict[str, Any] = {
+            "kind": self.description[name].kind,
+            "frame": self.frames[name],
+            "status": status,
+            "reason": reason,
+            "T_reference_sensor": T.tolist(),
+            "translation_m": T[:3, 3].tolist(),
+            "quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
+            "covariance": self.solution.marginal(name).tolist(),
+        }
+        for key, other in (("prior_error", self.solution.prior.get(name, (None,))[0]), ("reference_error", self.truth.get(name))):
+            deg, m = (None, None) if other is None else se3.error(other, T)
+            found[key] = None if other is None else {"rotation_deg": deg, "translation_m": m}
+        return found
+
+    def _fate(self, measured: Measurement) -> str:
+        def among(edges: Sequence[Edge]) -> bool:
+            return any((e.target, e.source, e.kind) == (measured.target, measured.source, measured.kind) for e in edges)
+
+        if measured.edge is None:
+            return "failed"
+        return "rejected" if among(self.solution.rejected) else ("doubted" if among(self.solution.doubted) else "used")
+
+    def _edge(self, measured: Measurement) -> dict[str, Any]:
+        edge = measured.edge
+        return {
+            "target": measured.target,
+            "source": measured.source,
+            "kind": measured.kind,
+            "fate": self._fate(measured),
+            "reason": measured.reason,
+            "T_target_source": None if edge is None else edge.T.tolist(),
+            "covariance": None if edge is None else edge.covariance.tolist(),
+            "time_offset_s": None if edge is None else edge.time_offset_s,
+            "time_offset_sigma_s": None if edge is None else edge.time_sigma_s,
+            "frames_used": 0 if edge is None else edge.samples,
+        }
+
+    def dumps(self) -> str:
+        """JSON."""
+        return json.dumps(self.to_dict(), indent=1) + "\n"
+
+    def save(self, path: str) -> None:
+        """Write JSON atomically. BadInputError if the folder cannot be written."""
+        io.write_atomically(path, self.dumps().encode())
+
+    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
+        """Caption, column names and rows: sensors, edges, loops."""
+        sensors, edges = [], []
+        for name, T in self.solution.poses.items():
+            (status, reason), (deg, m) = self.status(name), _sigmas(self.at_sensor(name))
+            x, y, z = T[:3, 3]
+            known = self.truth.get(name)
+            error = "" if known is None or name == self.solution.reference else _amounts(*se3.error(known, T))
+            sensors.append([name, status, f"{x:.3f} {y:.3f} {z:.3f}", _amounts(deg, m), error, reason])
+        for measured in self.measured:
+            sigma = "" if measured.edge is None else _amounts(*_sigmas(measured.edge.covariance))
+            edges.append([measured.target, measured.source, measured.kind, self._fate(measured), sigma, measured.reason])
+        priors = [e.target + "-" + e.source for e in self.solution.rejected if e.kind == PRIOR]
+        edges += [[*name.split("-", 1), PRIOR, "rejected", "", "the edges contradict it"] for name in priors]
+        loops = [
+            [", ".join(loop.sensors), _amounts(*loop.size), f"{loop.p_value:.3g}", "yes" if loop.closes else "NO"]
+            for loop in self.solution.loops
+        ]
+        return [
+            (
+                f"Sensors in the frame of {self.solution.reference}",
+                ["sensor", "status", "x y z, m", "1 sigma", "error", "remarks"],
+                sensors,
+            ),
+            ("Edges", ["target", "source", "kind", "", "1 sigma", "remarks"], edges),
+            ("Loops", ["sensors", "residual", "p-value", "closes"], loops),
+        ]
+
+    def text(self) -> str:
+        """For a terminal."""
+        lines = []
+        for caption, header, rows in self.tables():
+            if not rows:
+                continue
+            widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
+            lines += [caption] + [
+                "  " + "  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)).rstrip() for r in [header, *rows]
+            ]
+        return "\n".join([*lines, *([] if self.before is None else [f"Since the former result: {self.changes[1]}"])])
+
+    def html(self) -> str:
+        """A page that needs nothing from elsewhere: the rig from above, and the tables."""
+        parts = [f"<h1>Rig of {escape(self.source)}</h1>", self._drawing()]
+        for caption, header, rows in self.tables():
+            cells = [
+                "".join(f"<{tag}>{escape(c)}</{tag}>" for c in row) for tag, row in [("th", header), *(("td", r) for r in rows)]
+            ]
+            parts.append(f"<h2>{escape(caption)}</h2><table>{''.join(f'<tr>{c}</tr>' for c in cells)}</table>")
+        if self.before is not None:
+            parts.append(f"<p>Since the former result: {escape(self.changes[1])}</p>")
+        style = "body{font-family:sans-serif;margin:2em}tr:first-child{font-weight:bold}td{padding:.2em .8em}"
+        return f'<!doctype html><meta charset="utf-8"><title>Rig</title><style>{style}</style>{"".join(parts)}\n'
+
+    def _drawing(self) -> str:
+        """SVG of the sensors from above, x of a LiDAR reference to the right, with edges and where each looks."""
+        poses = self.solution.poses
+        xy = np.array([T[:2, 3] for T in poses.values()])
+        low, size = xy.min(axis=0) - 0.6, float(np.ptp(xy, axis=0).max()) + 1.2
+        at = {name: (100 * (T[:2, 3] - low) / size * [1, -1] + [0, 100]).round(2) for name, T in poses.items()}
+        lines = [(at[e.target], at[e.source], "#999") for e in self.solution.edges]
+        for name, T in poses.items():
+            ahead = T[:2, 2] if self.description[name].kind == CAMERA else T[:2, 0]
+            lines.append((at[name], (at[name] + 6 * ahead * [1, -1]).round(2), "#06c"))
+        drawn = [f'<line x1="{a[0]}" y1="{a[1]}" x2="{b[0]}" y2="{b[1]}" stroke="{c}" stroke-width=".5"/>' for a, b, c in lines]
+        drawn += [f'<circle cx="{p[0]}" cy="{p[1]}" r="1"/><text x="{p[0] + 2}" y="{p[1]}" font-size="3">{escape(n)}</text>'
+                  for n, p in at.items()]  # fmt: skip
+        return f'<svg viewBox="0 0 130 100" width="640" height="480">{"".join(drawn)}</svg>'
+
+    def edges_of_frames(self) -> dict[tuple[str, str], Transform]:
+        """T_parent_child (4, 4) by TF frames, of every two sensors, the reference as parent first."""
+        names = [self.solution.reference, *self.solution.columns]
+        poses = self.solution.poses
+        return {(self.frames[a], self.frames[b]): se3.inverse(poses[a]) @ poses[b] for a in names for b in names if a != b}
+
+    def write(self, path: str) -> None:
+        """Write to a file of another tool, by its ending: the joints of a robot's description (.urdf, .xacro), whose origins
+        change where the file exists; Autoware's YAML; Kalibr's camera chain where the name begins with camchain."""
+        check_out(path)
+        edges, name = self.edges_of_frames(), Path(path).name
+        poses = [export.Pose(a, b, T) for (a, b), T in edges.items() if a == self.frames[self.solution.reference]]
+        if name.startswith(CAMCHAIN):
+            cameras = {n: (c, self.solution.poses[n], self.description[n].topic) for n, c in self.cameras.items()}
+            io.write_atomically(path, export.kalibr_camchain(cameras).encode())
+        elif Path(path).suffix.lower() in export.DESCRIPTIONS:
+            export.write_joints(path, poses, edges)
+        else:
+            io.write_atomically(path, export.autoware_yaml(*poses).encode())
+
+
+def _change(found: RigHypothesis) -> dict[str, Any]:
+    deg, m = found.size
+    return {
+        "kind": found.kind,
+        "sensors": list(found.sensors),
+        "posterior": found.posterior,
+        "rotation_deg": deg,
+        "translation_m": m,
+        "displacement": found.displacement.tolist(),
+        "p_value": found.p_value,
+    }
+
+
+def load(path: str | Path) -> RigSolution:
+    """The solution in a file of `RigReport.save`. BadInputError for another one."""
+    text = io.read_text(path, "result", "a JSON result of calib-ros rig")
+    try:
+        data = json.loads(text)
+        poses = {name: se3.as_transform(s["T_reference_sensor"], name) for name, s in data["sensors"].items()}
+        covariance = np.array(data["covariance"], float)
+        edges = tuple(
+            Edge(
+                *(e["target"], e["source"], se3.as_transform(e["T_target_source"], "an edge"), np.array(e["covariance"], float)),
+                *(e["kind"], e["time_offset_s"], e["time_offset_sigma_s"]),
+            )
+            for e in data["edges"]
+            if e["fate"] in ("used", "doubted")
+        )
+        solution = RigSolution(data["reference"], poses, covariance, edges)
+        if covariance.shape != (6 * len(solution.columns),) * 2 or list(solution.columns) != data["covariance_of"]:
+            raise ValueError
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        raise BadInputError(f"{path} is no result of calib-ros rig; give the file that --json wrote") from None
+    return solution
+
+
+def check_out(path: str) -> None:
+    """BadInputError, before the work, for a file that `RigReport.write` has no format for."""
+    if Path(path).suffix.lower() not in WRITABLE:
+        raise BadInputError(f"--out {path}: the ending tells the format; give one of {', '.join(WRITABLE)}, or {CAMCHAIN}.yaml")
+
+
+def _sigmas(C: Covariance) -> tuple[float, float]:
+    """Standard deviations along the worst directions, deg and m."""
+    turn, shift = (float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0))) for block in (C[:3, :3], C[3:, 3:]))
+    return float(np.rad2deg(turn)), shift
+
+
+def _amounts(deg: float, m: float) -> str:
+    return f"{deg:.3f} deg {100 * m:.1f} cm"

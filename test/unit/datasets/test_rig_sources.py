@@ -1,0 +1,191 @@
+"""Recordings of rigs: a bag with all topics and its description, KITTI, nuScenes and synthetic rigs by a description."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import sample_sources
+import yaml
+
+from calib_ros import se3
+from calib_ros.cli.main import main
+from calib_ros.datasets import bag, kitti, nuscenes
+from calib_ros.datasets.bag_file import BagFile
+from calib_ros.datasets.bag_rig import BagRig
+from calib_ros.datasets.recent import Recent
+from calib_ros.datasets.rig import open_rig
+from calib_ros.errors import BadInputError
+from calib_ros.frame import NANOSECONDS
+from calib_ros_synthetic.rig import SyntheticRig
+
+TEXT = "synthetic:seed=3,frames=1,width=96,noise=0.0,rig=two_lidars_three_cameras"
+
+
+def described(reference: str, **sensors: dict[str, Any]) -> Any:
+    """A description as of calib_ros/rig."""
+    empty = {"topic": "", "camera_info": "", "frame": "", "prior": None}
+    listed = tuple(SimpleNamespace(**{**empty, "name": name, **values}) for name, values in sensors.items())
+    return SimpleNamespace(reference=reference, sensors=listed)
+
+
+def camera(topic: str = "", **more: Any) -> dict[str, Any]:
+    return {"kind": "camera", "topic": topic, **more}
+
+
+def lidar(topic: str = "", **more: Any) -> dict[str, Any]:
+    return {"kind": "lidar", "topic": topic, **more}
+
+
+@pytest.fixture(scope="module")
+def rig() -> SyntheticRig:
+    return SyntheticRig.from_text(TEXT)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rig") / "drive"
+    assert main(["convert", TEXT, str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def description(written: Path) -> Any:
+    data = yaml.safe_load(written.with_name("drive.rig.yaml").read_text(encoding="utf-8"))
+    return described(data["reference"], **{name: {**own, "prior": None} for name, own in data["sensors"].items()})
+
+
+def test_a_bag_has_every_topic_of_the_rig_in_the_order_of_stamps(written: Path, rig: SyntheticRig) -> None:
+    opened = BagFile(written)
+    counts = {topic.name: topic.messages for topic in opened.topics.values()}
+    expected = {f"/{name}/points": len(rig.stamps(name)) for name in rig.lidars}
+    expected |= {f"/{name}/{what}": len(rig.stamps(name)) for name in rig.cameras for what in ("image", "camera_info")}
+    assert counts == expected | {"/tf_static": 1}
+    recorded = [time for _, time, _ in opened.raw(list(counts))]
+    assert recorded == sorted(recorded)
+    data = yaml.safe_load(written.with_name("drive.rig.yaml").read_text(encoding="utf-8"))
+    front = data["sensors"]["front"]
+    assert data["reference"] == "lidar_left"
+    assert "prior" not in data["sensors"]["lidar_left"]
+    assert (front["kind"], front["topic"], front["camera_info"]) == ("camera", "/front/image", "/front/camera_info")
+    R = se3.rotation_from_quaternion(front["prior"]["quaternion_xyzw"])
+    np.testing.assert_allclose(se3.from_parts(R, front["prior"]["translation_m"]), rig.prior("front"), atol=1e-5)
+
+
+def test_a_bag_gives_back_the_rig(written: Path, description: Any, rig: SyntheticRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[int] = []
+    whole = bag.decode_cloud
+    monkeypatch.setattr(bag, "decode_cloud", lambda message: decoded.append(1) or whole(message))
+    opened = open_rig(written, description)
+    assert isinstance(opened, BagRig)
+    assert (opened.cameras, opened.lidars) == (rig.cameras, rig.lidars)
+    for name in (*rig.cameras, *rig.lidars):
+        np.testing.assert_allclose(opened.reference(name), rig.reference(name), atol=1e-9)
+        assert opened.frame_id(name) == rig.frame_id(name)
+    np.testing.assert_allclose(opened.camera("left").K, rig.camera("left").K)
+    pair = opened.pair("left", "lidar_right")
+    assert opened.pair("left", "lidar_right") is pair
+    frame = pair[3]
+    np.testing.assert_allclose(frame.reference, se3.inverse(rig.reference("left")) @ rig.reference("lidar_right"), atol=1e-9)
+    images, scans = rig.stamps("left").tolist(), rig.stamps("lidar_right").tolist()
+    np.testing.assert_array_equal(frame.image, rig.picture("left", images.index(frame.stamp))[0])
+    # The same scan for another camera, and by itself, is decoded once.
+    at = scans.index(frame.cloud_stamp)
+    np.testing.assert_array_equal(frame.cloud.xyz, rig.scan("lidar_right", at)[0].xyz)
+    opened.pair("front", "lidar_right")
+    decoded.clear()
+    listed = opened.scans("lidar_right")
+    assert listed.stamps.tolist() == scans
+    stamp, cloud = listed[at]
+    assert (stamp, cloud) == (frame.cloud_stamp, frame.cloud)
+    other = opened.pair("right", "lidar_right")
+    decoded.clear()
+    stamps = [int(other._index.cloud.stamps[k]) for k in other._pairs[1]]
+    assert other[stamps.index(stamp)].cloud is cloud
+    assert not decoded
+
+
+def test_priors_tell_where_a_camera_looks_when_a_bag_has_no_transforms(written: Path, rig: SyntheticRig) -> None:
+    by_prior = described(
+        "lidar_left",
+        lidar_left=lidar("/lidar_left/points", frame="a"),
+        side=camera("/right/image", frame="b", prior=rig.prior("right")),
+    )
+    opened = open_rig(written, by_prior)
+    assert opened.reference("side") is None
+    # The camera on the right looks where the scan is 22 ms after its stamp.
+    assert opened.pair("side", "lidar_left")._sweep_offset / NANOSECONDS == pytest.approx(80 / 3600, abs=0.01)  # type: ignore[attr-defined]
+    with pytest.raises(BadInputError, match=r"on topic /rear/image; it has /front/image.*; set sensors\.rear\.topic"):
+        open_rig(written, described("lidar_left", lidar_left=lidar("/lidar_left/points"), rear=camera("/rear/image")))
+
+
+def test_a_synthetic_rig_under_other_names(rig: SyntheticRig) -> None:
+    chosen = described("eye", eye=camera("front"), scanner=lidar("lidar_right"), left=camera("/left/image"))
+    opened = open_rig(TEXT, chosen)
+    assert (opened.cameras, opened.lidars, opened.reference_sensor) == (("eye", "left"), ("scanner",), "eye")
+    np.testing.assert_allclose(opened.reference("eye"), np.eye(4), atol=1e-12)
+    T = se3.inverse(rig.reference("front")) @ rig.reference("lidar_right")
+    np.testing.assert_allclose(opened.reference("scanner"), T, atol=1e-12)
+    np.testing.assert_allclose(opened.pair("eye", "scanner").reference, T, atol=1e-12)
+    assert opened.frame_id("left") == "left_optical"
+    assert len(opened.scans("scanner")) == 20
+    with pytest.raises(BadInputError, match="has no camera roof; name by topic one that it has: front, left, right"):
+        open_rig(TEXT, described("scanner", scanner=lidar("lidar_left"), roof=camera()))
+
+
+def test_kitti_with_two_cameras_reads_a_scan_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sample_sources.kitti(tmp_path, "odometry")
+    (tmp_path / "image_3").symlink_to(tmp_path / "image_2")
+    P2, Tr = (tmp_path / "calib.txt").read_text(encoding="utf-8").splitlines()
+    P3 = np.array(P2.split()[1:], float)
+    P3[3] -= 0.5 * P3[0]
+    (tmp_path / "calib.txt").write_text("\n".join([P2, "P3: " + " ".join(map(str, P3)), Tr]), encoding="utf-8")
+    read, whole = [], kitti.read_scan
+    monkeypatch.setattr(kitti, "read_scan", lambda path: read.append(path) or whole(path))
+    opened = open_rig(tmp_path, described("velo", velo=lidar(), left=camera("2"), right=camera("3")))
+    frames = [opened.pair(name, "velo")[1] for name in opened.cameras]
+    stamp, cloud = opened.scans("velo")[1]
+    assert len(read) == 1
+    assert cloud is frames[0].cloud is frames[1].cloud
+    assert stamp == frames[0].moment_of_cloud
+    between = se3.inverse(opened.reference("left")) @ opened.reference("right")
+    np.testing.assert_allclose(between[:3, 3], [0.5, 0, 0], atol=1e-5)
+    assert opened.frame_id("right") == "camera_color_right"
+    with pytest.raises(BadInputError, match="has one LiDAR, but the description has 2 and 1 cameras"):
+        open_rig(tmp_path, described("a", a=lidar(), b=lidar(), left=camera("2")))
+
+
+def test_nuscenes_by_its_channels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sample_sources.nuscenes(tmp_path)
+    read, whole = [], nuscenes.read_sweep
+    monkeypatch.setattr(nuscenes, "read_sweep", lambda path: read.append(path) or whole(path))
+    opened = open_rig(tmp_path, described("CAM_FRONT", CAM_FRONT=camera(), LIDAR_TOP=lidar()))
+    frame = opened.pair("CAM_FRONT", "LIDAR_TOP")[0]
+    listed = opened.scans("LIDAR_TOP")
+    assert frame.cloud in [cloud for _, cloud in listed]
+    assert len(read) == len(listed)
+    np.testing.assert_allclose(opened.reference("LIDAR_TOP"), frame.reference, atol=1e-9)
+    with pytest.raises(BadInputError, match="has no camera CAM_ROOF; choose one of"):
+        open_rig(tmp_path, described("LIDAR_TOP", LIDAR_TOP=lidar(), roof=camera("CAM_ROOF")))
+
+
+def test_what_is_no_recording_of_a_rig_is_said(tmp_path: Path, written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for text in ("synthetic:frames=1,rig=os1_64_robot", str(tmp_path / "none")):
+        with pytest.raises(BadInputError, match=r"is no recording of a rig|does not exist"):
+            open_rig(text, described("l", l=lidar(), c=camera()))
+    assert main(["convert", TEXT, str(written), "--frames", "0:2"]) == 2
+    assert main(["convert", TEXT, str(written)]) == 2
+    assert "drive.rig.yaml exists already" in capsys.readouterr().err
+    assert main(["convert", TEXT, str(tmp_path / "pair"), "--camera", "left"]) == 0
+    assert "1 frames written" in capsys.readouterr().out
+
+
+def test_the_newest_are_kept() -> None:
+    made: list[int] = []
+    recent = Recent(2)
+    for key in (1, 2, 1, 3, 1, 2):
+        assert recent(key, lambda key=key: made.append(key) or key) == key  # type: ignore[misc]
+    assert made == [1, 2, 3, 2]
