@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import RefineConfig
-from calib_ros.result import CONVERGED, INITIAL, MOVED, SUSPECT, TENTATIVE, Extrinsic
+from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, SUSPECT, TENTATIVE, Extrinsic
 from calib_ros.rig.description import RigDescription
 from calib_ros.rig.edges import Measurement
 from calib_ros.rig.graph import Edge, RigSolution, solve
@@ -128,7 +128,7 @@ class LiveRig:
         self, name: str, report: RigReport, joined: set[str], moved: Sequence[str], pairs: Sequence[PairState]
     ) -> SensorState:
         (status, reason), own = report.status(name), [p for p in pairs if name in p.pair]
-        usable = status in (CONVERGED, REFERENCE) and name in joined and name not in moved
+        usable = status in (CONVERGED, REFERENCE, INSUFFICIENT) and name in joined and name not in moved
         if name in moved:
             status, reason = MOVED, self._told
         elif not usable and (objecting := [p for p in own if not p.usable]):
