@@ -132,6 +132,7 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
     command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON; - = standard output")
     command.add_argument("--report", metavar="HTML", help="write a page")
+    command.add_argument("--before", metavar="JSON", help="a former result of this rig: say which sensor has moved since")
     command.add_argument(
         "--out",
         action="append",

@@ -15,8 +15,8 @@ from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.datasets.positions import frame_positions
-from calib_ros.datasets.rig import RigSource
-from calib_ros.datasets.source import Source, neighbours
+from calib_ros.datasets.rig_source import RigSource
+from calib_ros.datasets.source import neighbours
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.lidar.ego_motion import needs_ego_motion
@@ -75,8 +75,17 @@ class RigMeasurer:
         self.rig, self.description, self.config, self.frames = rig, description, config, frames
         self.priors = priors_of(description, rig)
         self.progress = progress or (lambda text, share: None)
-        self.scans = {name: LidarScans(rig.scans(name), config.motion) for name in description.lidars}
+        self.scans = {name: LidarScans(rig.scans(name), config.motion, self._window(name)) for name in description.lidars}
         self._shared: dict[str, ScanEdges] = {name: {} for name in description.lidars}
+
+    def _window(self, lidar: str) -> tuple[int, int] | None:
+        """From and to which scan the chosen frames last; None = all."""
+        if self.frames == "all" or not self.description.cameras:
+            return None
+        source = self.rig.pair(self.description.cameras[0], lidar)
+        positions = frame_positions(self.frames, len(source))
+        first, last = (source[k].moment_of_cloud for k in (min(positions), max(positions)))
+        return first, last
 
     def measure(self) -> list[Measurement]:
         """All edges: LiDARs first, whose places narrow the search for cameras. Deterministic. Raises what reading raises."""
@@ -128,18 +137,18 @@ class RigMeasurer:
 
     def _sees(self, camera: str, lidar: str, known: RigSolution) -> bool:
         scans = self.scans[lidar]
-        if not len(scans):
+        if not len(scans.used):
             return False
-        points, _ = scans.still(len(scans) // 2)
+        points, _ = scans.still(int(scans.used[len(scans.used) // 2]))
         return seen_share(self.rig.camera(camera), known.between(camera, lidar)[0], points) >= SEEN
 
     def camera_edge(self, camera: str, lidar: str, known: RigSolution) -> Measurement:
         """Registration of a camera with a LiDAR, around where they are by what is known."""
         T, C = known.between(camera, lidar)
+        source, config = self.rig.pair(camera, lidar), self._config(camera)
+        positions = frame_positions(self.frames, len(source))
         try:
-            source = self._pair(camera, lidar)
-            config = self._config(camera)
-            frames = [self._with_motion(source[i], lidar, config) for i in frame_positions(self.frames, len(source))]
+            frames = [self._with_motion(source[i], lidar, config) for i in positions]
             calibrator = Calibrator(frames[0].camera, config, scans=self._shared[lidar])
             result = calibrator.calibrate(frames, T, box_of(C))
         except CalibrationError as error:
@@ -165,7 +174,7 @@ class RigMeasurer:
         return out
 
     def _turns(self, camera: str, lidar: str, known: RigSolution) -> Edge:
-        source, config = self._pair(camera, lidar), self._config(camera)
+        source, config = self.rig.pair(camera, lidar), self._config(camera)
         positions = frame_positions(self.frames, len(source))
         frames = [self._with_motion(frame, lidar, config) for frame in neighbours(source, positions)]
         guess = motion_guess(frames, FeatureExtractor(source.camera, config), config.search.seed)
@@ -175,9 +184,6 @@ class RigMeasurer:
         C[:3, :3] = guess.covariance
         at = se3.inverse(T)[:3, 3]  # the camera stays where it is believed to be: it turns about itself
         return Edge(camera, lidar, se3.from_parts(R, -R @ at), C, "motion", samples=len(frames))
-
-    def _pair(self, camera: str, lidar: str) -> Source:
-        return self.rig.pair(camera, lidar)
 
     def _config(self, camera: str) -> Config:
         mask = self.description[camera].mask

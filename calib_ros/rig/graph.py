@@ -75,7 +75,7 @@ class RigSolution:
     poses: T_reference_sensor (4, 4) by name, the reference among them. covariance: (6 m, 6 m) of left twists of the m others in
     the order of `poses`, rad and m. edges: that were used; rejected: that contradict the others; doubted: one of these is wrong,
     it cannot be told which, and all count less. open: for sensors, left twists (k, 6) along which their pose rests on the prior,
-    turns in rad and shifts in m of one standard deviation of the prior. prior: (T, covariance) by name.
+    turns in rad and shifts in m of one standard deviation. prior: (T, covariance) by name.
     """
 
     reference: str
@@ -160,7 +160,7 @@ def solve(edges: Sequence[Edge], priors: Priors, reference: str) -> RigSolution:
     solution = RigSolution(
         reference, poses, covariance, used, tuple(given[k] for k in left_out), tuple(given[k] for k in doubted), prior=priors
     )
-    return replace(solution, loops=closed_loops(edges, reference), open=_open(solution, priors))
+    return replace(solution, loops=closed_loops(edges, reference), open=_open(solution, factors))
 
 
 def _scaled(factors: Sequence[Edge], which: Sequence[int], scale: float) -> list[Edge]:
@@ -179,9 +179,14 @@ def _solved(factors: Sequence[Edge], names: Sequence[str], reference: str) -> tu
         poses = {n: se3.exp(step[columns[n]]) @ T if n in columns else T for n, T in poses.items()}
         if np.abs(step).max() < STEP:
             break
-    r, J = _linear(factors, roots, poses, columns)
-    inverse = np.linalg.pinv(J)
-    return poses, inverse @ inverse.T, float(r @ r)
+    r, _ = _linear(factors, roots, poses, columns)
+    return poses, _covariance(factors, poses, columns), float(r @ r)
+
+
+def _covariance(factors: Sequence[Edge], poses: Mapping[str, Transform], columns: Mapping[str, slice]) -> Matrix:
+    """Of all poses (n, n), by the factors."""
+    inverse = np.linalg.pinv(_linear(factors, [root_information(f.covariance) for f in factors], poses, columns)[1], rcond=1e-12)
+    return np.asarray(inverse @ inverse.T)
 
 
 def _linear(
@@ -264,13 +269,15 @@ def _loop(edge: Edge, up: Mapping[str, tuple[str, Edge]], tests: int) -> Loop:
     return Loop(tuple(at for at, _ in steps), residual, p, p > SIGNIFICANCE / tests)
 
 
-def _open(solution: RigSolution, priors: Priors) -> dict[str, Matrix]:
-    """Directions of each sensor's pose of which the edges tell less than the prior does."""
+def _open(solution: RigSolution, factors: Sequence[Edge]) -> dict[str, Matrix]:
+    """Directions of each sensor's pose of which the edges tell less than the priors do, its own and those of others."""
+    priors = [k for k, factor in enumerate(factors) if factor.kind == PRIOR]
+    alone = _covariance(_scaled(factors, priors, NOTHING_SAID), solution.poses, solution.columns)
     found = {}
-    for name, (_, C) in priors.items():
-        W = root_information(C)
+    for name, own in solution.columns.items():
+        W = root_information(alone[own, own])
         values, vectors = np.linalg.eigh(W @ solution.marginal(name) @ W.T)
-        rest = vectors[:, values > TOLD]
+        rest = vectors[:, values < 1 - TOLD] * np.sqrt(values[values < 1 - TOLD])
         if rest.size:
-            found[name] = (np.linalg.inv(W) @ rest).T
+            found[name] = np.linalg.solve(W, rest).T
     return found

@@ -40,12 +40,15 @@ Stamped = tuple[int, PointCloud]
 
 
 class LidarScans:
-    """The scans of a LiDAR in the order of their stamps, and its motion between them, estimated when it is asked for."""
+    """The scans of a LiDAR in the order of their stamps, and its motion between them, estimated when it is asked for. window: of
+    stamps, ns, first and last, whose scans are registered; None = all."""
 
-    def __init__(self, scans: Sequence[Stamped], config: MotionConfig) -> None:
+    def __init__(self, scans: Sequence[Stamped], config: MotionConfig, window: tuple[int, int] | None = None) -> None:
         self.scans, self.config = scans, config
         stamps = getattr(scans, "stamps", None)
         self.stamps = np.array([stamp for stamp, _ in scans] if stamps is None else stamps, np.int64)
+        first, last = window or (self.stamps[:1].sum(), self.stamps[-1:].sum())
+        self.used = np.flatnonzero((self.stamps >= first) & (self.stamps <= last))  # their positions
         self._motions: dict[int, Matrix | None] = {}
 
     def __len__(self) -> int:
@@ -91,15 +94,16 @@ class LidarScans:
 
     def chosen(self, n: int) -> list[int]:
         """Up to n positions, spread evenly."""
-        return sorted({int(k) for k in np.linspace(0, len(self) - 1, min(n, len(self))).round()})
+        return [int(self.used[round(k)]) for k in np.linspace(0, len(self.used) - 1, min(n, len(self.used)))]
 
     @cached_property
     def run(self) -> Run | None:
         """The longest sequence of scans between which the motion is known; None where there is none."""
-        begin = max(len(self) - RUN_SCANS, 0) // 2
-        known = {k: self._motion(k) for k in range(begin, min(begin + RUN_SCANS, len(self)) - 1)}
-        best, first = (0, 0), begin
-        for k in range(begin, begin + len(known) + 1):
+        spare = max(len(self.used) - RUN_SCANS, 0)
+        own = self.used[spare // 2 : len(self.used) - (spare - spare // 2)].tolist()
+        known = {k: self._motion(k) for k in own[:-1]}
+        best, first = (0, 0), own[0] if own else 0
+        for k in own:
             if known.get(k) is None:
                 best, first = max(best, (first, k), key=lambda part: part[1] - part[0]), k + 1
         if best[1] == best[0]:
@@ -114,9 +118,9 @@ class LidarScans:
 
 def shared_view(a: LidarScans, b: LidarScans, T: Transform) -> float:
     """Share of the points of the scanner that sees less which the other one sees, too, by T_a_b (4, 4)."""
-    if not len(a) or not len(b):
+    if not len(a.used) or not len(b.used):
         return 0.0
-    k = len(b) // 2
+    k = int(b.used[len(b.used) // 2])
     A, B = a.still(a.nearest(int(b.stamps[k])))[0], se3.transform(T, b.still(k)[0])
     if min(len(A), len(B)) < MIN_POINTS:
         return 0.0
@@ -137,15 +141,19 @@ def scan_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], T:
     for k in b.chosen(SCANS):
         j = a.nearest(int(b.stamps[k]))
         late_s = int(b.stamps[k] - a.stamps[j]) / NANOSECONDS
-        A, twist = a.still(j)
-        B, _ = b.still(k)
-        if abs(late_s) > MAX_GAP_S or min(len(A), len(B)) < MIN_POINTS or (twist is None and late_s):
+        if abs(late_s) > MAX_GAP_S:
+            continue
+        (A, twist), (B, _) = a.still(j), b.still(k)
+        if min(len(A), len(B)) < MIN_POINTS or (twist is None and late_s):
+            reason = f"too few points in their scans, or the motion of {name_a} is unknown"
             continue
         between = se3.exp(np.zeros(6) if twist is None else twist * late_s)
         guess = between @ T
         # The narrower scanner's points are looked for among the wider one's.
         turned, matched = len(B) > len(A), 0.0
         for reach in REACHES_M:
+            if not np.isfinite(guess).all():
+                break
             if turned:
                 result = align(B, A, se3.inverse(guess), reach)
                 guess = se3.inverse(np.asarray(result.T_target_source, float))
@@ -156,7 +164,7 @@ def scan_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], T:
                 matched = result.num_inliers / min(len(A), len(B))
         H = np.asarray(result.H, float)
         curvature = float(np.linalg.eigvalsh(H[3:, 3:])[0]) / max(result.num_inliers, 1)
-        if not result.converged or matched < MIN_MATCHED or curvature < MIN_CURVATURE:
+        if not result.converged or not np.isfinite(guess).all() or matched < MIN_MATCHED or curvature < MIN_CURVATURE:
             reason = f"their scans match at {matched:.0%} of the points, {MIN_MATCHED:.0%} are needed, or slide along each other"
             continue
         # From a right twist of what was aligned to a left one of T_target_source.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from calib_ros.result import CONSUMERS_SIGMAS, CONVERGED, INSUFFICIENT, REFUSED,
 from calib_ros.rig.description import CAMERA, RigDescription
 from calib_ros.rig.edges import Measurement, RigMeasurer
 from calib_ros.rig.graph import PRIOR, Edge, RigSolution
+from calib_ros.rig.moved import RigHypothesis, hypotheses, verdict
 
 REFERENCE = "reference"
 AXES = "xyz"
@@ -32,7 +34,7 @@ class RigReport:
     """The result of a rig.
 
     frames: of TF, by the sensors' names. cameras: intrinsics. truth: T_reference_sensor (4, 4) as the recording states it, as far
-    as it does. limits: what every sensor has to be known to.
+    as it does. limits: what every sensor has to be known to. before: an earlier solution, to be compared.
     """
 
     description: RigDescription
@@ -43,9 +45,10 @@ class RigReport:
     truth: Mapping[str, Transform] = field(default_factory=dict)
     limits: RefineConfig = field(default_factory=RefineConfig)
     source: str = ""
+    before: RigSolution | None = None
 
     @classmethod
-    def of(cls, measurer: RigMeasurer, measured: Sequence[Measurement]) -> RigReport:
+    def of(cls, measurer: RigMeasurer, measured: Sequence[Measurement], before: RigSolution | None = None) -> RigReport:
         """The report on what was measured."""
         rig, description = measurer.rig, measurer.description
         known = {s.name: rig.reference(s.name) for s in description.sensors}
@@ -53,7 +56,8 @@ class RigReport:
         frames = {s.name: s.frame or rig.frame_id(s.name) for s in description.sensors}
         cameras = {name: rig.camera(name) for name in description.cameras}
         return cls(
-            *(description, measurer.solution(measured), measured, frames, cameras, truth, measurer.config.refine, rig.name)
+            *(description, measurer.solution(measured), measured, frames, cameras, truth, measurer.config.refine, rig.name),
+            before=before,
         )
 
     def at_sensor(self, name: str) -> Covariance:
@@ -94,13 +98,20 @@ class RigReport:
     def _direction(self, name: str, twist: Matrix) -> str:
         """An unobservable direction at the sensor, in the reference's axes."""
         v = se3.parts_jacobian(self.solution.poses[name]) @ twist
-        prior = se3.parts_jacobian(self.solution.prior[name][0]) @ self.solution.prior[name][1]
-        sigma = np.sqrt(np.diag(prior @ se3.parts_jacobian(self.solution.prior[name][0]).T))
+        T, C = self.solution.prior[name]
+        sigma = np.sqrt(np.diag(se3.parts_jacobian(T) @ C @ se3.parts_jacobian(T).T))
         axis = int(np.argmax(np.abs(v) / sigma))
         own = float(np.sqrt(self.at_sensor(name)[axis, axis]))
         if axis < 3:
             return f"its rotation about {AXES[axis]} ({np.rad2deg(own):.2f} deg)"
         return f"its place along {AXES[axis - 3]} ({100 * own:.0f} cm)"
+
+    @cached_property
+    def changes(self) -> tuple[tuple[RigHypothesis, ...], str]:
+        """What may have happened since `before`, and a line about it; nothing where that is unknown."""
+        if self.before is None:
+            return (), ""
+        return verdict(hypotheses(self.before, [m.edge for m in self.measured if m.edge is not None]))
 
     @property
     def converged(self) -> bool:
@@ -125,6 +136,7 @@ class RigReport:
                  "p_value": loop.p_value, "closes": loop.closes}
                 for loop in s.loops
             ],
+            **({} if self.before is None else {"changes": [_change(h) for h in self.changes[0]], "change": self.changes[1]}),
             "version": VERSION,
         }  # fmt: skip
 
@@ -214,7 +226,7 @@ class RigReport:
             lines += [caption] + [
                 "  " + "  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)).rstrip() for r in [header, *rows]
             ]
-        return "\n".join(lines)
+        return "\n".join([*lines, *([] if self.before is None else [f"Since the former result: {self.changes[1]}"])])
 
     def html(self) -> str:
         """A page that needs nothing from elsewhere: the rig from above, and the tables."""
@@ -224,6 +236,8 @@ class RigReport:
                 "".join(f"<{tag}>{escape(c)}</{tag}>" for c in row) for tag, row in [("th", header), *(("td", r) for r in rows)]
             ]
             parts.append(f"<h2>{escape(caption)}</h2><table>{''.join(f'<tr>{c}</tr>' for c in cells)}</table>")
+        if self.before is not None:
+            parts.append(f"<p>Since the former result: {escape(self.changes[1])}</p>")
         style = "body{font-family:sans-serif;margin:2em}tr:first-child{font-weight:bold}td{padding:.2em .8em}"
         return f'<!doctype html><meta charset="utf-8"><title>Rig</title><style>{style}</style>{"".join(parts)}\n'
 
@@ -261,6 +275,42 @@ class RigReport:
             export.write_joints(path, poses, edges)
         else:
             io.write_atomically(path, export.autoware_yaml(*poses).encode())
+
+
+def _change(found: RigHypothesis) -> dict[str, Any]:
+    deg, m = found.size
+    return {
+        "kind": found.kind,
+        "sensors": list(found.sensors),
+        "posterior": found.posterior,
+        "rotation_deg": deg,
+        "translation_m": m,
+        "displacement": found.displacement.tolist(),
+        "p_value": found.p_value,
+    }
+
+
+def load(path: str | Path) -> RigSolution:
+    """The solution in a file of `RigReport.save`. BadInputError for another one."""
+    text = io.read_text(path, "result", "a JSON result of calib-ros rig")
+    try:
+        data = json.loads(text)
+        poses = {name: se3.as_transform(s["T_reference_sensor"], name) for name, s in data["sensors"].items()}
+        covariance = np.array(data["covariance"], float)
+        edges = tuple(
+            Edge(
+                *(e["target"], e["source"], se3.as_transform(e["T_target_source"], "an edge"), np.array(e["covariance"], float)),
+                *(e["kind"], e["time_offset_s"], e["time_offset_sigma_s"]),
+            )
+            for e in data["edges"]
+            if e["fate"] in ("used", "doubted")
+        )
+        solution = RigSolution(data["reference"], poses, covariance, edges)
+        if covariance.shape != (6 * len(solution.columns),) * 2 or list(solution.columns) != data["covariance_of"]:
+            raise ValueError
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        raise BadInputError(f"{path} is no result of calib-ros rig; give the file that --json wrote") from None
+    return solution
 
 
 def check_out(path: str) -> None:

@@ -111,6 +111,15 @@ def test_what_no_edge_tells_rests_on_the_prior() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(C))[3:], 0.2, rtol=0.05)
 
 
+def test_priors_of_two_sensors_joined_by_an_edge_are_no_measurement() -> None:
+    """Together they tell twice as much as one alone of where both are."""
+    poses = rig(1, 2)
+    rng = np.random.default_rng(9)
+    measured = edges(poses, [("c0", "c1")], rng)
+    solution = solve(measured, priors(poses, rng), "l0")
+    assert solution.open["c0"].shape == solution.open["c1"].shape == (6, 6)
+
+
 def test_an_edge_of_an_unknown_sensor_is_named() -> None:
     with pytest.raises(BadInputError, match="edge c9-l0: c9 has no prior; the rig has l0"):
         solve([Edge("c9", "l0", np.eye(4), np.eye(6))], {}, "l0")

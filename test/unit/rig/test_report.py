@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -18,7 +19,7 @@ from calib_ros.export import Pose
 from calib_ros.rig.description import RigDescription, Sensor
 from calib_ros.rig.edges import Measurement
 from calib_ros.rig.graph import solve
-from calib_ros.rig.report import RigReport, check_out
+from calib_ros.rig.report import RigReport, check_out, load
 
 POSES = rig(1, 3)
 CAMERA = Camera(np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]), 640, 480, "plumb_bob", np.array([-0.3, 0.1, 1e-3, 0, 0]))
@@ -66,6 +67,22 @@ def test_json_holds_poses_covariances_edges_and_loops(report: RigReport) -> None
     assert sensor["frame"] == "c1_link"
     assert sensor["reference_error"]["rotation_deg"] < 0.3
     assert [e["fate"] for e in data["edges"]] == ["used", "used", "failed"]
+
+
+def test_a_former_result_tells_what_has_moved(report: RigReport, tmp_path: Path) -> None:
+    path = tmp_path / "before.json"
+    report.save(str(path))
+    before = load(path)
+    assert np.array_equal(before.covariance, report.solution.covariance)
+    assert replace(report, before=before).changes[1] == "nothing has changed"
+    knock = se3.exp([0, 0.02, 0, 0.05, 0, 0])
+    moved = [m if m.target != "c1" else replace(m, edge=replace(m.edge, T=knock @ m.edge.T)) for m in report.measured if m.edge]
+    told = replace(report, measured=moved, before=before)
+    assert told.to_dict()["changes"][0]["sensors"] == ["c1"]
+    assert "Since the former result: c1 moved by 1.1" in told.text()
+    path.write_text('{"sensors": {}}')
+    with pytest.raises(BadInputError, match="is no result of calib-ros rig; give the file that --json wrote"):
+        load(path)
 
 
 def test_words_and_page_name_every_sensor(report: RigReport) -> None:

@@ -1,0 +1,181 @@
+"""From a recording to the graph: the halves of a synthetic drive's pictures as two cameras around its LiDAR."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import QUICK, RenderedDrive
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.cli.main import main
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.registration.features import FeatureExtractor, ScanEdges
+from calib_ros.rig import edges
+from calib_ros.rig.description import RigDescription, Sensor
+from calib_ros.rig.edges import RigMeasurer, box_of, priors_of, seen_share
+from calib_ros.rig.report import RigReport
+
+HALVES = {"left": slice(0, 380), "right": slice(260, 640)}  # columns
+
+
+class Half:
+    """Some columns of a drive's pictures as a source of their own."""
+
+    lidar_frame = "lidar"
+
+    def __init__(self, drive: RenderedDrive, name: str) -> None:
+        self._drive, self._columns, self.name, self.camera_frame = drive, HALVES[name], name, name
+        K = drive.camera.K.copy()
+        K[0, 2] -= self._columns.start
+        own = drive.camera
+        self.camera = Camera(K, self._columns.stop - self._columns.start, own.height, own.model, own.D)
+        self.reference = drive.reference
+
+    def __len__(self) -> int:
+        return len(self._drive)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = self._drive[index]
+        return replace(frame, image=np.ascontiguousarray(frame.image[:, self._columns]), camera=self.camera, classes=None)
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+class TwoHalves:
+    """A rig of one LiDAR and two cameras, which are the halves of one."""
+
+    name, cameras, lidars, reference_sensor = "two halves", ("left", "right"), ("top",), "top"
+
+    def __init__(self, drive: RenderedDrive) -> None:
+        self._drive, self._pairs = drive, {name: Half(drive, name) for name in HALVES}
+
+    def camera(self, name: str) -> Camera:
+        return self._pairs[name].camera
+
+    def frame_id(self, name: str) -> str:
+        return name
+
+    def reference(self, name: str) -> np.ndarray | None:
+        return np.eye(4) if name == "top" else se3.inverse(self._drive.reference)
+
+    def pair(self, camera: str, lidar: str) -> Half:
+        return self._pairs[camera]
+
+    def scans(self, lidar: str) -> Sequence[tuple[int, PointCloud]]:
+        frames = [self._drive[k] for k in range(len(self._drive))]
+        return [(frame.moment_of_cloud, frame.cloud) for frame in frames]
+
+
+@pytest.fixture(scope="module")
+def halves(drive: RenderedDrive) -> TwoHalves:
+    return TwoHalves(drive)
+
+
+@pytest.fixture
+def description(halves: TwoHalves) -> RigDescription:
+    """Cameras are believed 1 deg and several cm from where they are, each in another direction."""
+    off = {"left": ([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]), "right": ([-0.6, 0.5, 0.3], [-0.05, 0.05, 0.03])}
+    priors = {n: se3.inverse(se3.perturb(se3.inverse(halves.reference(n)), *by)) for n, by in off.items()}  # type: ignore[arg-type]
+    cameras = [Sensor(n, "camera", prior=T, sigma_deg=0.7, sigma_m=0.05) for n, T in priors.items()]
+    return RigDescription((Sensor("top", "lidar"), *cameras), "top")
+
+
+def test_two_cameras_are_found_around_their_lidar(halves: TwoHalves, description: RigDescription) -> None:
+    measurer = RigMeasurer(halves, description, QUICK)
+    measured = measurer.measure()
+    report = RigReport.of(measurer, measured)
+    assert [(m.target, m.source, m.kind) for m in measured] == [("left", "top", "registration"), ("right", "top", "registration")]
+    assert report.converged, report.text()
+    for name, (deg, m) in edges.errors(report.solution, report.truth).items():
+        assert deg < 0.2, name
+        assert m < 0.04, name
+    # The baseline of two cameras that are one.
+    T, C = report.solution.between("left", "right")
+    xi = se3.log(T)
+    assert xi @ np.linalg.solve(C, xi) < 22.5
+    assert len(measurer._shared["top"]) == len(halves.scans("top"))
+
+
+def test_a_scan_is_searched_once_for_all_cameras(halves: TwoHalves, monkeypatch: pytest.MonkeyPatch) -> None:
+    shared: ScanEdges = {}
+    frames = [halves.pair(name, "top")[0] for name in HALVES]
+    alone = [FeatureExtractor(frame.camera, QUICK)(frame) for frame in frames]
+    together = [FeatureExtractor(frames[0].camera, QUICK, shared)(frames[0])]
+    monkeypatch.setattr("calib_ros.registration.features.range_image", None)  # a second search fails
+    together.append(FeatureExtractor(frames[1].camera, QUICK, shared)(frames[1]))
+    for one, other in zip(alone, together, strict=True):
+        assert np.array_equal(one.points.xyz, other.points.xyz)
+        assert all(np.array_equal(a.maps, b.maps) for a, b in zip(one.levels, other.levels, strict=True))
+
+
+def test_what_fails_is_told_and_the_rest_is_solved(halves: TwoHalves, description: RigDescription) -> None:
+    away = Sensor("right", "camera", prior=halves.reference("right") @ se3.exp([0, np.pi, 0, 0, 0, 0]), sigma_deg=0.7)
+    measurer = RigMeasurer(halves, replace(description, sensors=(*description.sensors[:2], away)), QUICK, "0:3")
+    points = measurer.scans["top"].still(0)[0]
+    assert seen_share(halves.camera("left"), se3.inverse(halves.reference("left")), points) > 0.3  # type: ignore[arg-type]
+    assert measurer.camera_pairs(measurer.solution([])) == [("left", "top"), ("right", "top")]  # a full turn is seen by all
+    measured = measurer.measure()
+    assert [m.edge is not None for m in measured if m.target == "left"] == [True]
+    assert all(m.edge is None and m.reason for m in measured if m.target == "right")
+    report = RigReport.of(measurer, measured)
+    assert report.status("left")[0] == "converged", report.text()
+    assert report.status("right")[0] == "insufficient"
+
+
+def test_the_search_follows_the_prior() -> None:
+    box = box_of(np.diag(np.r_[np.deg2rad([1.0, 2, 0.01]), 0.1, 0.2, 0.001] ** 2))
+    np.testing.assert_allclose(box.rotation_deg, [2, 4, 0.5])
+    np.testing.assert_allclose(box.translation_m, [0.2, 0.4, 0.05])
+
+
+def test_a_sensor_without_a_prior_is_named(halves: TwoHalves, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(halves, "reference", lambda name: None)
+    description = RigDescription((Sensor("top", "lidar"), Sensor("left", "camera")), "top")
+    with pytest.raises(BadInputError, match=r"two halves does not state where left is; set sensors.left.prior"):
+        priors_of(description, halves)
+
+
+RIG = "reference: lidar_left\nsensors:\n  lidar_left: {kind: lidar}\n  front: {kind: camera}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere", "--rig", "RIG"], "nowhere does not exist"),
+        (["synthetic:rig=two_lidars_three_cameras", "--rig", "nothing.yaml"], "cannot read rig nothing.yaml"),
+        (["synthetic:rig=two_lidars_three_cameras", "--rig", "RIG", "--out", "x.txt"], "the ending tells the format"),
+        (["synthetic:rig=two_lidars_three_cameras,frames=2", "--rig", "RIG", "--frames", "7"], "position 7 is outside"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments: list[str], message: str, tmp_path: Path, capsys) -> None:
+    (tmp_path / "rig.yaml").write_text(RIG)
+    assert main(["rig", *(str(tmp_path / "rig.yaml") if a == "RIG" else a for a in arguments)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+@pytest.mark.slow
+def test_the_command_estimates_a_rig_with_two_lidars(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sensors = "".join(f"  {n}: {{kind: camera}}\n" for n in ("left", "right"))
+    (tmp_path / "rig.yaml").write_text(RIG + sensors + "  lidar_right: {kind: lidar}\n")
+    out = {k: str(tmp_path / v) for k, v in {"--json": "rig.json", "--report": "rig.html", "--out": "rig.urdf"}.items()}
+    source = "synthetic:rig=two_lidars_three_cameras,frames=6,ride=weaving,seed=2"
+    code = main(["rig", source, "--rig", str(tmp_path / "rig.yaml"), *(text for pair in out.items() for text in pair)])
+    data = json.loads(Path(out["--json"]).read_text())
+    assert {name for name, s in data["sensors"].items() if s["status"] == "converged"} >= {"front", "lidar_right"}, data
+    assert code == (0 if data["status"] == "converged" else 1)
+    assert all(loop["closes"] for loop in data["loops"])
+    assert len(data["loops"]) >= 2
+    for name in ("front", "lidar_right"):
+        assert data["sensors"][name]["reference_error"]["rotation_deg"] < 0.15
+    assert "lidar_right" in capsys.readouterr().out
+    assert "<svg" in Path(out["--report"]).read_text()
+    assert "lidar_left_to_front_optical" in Path(out["--out"]).read_text()
