@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import RefineConfig
-from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, SUSPECT, TENTATIVE, Extrinsic
+from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
 from calib_ros.rig.description import RigDescription
 from calib_ros.rig.edges import Measurement
 from calib_ros.rig.graph import Edge, RigSolution, solve
 from calib_ros.rig.moved import MOVED as KNOCKED
 from calib_ros.rig.moved import hypotheses, verdict
-from calib_ros.rig.report import REFERENCE, RigReport
+from calib_ros.rig.report import RigReport
 
 UNCHECKED = "unchecked"  # status of a sensor whose pairs get no data
 KIND = "registration"
@@ -119,7 +119,7 @@ class LiveRig:
             self._before = solution if len(confirmed) == len(edges) else solve(confirmed, priors, reference)
         measured = [Measurement(*p.pair, KIND, edges.get(p.pair), p.reason) for p in known]
         report = RigReport(self._description, solution, measured, {}, {}, limits=self._limits)
-        rejected = {(e.target, e.source) for e in solution.rejected}
+        rejected = {(e.target, e.source) for e in (*solution.rejected, *solution.doubted)}
         joined = _joined(reference, [p.pair for p in known if p.usable and p.pair in edges and p.pair not in rejected])
         sensors = tuple(self._sensor(name, report, joined, moved, known) for name in solution.poses)
         return RigState(solution, sensors, moved, self._told)
@@ -128,7 +128,9 @@ class LiveRig:
         self, name: str, report: RigReport, joined: set[str], moved: Sequence[str], pairs: Sequence[PairState]
     ) -> SensorState:
         (status, reason), own = report.status(name), [p for p in pairs if name in p.pair]
-        usable = status in (CONVERGED, REFERENCE, INSUFFICIENT) and name in joined and name not in moved
+        usable = name in joined and name not in moved
+        if usable and status == REFUSED:  # as uncertain as it is, its pairs are to be relied on
+            status = INSUFFICIENT
         if name in moved:
             status, reason = MOVED, self._told
         elif not usable and (objecting := [p for p in own if not p.usable]):
