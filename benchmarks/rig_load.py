@@ -40,7 +40,8 @@ HEAD = """\
 
 def thinned(bag: Path, topics: list[str]) -> list[Recorded]:
     """Messages of a bag in the order of time, images at most at 10 Hz."""
-    file, last, kept = BagFile(bag), defaultdict(lambda: -SPACING_NS), []
+    file, kept = BagFile(bag), list[Recorded]()
+    last: dict[str, int] = defaultdict(lambda: -SPACING_NS)
     for topic, _, data in file.raw(topics):
         stamp = peek_header(data)[0]
         if stamp - last[topic] >= SPACING_NS:
@@ -80,7 +81,7 @@ def measure(bag: Path, folder: Path, cameras: int, seconds: float, given: list[s
     command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args", "-p", f"rig_file:={file}"]
     command += [word for value in given for word in ("-p", value)]
     rclpy.init()
-    node, statuses, rigs = rclpy.create_node("player"), {}, []
+    node, statuses, rigs = rclpy.create_node("player"), dict[str, Any](), list[Rig]()
     publishers = {t: node.create_publisher(message_class(kind), t, QoSProfile(depth=20)) for t, kind in kinds.items()}
     node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: statuses.update({s.name: s for s in m.status}), 50)
     node.create_subscription(Rig, "/calib_ros/rig", rigs.append, LATCHED)

@@ -28,7 +28,7 @@ from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, ProcessedPublisher
 from calib_ros.ros.rig_node import RigInterface
-from calib_ros.ros.rig_pairs import RigPair
+from calib_ros.ros.rig_pairs import PairOfRig
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, StaticTf
@@ -45,7 +45,7 @@ class RosInterface:
     CalibrationError for parameters that cannot work. To be used on the executor's thread. rig: what a pair shares with others.
     """
 
-    def __init__(self, node: Node, rig: RigPair | None = None) -> None:
+    def __init__(self, node: Node, rig: PairOfRig | None = None) -> None:
         self._node, self._rig = node, rig
         self.nodes: tuple[Node, ...] = ()  # beside this one
         self.parameters = parameters.declare(node)

@@ -38,7 +38,7 @@ from calib_ros.ros.conversions import covariance_for_ros, time_message, transfor
 from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import VALID_PERIODS
-from calib_ros.ros.rig_pairs import RigPair, SharedTopics, decoded_clouds, decoded_images
+from calib_ros.ros.rig_pairs import PairOfRig, SharedTopics, decoded_clouds, decoded_images
 from calib_ros.ros.tf import LATCHED, StaticTf
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class RigInterface:
     interface of a pair. Raises a CalibrationError for a rig file or parameters that cannot work.
     """
 
-    def __init__(self, node: Node, declared: Parameters, make: Callable[[Node, RigPair], RosInterface]) -> None:
+    def __init__(self, node: Node, declared: Parameters, make: Callable[[Node, PairOfRig], RosInterface]) -> None:
         self._node, self.parameters, self.health = node, declared, Health(node.get_logger())
         self.description = read_rig(declared["rig_file"])
         wanted = _pairs(self.description, declared["rig_file"])
@@ -78,7 +78,7 @@ class RigInterface:
         self.pairs: dict[Pair, RosInterface] = {}
         self.nodes: tuple[Node, ...] = ()
         for camera, lidar in wanted:
-            pair = RigPair(*(camera, lidar, common, self._shared, self._topics(camera, lidar), decoded[camera], decoded[lidar]))
+            pair = PairOfRig(*(camera, lidar, common, self._shared, self._topics(camera, lidar), decoded[camera], decoded[lidar]))
             known = self._between(camera, lidar)
             pair.T = None if known is None else known[0]
             own = _node_of(node, camera, lidar, self._overrides(camera, lidar, known))

@@ -118,7 +118,7 @@ def decoded_images() -> Decoded:
 
 
 @dataclass(eq=False)
-class RigPair:
+class PairOfRig:
     """What a pair's interface takes from its rig.
 
     camera, lidar: names. topics: of image, points and CameraInfo. T: T_camera_lidar (4, 4) by the priors; None = unknown. unseen:
