@@ -63,14 +63,17 @@ class CalibLifecycleNode(LifecycleNode):
 
     def _configure(self) -> None:
         self.calibration = interface(self)
-        for other in self.calibration.nodes if self.executor is not None else ():
-            self.executor.add_node(other)
+        for other in self.calibration.nodes:
+            if self.executor is not None:
+                self.executor.add_node(other)
 
     def _clean_up(self) -> None:
         calibration, self.calibration = self.calibration, None
         if calibration is not None:
             self._ended = calibration.destroy() and self._ended
             for other in calibration.nodes:
+                if self.executor is not None:
+                    self.executor.remove_node(other)
                 other.destroy_node()
 
     def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:

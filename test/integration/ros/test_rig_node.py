@@ -5,23 +5,36 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from subprocess import run
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rig_peer import RigPeer, again, describe, measured, poses
+from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 from waiting import pause
 
 from calib_ros import se3
+from calib_ros.config import OnlineConfig
+from calib_ros.errors import BadInputError
 from calib_ros.lidar.edges import edge_points
 from calib_ros.lidar.ego_motion import estimate_motion
 from calib_ros.messages import decode_cloud
 from calib_ros.online import common
+from calib_ros.online.common import Common
 from calib_ros.registration import features
 from calib_ros.ros import conversions
+from calib_ros.ros.lifecycle_node import CalibLifecycleNode
+from calib_ros.ros.rig_pairs import PairOfRig
 from calib_ros.ros.tf import LATCHED
 from calib_ros_synthetic.rig import SyntheticRig
 
@@ -147,6 +160,44 @@ def test_a_knocked_camera_is_named_with_its_size_and_found_again(rig, driven) ->
     assert f"{LEFT} moved by" in peer.rigs[-1].text
     stamp = driven.items[-1][0]
     assert is_near(rig, peer, (LEFT,), lambda name: knocked.reference_at(name, stamp))
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_pair_that_shares_no_view_by_its_priors_is_left_out_unless_it_is_listed(rig, given) -> None:
+    """Of the front camera, the points behind the vehicle."""
+    cloud, camera, told = rig.scans(TOP)[0][1], rig.camera("front"), []
+    behind = replace(cloud, xyz=cloud.xyz * np.float32([-1, -1, 1])).select(cloud.xyz[:, 0] > 0)
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    pair = PairOfRig("front", TOP, Common(OnlineConfig()), None, ("",) * 3, lambda _: image, lambda _: behind)
+    pair.T, pair.unseen = se3.inverse(rig.reference("front")), None if given else told.append
+    message = SimpleNamespace(header=Header())
+    if given:
+        assert pair.frame(message, message, camera).image is image
+        return
+    with pytest.raises(BadInputError, match="front and lidar_top share no view by their priors"):
+        pair.frame(message, message, camera)
+    assert len(told) == 1
+    assert pair.frame(message, message, camera).image is image  # whoever asks again knows it
+
+
+def test_a_managed_node_makes_its_pairs_and_leaves_none_behind(rig, tmp_path) -> None:
+    context = Context()
+    rclpy.init(context=context)
+    file = str(describe(rig, (LEFT, RIGHT), tmp_path / "rig.yaml"))
+    node = CalibLifecycleNode(context=context, parameter_overrides=[Parameter("rig_file", value=file)])
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    for transition in (node.trigger_configure, node.trigger_activate):
+        assert transition() == TransitionCallbackReturn.SUCCESS
+    assert [own.get_fully_qualified_name() for own in node.calibration.nodes] == [f"/calib_ros/{c}/{TOP}" for c in (LEFT, RIGHT)]
+    assert len(executor.get_nodes()) == 3
+    executor.spin_once(timeout_sec=0.1)
+    for transition in (node.trigger_deactivate, node.trigger_cleanup):
+        assert transition() == TransitionCallbackReturn.SUCCESS
+    assert (executor.get_nodes(), node.calibration) == ([node], None)
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
 
 
 @pytest.mark.parametrize(
