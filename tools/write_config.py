@@ -29,7 +29,8 @@ REFERENCE, TABLE = ROOT / "docs" / "parameters.md", ROOT / "docs" / "figures" / 
 # What the parameter file shows, in this order. All other parameters are set in the same file by their names.
 GROUPS = {
     "Topics": [
-        "image_transport", "image_is_rectified", "reliability", "camera_frame", "lidar_frame", "online.pair_tolerance_s",
+        "rig_file", "image_transport", "image_is_rectified", "reliability", "camera_frame", "lidar_frame",
+        "online.pair_tolerance_s",
     ],
     "Initial extrinsic, and what is known about it (T_camera_lidar: p_camera = T_camera_lidar * p_lidar)": [
         "state_file", "initial_translation_m", "initial_quaternion_xyzw", "initial_from_tf", "nominal_yaw_deg",

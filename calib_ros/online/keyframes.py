@@ -231,11 +231,14 @@ class EgoMotion:
     """Twist of the LiDAR from scan to scan, for keyframes that come without odometry. Not thread-safe.
 
     config may be replaced at any time. last: the last estimate, None before the first. missing: a line for a person if
-    small_gicp is not installed, else "". left_out: keyframes that were given up, see `check_known`.
+    small_gicp is not installed, else "". left_out: keyframes that were given up, see `check_known`. estimate: that of
+    `estimate_motion`, or one that remembers.
     """
 
-    def __init__(self, config: MotionConfig, accumulate_s: float = 0.0) -> None:
-        self.config, self.accumulate_s = config, accumulate_s
+    def __init__(
+        self, config: MotionConfig, accumulate_s: float = 0.0, estimate: Callable[..., Motion] = estimate_motion
+    ) -> None:
+        self.config, self.accumulate_s, self._estimate = config, accumulate_s, estimate
         self._scans: deque[Stamped] = deque()  # of the last accumulate_s, oldest first
         self._accumulator = Accumulator()
         self.last: Motion | None = None
@@ -282,7 +285,7 @@ class EgoMotion:
             return frame
         start = None if self.last is None else self.last.twist
         try:
-            self.last = estimate_motion(before[1], frame.cloud, (stamp - before[0]) / NANOSECONDS, self.config, start)
+            self.last = self._estimate(before[1], frame.cloud, (stamp - before[0]) / NANOSECONDS, self.config, start)
         except MissingDependencyError as error:
             self.missing = f"scans are not corrected for the vehicle's motion: {error}"
             return frame

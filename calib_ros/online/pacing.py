@@ -68,21 +68,30 @@ class Meter:
         self._work, self._since = work, now
 
 
+class Purse:
+    """What has been saved up, s of CPU time, and until when, by the clock; of one budget, or of several that share it. lock:
+    to be held. clock: s, never runs back."""
+
+    def __init__(self, config: OnlineConfig, clock: Callable[[], float] = time.monotonic) -> None:
+        self.clock, self.lock = clock, threading.Lock()
+        self.at, self.saved = clock(), SAVED_S * config.max_load
+
+
 class LoadBudget:
     """Saves up max_load seconds of CPU time per second, up to SAVED_S seconds of it, and spends it on the work. Thread-safe.
 
     What is done is known only afterwards: the budget may be overdrawn by one keyframe or estimate, and what comes next waits
     until that is made up for. An estimate that waits and the keyframes take turns, by the CPU time that they take: else keyframes
-    would use up whatever is there. config may be replaced at any time. clock: s, never runs back.
+    would use up whatever is there. config may be replaced at any time. purse: shared with others, each of which has
+    turns of its own, and its least of keyframes and estimates.
     """
 
-    def __init__(self, config: OnlineConfig, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, config: OnlineConfig, clock: Callable[[], float] = time.monotonic, purse: Purse | None = None) -> None:
         self.config = config
-        self._clock, self._lock = clock, threading.Lock()
+        self._purse = purse or Purse(config, clock)
+        self._clock, self._lock = self._purse.clock, self._purse.lock
         self._seconds = dict.fromkeys(Work, 0.0)
         self._keyframes = self._postponed = self._forced = 0
-        self._at = clock()
-        self._saved = SAVED_S * config.max_load
         self._last = dict.fromkeys((Work.KEYFRAMES, Work.ESTIMATES, Work.CLASSES), -float("inf"))  # when the last one began
         self._estimate_waits = False
         self._last_estimate_s = self._keyframes_since_s = 0.0  # CPU time of the last estimate, and of the keyframes since
@@ -106,13 +115,13 @@ class LoadBudget:
             self._seconds[work] += seconds
             if not charged:
                 return
-            self._saved -= seconds
+            self._purse.saved -= seconds
             if work is Work.KEYFRAMES:
                 self._keyframes_since_s += seconds
             elif work is Work.ESTIMATES:
                 self._last_estimate_s, self._keyframes_since_s = seconds, 0.0
             # Intake goes on whatever it costs. Large debts are forgiven, or a larger max_load would help only after hours.
-            self._saved = max(self._saved, -max(SAVED_S, self._last_estimate_s))
+            self._purse.saved = max(self._purse.saved, -max(SAVED_S, self._last_estimate_s))
 
     def count_messages(self) -> None:
         """The calling thread receives the messages: its CPU time counts from now on. Does nothing where it cannot be told."""
@@ -130,7 +139,7 @@ class LoadBudget:
         with self._lock:
             now = self._update()
             turn = not self._estimate_waits or self._keyframes_since_s < self._last_estimate_s
-            affordable = self._saved >= 0 and turn
+            affordable = self._purse.saved >= 0 and turn
             if not affordable and now - self._last[Work.KEYFRAMES] < KEYFRAME_EVERY_S:
                 self._postponed += 1
                 return False
@@ -143,7 +152,7 @@ class LoadBudget:
         """True if an estimate is due and may begin. If it is due and may not, keyframes make room for it."""
         with self._lock:
             now = self._update()
-            affordable = self._saved >= 0 or now - self._last[Work.ESTIMATES] >= ESTIMATE_EVERY_S
+            affordable = self._purse.saved >= 0 or now - self._last[Work.ESTIMATES] >= ESTIMATE_EVERY_S
             self._estimate_waits = due and not affordable
             return due and affordable
 
@@ -156,7 +165,7 @@ class LoadBudget:
         """True if a keyframe may be given classes. needed: without them there will be no estimate."""
         with self._lock:
             now = self._update()
-            enough = self._saved >= CLASSES_RESERVE * SAVED_S * self.config.max_load
+            enough = self._purse.saved >= CLASSES_RESERVE * SAVED_S * self.config.max_load
             allowed = needed or enough or now - self._last[Work.CLASSES] >= CLASSES_EVERY_S
             if allowed:
                 self._last[Work.CLASSES] = now
@@ -174,15 +183,15 @@ class LoadBudget:
         """With the lock held: the time, with what was saved up and received until then."""
         now = self._clock()
         limit = self.config.max_load
-        self._saved = min(self._saved + limit * (now - self._at), SAVED_S * limit)
-        self._at = now
+        self._purse.saved = min(self._purse.saved + limit * (now - self._purse.at), SAVED_S * limit)
+        self._purse.at = now
         if self._executor is not None:
             own, before = self._executor
             with suppress(OSError):  # the thread has ended
                 spent = time.clock_gettime(own)
                 self._executor = own, spent
                 self._seconds[Work.MESSAGES] += spent - before
-                self._saved -= spent - before
+                self._purse.saved -= spent - before
         return now
 
 

@@ -24,6 +24,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
+from calib_ros.online.common import Common
 from calib_ros.online.deferred import Deferred, DeferredJob
 from calib_ros.online.events import Announcer, Event, FrameIngested, Inputs, IntakeIdle, JobDone, Problem
 from calib_ros.online.keyframes import SpeedGate
@@ -34,7 +35,6 @@ from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.requests import Requests
 from calib_ros.online.worker import Worker
 from calib_ros.registration.classes import Segmentation
-from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.progress import Callback
 from calib_ros.result import Extrinsic, Result
 
@@ -49,18 +49,23 @@ class Pipeline:
     sink: called with every event, on the worker threads, and after reset() on the thread that called it. Extrinsics come in
     order: the last one is the current one. camera: intrinsics of the images, None before any. recalibrator: None before the
     first pair. last_keyframe: the newest keyframe's frame. load: the CPU time of the threads' work, and what it allows for.
+    common: shared with the pipelines of other pairs of a rig. lidar: name of the LiDAR in there.
     """
 
-    def __init__(self, config: Config, inputs: Inputs, sink: Callable[[Event], None]) -> None:
+    def __init__(
+        self, config: Config, inputs: Inputs, sink: Callable[[Event], None], common: Common | None = None, lidar: str = ""
+    ) -> None:
         self.config = config
         self.camera: Camera | None = None
         self.recalibrator: Recalibrator | None = None
         self.last_keyframe: Frame | None = None
         self._pairing = Pairing(config, inputs.decode_cloud is not None)
         self.speed_gate = SpeedGate(config.online)
-        self.load = LoadBudget(config.online)
+        self._common = common or Common(config.online)
+        self._scans = None if common is None else common.scans(lidar)
+        self.load = LoadBudget(config.online, purse=self._common.purse)
         self._inputs = inputs
-        self._segmentation = models_of(config.semantics)
+        self._segmentation = self._common.models(config.semantics)
         self._requests, self._deferred = Requests(), Deferred()
         self.dropped_pairs = 0  # that a newer one replaced before they were ingested
         self.rested_pairs = 0  # that were left out, since there was no need to look at them
@@ -93,7 +98,7 @@ class Pipeline:
     def _recalibrator_at(self, camera: Camera, initial: Result, current: Result | None = None) -> Recalibrator:
         """A new one; its frames are those of the initial extrinsic."""
         names = initial.camera_frame, initial.lidar_frame
-        return Recalibrator(camera, initial, self.config, *names, current, self.speed_gate, self.segmentation)
+        return Recalibrator(camera, initial, self.config, *names, current, self.speed_gate, self.segmentation, self._scans)
 
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""
@@ -231,7 +236,7 @@ class Pipeline:
     def segmentation(self) -> Segmentation:
         """The models, loaded ones where there are some: loading takes seconds."""
         last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
-        return last if last.config == self.config.semantics else models_of(self.config.semantics)
+        return last if last.config == self.config.semantics else self._common.models(self.config.semantics)
 
     @property
     def taking_in(self) -> bool:
@@ -254,7 +259,7 @@ class Pipeline:
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
     def _ingest(self, intake: Intake) -> None:
-        with self.load.counting(Work.INTAKE) as meter:
+        with self._common.intake.mine(self._ingester.check_cancelled), self.load.counting(Work.INTAKE) as meter:
             self._take_in(intake, meter)
 
     def _take_in(self, intake: Intake, meter: Meter) -> None:
@@ -352,11 +357,12 @@ class Pipeline:
 
     def _estimate_and_defer(self, _: None) -> None:
         """An estimate if one is asked for or due, then a job if one waits, so that each has its turn."""
-        try:
-            self._estimate()
-        finally:
-            if self._deferred.waiting:
-                self._do_job()
+        with self._common.estimates.mine(self._estimator.check_cancelled):
+            try:
+                self._estimate()
+            finally:
+                if self._deferred.waiting:
+                    self._do_job()
 
     def _do_job(self) -> None:
         with self.load.counting(Work.CHECKS, charged=False):
@@ -403,7 +409,7 @@ class Pipeline:
     def _segment(self, _: None) -> None:
         recalibrator = self.recalibrator
         if recalibrator is not None:
-            with self.load.counting(Work.CLASSES):
+            with self._common.classes.mine(self._segmenter.check_cancelled), self.load.counting(Work.CLASSES):
                 problems = recalibrator.segment_keyframe(lambda: self._segmenter.stopping or self.paused)
             for k, problem in enumerate(problems):
                 self._announcer.tell(Problem(problem, f"model {k}"))

@@ -15,9 +15,11 @@ from calib_ros.config import Config
 from calib_ros.config.online import CONTINUOUS
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.intrinsics import RefinedCamera
+from calib_ros.lidar.ego_motion import estimate_motion
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.coach import Advice, Counted, advise
+from calib_ros.online.common import SharedScans
 from calib_ros.online.first_guess import FirstGuess
 from calib_ros.online.glance import Glance
 from calib_ros.online.keyframe_classes import KeyframeSegmenter
@@ -64,6 +66,8 @@ class Recalibrator:
         One that is fed with odometry from outside.
     segmentation : Segmentation, optional
         The models, where they are loaded already.
+    scans : SharedScans, optional
+        What is found out of the LiDAR's scans, shared with the recalibrators of other cameras beside it.
     """
 
     def __init__(
@@ -76,6 +80,7 @@ class Recalibrator:
         current: Result | None = None,
         speed_gate: SpeedGate | None = None,
         segmentation: Segmentation | None = None,
+        scans: SharedScans | None = None,
     ) -> None:
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
         self._configured = config or Config()
@@ -89,11 +94,14 @@ class Recalibrator:
         self.segmentation = segmentation or models_of(self.config.semantics)
         self.segmenter = KeyframeSegmenter()
         self.selector = KeyframeSelector(self.config.online)
-        self.motion = EgoMotion(self.config.motion, self.config.lidar.accumulate_s)
+        self._scans = scans
+        self.motion = EgoMotion(
+            self.config.motion, self.config.lidar.accumulate_s, estimate_motion if scans is None else scans.motion
+        )
         self.speed_gate = speed_gate or SpeedGate(self.config.online)
         self.schedule, self.rest = Schedule(self.config.online), Rest()
         self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
-        self._calibrator = Calibrator(camera, self.config, self.segmentation)
+        self._calibrator = self._calibrator_for(self.config)
         self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
@@ -112,8 +120,12 @@ class Recalibrator:
         with self._calibrator_lock:
             config, last = self.config, self._calibrator
             if replace(config, online=last.config.online) != last.config:
-                self._calibrator = Calibrator(self.camera, config, self.segmentation)
+                self._calibrator = self._calibrator_for(config)
             return self._calibrator
+
+    def _calibrator_for(self, config: Config) -> Calibrator:
+        edges = None if self._scans is None else self._scans.edges(config.lidar)
+        return Calibrator(self.camera, config, self.segmentation, scans=edges)
 
     @property
     def buffer(self) -> deque[FrameFeatures]:

@@ -35,9 +35,14 @@ LIVOX_DATATYPES = {"u4": PointField.UINT32, "f4": PointField.FLOAT32, "u1": Poin
 
 def frame_from_messages(image: Serialized, cloud: Serialized, camera: Camera) -> Frame:
     """Image or CompressedImage and PointCloud2 -> Frame. BadInputError if one of them cannot be decoded."""
+    stamps = stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp)
+    return Frame(pixels_from_message(image), cloud_from_message(cloud), camera, *stamps)
+
+
+def pixels_from_message(image: Serialized) -> NDArray[np.uint8]:
+    """Image or CompressedImage -> its pixels. BadInputError if it cannot be decoded."""
     picture = image.message()
-    pixels = decode_compressed_image(picture) if hasattr(picture, "format") else decode_image(picture)
-    return Frame(pixels, cloud_from_message(cloud), camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
+    return decode_compressed_image(picture) if hasattr(picture, "format") else decode_image(picture)
 
 
 def cloud_from_message(cloud: Serialized) -> PointCloud:

@@ -8,7 +8,8 @@ from typing import Any
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from calib_ros.errors import CalibrationError, defect
-from calib_ros.ros.node import RosInterface
+from calib_ros.ros.node import RosInterface, interface
+from calib_ros.ros.rig_node import RigInterface
 
 
 class CalibLifecycleNode(LifecycleNode):
@@ -19,7 +20,7 @@ class CalibLifecycleNode(LifecycleNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("calib_ros", allow_undeclared_parameters=True, **kwargs)
-        self.calibration: RosInterface | None = None
+        self.calibration: RosInterface | RigInterface | None = None
         self._ended = True  # all threads of calibrations that are gone
         self.get_logger().info("waiting to be configured and activated")
 
@@ -56,17 +57,24 @@ class CalibLifecycleNode(LifecycleNode):
         self.stop()
         super().destroy_node()
 
-    def _configured(self) -> RosInterface:
+    def _configured(self) -> RosInterface | RigInterface:
         assert self.calibration is not None  # the state machine sees to it
         return self.calibration
 
     def _configure(self) -> None:
-        self.calibration = RosInterface(self)
+        self.calibration = interface(self)
+        for other in self.calibration.nodes:
+            if self.executor is not None:
+                self.executor.add_node(other)
 
     def _clean_up(self) -> None:
         calibration, self.calibration = self.calibration, None
         if calibration is not None:
             self._ended = calibration.destroy() and self._ended
+            for other in calibration.nodes:
+                if self.executor is not None:
+                    self.executor.remove_node(other)
+                other.destroy_node()
 
     def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         """rclpy itself would end a transition that raises without a word."""

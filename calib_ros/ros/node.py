@@ -28,6 +28,8 @@ from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.distributions import remark
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, ProcessedPublisher
+from calib_ros.ros.rig_node import RigInterface
+from calib_ros.ros.rig_pairs import PairOfRig
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, StaticTf
@@ -41,11 +43,12 @@ class RosInterface:
     """Topics, services and parameters on a node of any kind, as docs/vehicle.md lists them.
 
     Made with everything but the subscriptions to the sensors; activate() begins to receive and to estimate. Raises a
-    CalibrationError for parameters that cannot work. To be used on the executor's thread.
+    CalibrationError for parameters that cannot work. To be used on the executor's thread. rig: what a pair shares with others.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, rig: PairOfRig | None = None) -> None:
+        self._node, self._rig = node, rig
+        self.nodes: tuple[Node, ...] = ()  # beside this one
         self.parameters = parameters.declare(node)
         self.health = Health(node.get_logger())
         given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
@@ -62,13 +65,19 @@ class RosInterface:
         self.write_back = WriteBack(lambda: self.parameters, self.tf.edges, self._files, self.health)
         self._export_settings = self._export_parameters()
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
-        inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, cloud_from_message, self.tf.other_frames)
-        self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
+        decode = (frame_from_messages, cloud_from_message) if rig is None else (rig.frame, rig.cloud)
+        inputs = Inputs(decode[0], self._frame_ids, self.initial.choose, decode[1], self.tf.other_frames)
+        shared = () if rig is None else (rig.common, rig.lidar)
+        self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event, *shared)
         self.pipeline.pause(INACTIVE)
         self.black_box = BlackBox(self.pipeline, lambda: self.parameters["capture.on"], self._record)
         self.processed = ProcessedPublisher(node, self.pipeline)
-        self.sensors = SensorSubscriptions(node, self.parameters, motion, self.pipeline, self.health, self.processed.add)
-        self.extrinsic = ExtrinsicPublisher(node, self.pipeline, lambda: self.parameters)
+        receiver = node if rig is None else rig.shared.node
+        topics = () if rig is None else (rig.shared.subscribe, rig.topics, (rig.camera, rig.lidar))
+        self.sensors = SensorSubscriptions(
+            receiver, self.parameters, motion, self.pipeline, self.health, self.processed.add, *topics
+        )
+        self.extrinsic = ExtrinsicPublisher(node, self.pipeline, lambda: self.parameters, self.sensors.silent)
         self._transform_pub = node.create_publisher(TransformStamped, "~/transform", LATCHED)
         self.overlay = OverlayPublisher(node, self.parameters["overlay_period_s"])
         self._diagnostics_pub = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -238,7 +247,8 @@ class RosInterface:
     def _every_second(self) -> None:
         with self.health.guard():
             self.health.log.catch_up()
-            self.pipeline.load.count_messages()
+            if self._rig is None:  # else the rig receives them
+                self.pipeline.load.count_messages()
             self.overlay.period_s = self.parameters["overlay_period_s"]
             self.capture.resize()
             self.sensors.check(self.parameters)
@@ -295,19 +305,32 @@ class RosInterface:
             self.pipeline.read_current(self.extrinsic.publish, wait=False)
 
 
+def interface(node: Node) -> RosInterface | RigInterface:
+    """Of one pair, or of all those of a rig where the parameter rig_file names one."""
+    declared = parameters.declare(node)
+    return RigInterface(node, declared, RosInterface) if declared["rig_file"] else RosInterface(node)
+
+
 class CalibNode(Node):
     """The node that is active from its start to its end."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("calib_ros", allow_undeclared_parameters=True, **kwargs)  # which are refused, with the nearest name
-        self.calibration = RosInterface(self)
+        self.calibration: Any = interface(self)
         self.calibration.activate()
+
+    @property
+    def others(self) -> tuple[Node, ...]:
+        """The nodes of a rig's pairs, which are to spin along with this one."""
+        return tuple(self.calibration.nodes)
 
     def stop(self) -> bool:
         """End all threads of the node; True if they ended."""
-        return self.calibration.stop()
+        return bool(self.calibration.stop())
 
     def destroy_node(self) -> None:
         """Ends the threads first: they publish through this node."""
         self.stop()
+        for other in self.others:
+            other.destroy_node()
         super().destroy_node()

@@ -39,6 +39,11 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
         "before it; empty = none",
         choices=("", *names(PRESETS)),
     ),
+    "rig_file": option(
+        "",
+        "description of a rig of several cameras and LiDARs, rig.yaml; every pair then has its topics and services below "
+        "~/CAMERA/LIDAR, and ~/rig says where all sensors are; empty = one pair",
+    ),
     "image_transport": option(
         "raw",
         "type of the image topic: raw = sensor_msgs/Image, compressed = sensor_msgs/CompressedImage",

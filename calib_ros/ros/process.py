@@ -90,7 +90,8 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
     try:
         node = make()
         node.create_timer(WAKE_S, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        executor.add_node(node)
+        for own in (node, *getattr(node, "others", ())):
+            executor.add_node(own)
         while not _asked_to_end:
             executor.spin_once()
     except CalibrationError as error:

@@ -44,11 +44,14 @@ class ExtrinsicPublisher:
     """~/extrinsic: on every change, and at least once in publish_period_s, with what a consumer needs to rely on it.
 
     DDS tells subscribers that ask for it when the messages stay away (deadline) or the process ends (liveliness). stamp: of the
-    newest message, ns. served: the consumers that may use the newest published one.
+    newest message, ns. served: the consumers that may use the newest published one. silent: which sensor sends nothing, for a
+    person.
     """
 
-    def __init__(self, node: Node, pipeline: Pipeline, parameters: Callable[[], Parameters]) -> None:
-        self._node, self._pipeline, self._parameters = node, pipeline, parameters
+    def __init__(
+        self, node: Node, pipeline: Pipeline, parameters: Callable[[], Parameters], silent: Callable[[], str] = lambda: ""
+    ) -> None:
+        self._node, self._pipeline, self._parameters, self._silent = node, pipeline, parameters, silent
         self._valid_s = VALID_PERIODS * parameters()["publish_period_s"]
         self.stamp = 0
         self.served: list[str] = []
@@ -71,7 +74,8 @@ class ExtrinsicPublisher:
         starved = self._pipeline.starved(most)
         if age > (STARVED_PERIODS * most if starved else most):
             seen = f"no usable pair of image and cloud for {age:.1f} s" if age < float("inf") else "no usable pair yet"
-            return Validity(False, 0, age, f"not checked any more: {STARVED if starved else seen}" if extrinsic.usable else "")
+            why = STARVED if starved else ", ".join(filter(None, [self._silent(), seen]))
+            return Validity(False, 0, age, f"not checked any more: {why}" if extrinsic.usable else "")
         until = self._node.get_clock().now().nanoseconds + round(self._valid_s * NANOSECONDS)
         return Validity(extrinsic.usable, until if extrinsic.usable else 0, age, STARVED if starved and age > most else "")
 

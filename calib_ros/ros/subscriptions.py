@@ -35,6 +35,7 @@ BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABL
 DEPTH = 10  # half a second of a camera at 20 Hz
 HANDOVER_S = 1.0  # the old subscription stays so long: the new one has to be discovered first
 LOSS_CHECKS = 11  # checks, at one a second, over which lost messages count: 10 s
+SILENT_S = 1.0  # without a message: slower sensors than this are of no use
 MIN_LOSSES = 5  # messages in that time; fewer are those of the discovery
 AFTER_STAMP = 12  # bytes of a message: what comes behind is the same in nearly every CameraInfo
 MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
@@ -78,7 +79,9 @@ class SensorSubscriptions:
     """Image, cloud, CameraInfo and motion; between start() and stop() every message goes to the pipeline.
 
     camera_info: the newest usable CameraInfo. motion: what measures the vehicle's motion, from motion_source(). on_received:
-    called with the header of every image and cloud, once the pipeline has been given it.
+    called with the header of every image and cloud, once the pipeline has been given it. subscribe: makes an
+    AdaptiveSubscription, or what is like it. topics: of image, cloud and CameraInfo. names: of camera and LiDAR, where people
+    know them by names.
     """
 
     def __init__(
@@ -89,9 +92,13 @@ class SensorSubscriptions:
         pipeline: Pipeline,
         health: Health,
         on_received: Callable[[Header], None],
+        subscribe: Callable[..., Any] | None = None,
+        topics: tuple[str, str, str] = ("image", "points", "camera_info"),
+        names: tuple[str, ...] = (),
     ) -> None:
         self.camera_info: Serialized | None = None
         self.adaptive: tuple[AdaptiveSubscription, ...] = ()
+        self._subscribe, self._topics, self._names = subscribe or partial(AdaptiveSubscription, node), topics, names
         self._node, self._pipeline, self._health = node, pipeline, health
         self._on_received = on_received
         self._rectified = parameters["image_is_rectified"]
@@ -102,12 +109,13 @@ class SensorSubscriptions:
     def start(self, parameters: Parameters) -> None:
         """Subscribe."""
         pipeline = self._pipeline
-        subscribe = partial(AdaptiveSubscription, self._node, preference=parameters["reliability"], guard=self._health.guard)
+        subscribe = partial(self._subscribe, preference=parameters["reliability"], guard=self._health.guard)
+        image, points, camera_info = self._topics
         self.adaptive = (
-            subscribe([serialized(self._image)], "image", self._forwarding_to(pipeline.add_image)),
-            subscribe([serialized(PointCloud2), *livox_forms()], "points", self._forwarding_to(pipeline.add_cloud)),
+            subscribe([serialized(self._image)], image, self._forwarding_to(pipeline.add_image)),
+            subscribe([serialized(PointCloud2), *livox_forms()], points, self._forwarding_to(pipeline.add_cloud)),
             # A camera's driver may publish once, latched, what never changes.
-            subscribe([serialized(CameraInfo)], "camera_info", self._on_camera_info, latched=True),
+            subscribe([serialized(CameraInfo)], camera_info, self._on_camera_info, latched=True),
         )
         if self._motion is not None:
             motion = self._motion
@@ -140,6 +148,11 @@ class SensorSubscriptions:
             self._rectified = parameters["image_is_rectified"]
             if self.camera_info is not None:
                 self._use_camera(self.camera_info)
+
+    def silent(self) -> str:
+        """Which of the sensors, by its name, sends nothing, for a person; "" if both send or have no names."""
+        told = zip(self._names, self.adaptive, strict=False)
+        return ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told if own.silent_s > SILENT_S)
 
     def _forwarding_to(self, add: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
         def on_message(stamp: int, message: Any) -> None:
@@ -209,6 +222,7 @@ class AdaptiveSubscription:
         self.reliability_offered = False
         self.silence = ""
         self._received = self._lost = 0
+        self._received_at = -float("inf")
         self._history: deque[tuple[int, int]] = deque(maxlen=LOSS_CHECKS)  # received and lost so far, at every check
         self._old: list[tuple[Any, float]] = []
         self._recent: deque[tuple[int, int]] = deque(maxlen=64)  # stamp, and number of the subscription
@@ -230,6 +244,11 @@ class AdaptiveSubscription:
     def reliable(self) -> bool:
         """True if messages that get lost are sent again."""
         return self._qos[0] == RELIABLE
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since the newest message; inf before the first."""
+        return time.monotonic() - self._received_at
 
     def lost_share(self) -> float:
         """Share of the messages of the last 10 s, 0 to 1, that the middleware has reported as lost; 0 where it reports none."""
@@ -315,6 +334,7 @@ class AdaptiveSubscription:
                 return
             self._recent.append((stamp, subscription))
             self._received += 1
+            self._received_at = time.monotonic()
             self.largest = max(self.largest, len(getattr(msg, "data", ())))
             self._callback(stamp, msg)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from calib_ros.result import Result
 from calib_ros.ros.conversions import transform_message
 
 CAMERA, LIDAR = "camera", "lidar"  # values of tf_parent
-OWN_TRANSFORMS = 16  # published transforms that are recognised when they are received: one of the newest
+OWN_TRANSFORMS = 64  # published transforms that are recognised when they are received: one of the newest
 WAIT_S = 2.0  # static transforms are latched: discovery of their publishers takes about a second
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -125,6 +125,23 @@ class StaticTf:
             self._own.append(message)
             self._published = message
             self._publisher.publish(self._type(transforms=[message]))
+
+    def publish_tree(self, messages: Sequence[TransformStamped]) -> bool:
+        """Publish several edges at once, if switched on, in place of those before; those that /tf_static does not allow are
+        reported instead. False if it is too early, or switched off."""
+        with self._lock:
+            if self._publisher is None or time.monotonic() - self._since < WAIT_S:
+                return False
+            allowed = []
+            for message in messages:
+                conflict = self._conflict(message.header.frame_id, message.child_frame_id)
+                if conflict:
+                    self._error(conflict, f"tf {message.child_frame_id}")
+                else:
+                    allowed.append(message)
+            self._own.extend(allowed)
+            self._publisher.publish(self._type(transforms=allowed))
+            return True
 
     def check(self) -> None:
         """To be called about once a second: has the tree changed, for the better or the worse?

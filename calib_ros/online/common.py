@@ -1,0 +1,118 @@
+"""What the pipelines of a rig have in common, so that its cost is not that of so many nodes: a budget, turns, and what is found
+out of a scan, once whatever the number of cameras."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import LidarConfig, MotionConfig, OnlineConfig, SemanticsConfig
+from calib_ros.frame import PointCloud
+from calib_ros.lidar.edges import EdgePoints
+from calib_ros.lidar.ego_motion import Motion, estimate_motion
+from calib_ros.online.pacing import Purse
+from calib_ros.registration.classes import Segmentation
+from calib_ros.registration.classes import segmentation as models_of
+from calib_ros.registration.features import ScanEdges
+
+T = TypeVar("T")
+SCANS_KEPT = 8  # of a LiDAR: the newest, and those before them that cameras out of step look at
+POLL_S = 0.1  # between two looks whether who waits for a turn is to stop
+
+
+class Turns:
+    """One at a time, in the order in which they asked: a lock alone would serve the same one again and again."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._queue: deque[object] = deque()
+
+    @contextmanager
+    def mine(self, check: Callable[[], object] = lambda: None) -> Iterator[None]:
+        """Context of one's own turn. check: asked now and then while waiting; may raise to give up."""
+        ticket = object()
+        with self._changed:
+            self._queue.append(ticket)
+        try:
+            with self._changed:
+                while self._queue[0] is not ticket:
+                    self._changed.wait(POLL_S)
+                    check()
+            yield
+        finally:
+            with self._changed:
+                self._queue.remove(ticket)
+                self._changed.notify_all()
+
+
+class Newest:
+    """The newest values by key, each made once, whichever thread asks first; what it raises is made anew. Thread-safe."""
+
+    def __init__(self, count: int) -> None:
+        self._count, self._lock = count, threading.Lock()
+        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def __call__(self, key: Hashable, make: Callable[[], T]) -> T:
+        with self._lock:  # whoever else asks meanwhile mostly wants the same
+            if key not in self._kept:
+                self._kept[key] = make()
+                while len(self._kept) > self._count:
+                    self._kept.popitem(last=False)
+            value: T = self._kept[key]
+            return value
+
+
+class _Bounded(OrderedDict[int, tuple[bool, EdgePoints]]):
+    def __setitem__(self, key: int, value: tuple[bool, EdgePoints]) -> None:
+        super().__setitem__(key, value)
+        while len(self) > SCANS_KEPT:
+            self.popitem(last=False)
+
+
+class SharedScans:
+    """What is found out of the scans of one LiDAR: their edges, and how it moved from one to another."""
+
+    def __init__(self) -> None:
+        self._motions = Newest(SCANS_KEPT)
+        self._edges: tuple[LidarConfig, ScanEdges] | None = None
+
+    def edges(self, config: LidarConfig) -> ScanEdges | None:
+        """By the scans' stamps; None where those of several scans are put together, which each camera does at its own times."""
+        if config.accumulate_s > 0:
+            return None
+        if self._edges is None or self._edges[0] != config:
+            self._edges = config, _Bounded()
+        return self._edges[1]
+
+    def motion(
+        self, before: PointCloud, cloud: PointCloud, seconds: float, config: MotionConfig, start: NDArray[np.float64] | None
+    ) -> Motion:
+        """See `estimate_motion`. What cameras differ in, their clocks, does not change it."""
+        config = replace(config, time_offset_s=0.0, time_offset_sigma_s=MotionConfig.time_offset_sigma_s)
+        key = (before, cloud, seconds, config)
+        return self._motions(key, lambda: estimate_motion(before, cloud, seconds, config, start))
+
+
+class Common:
+    """Of all pipelines of a rig. scans: of the LiDAR of this one."""
+
+    def __init__(self, config: OnlineConfig) -> None:
+        self.purse = Purse(config)
+        self.intake, self.estimates, self.classes = Turns(), Turns(), Turns()
+        self._models = Newest(1)
+        self._scans: dict[str, SharedScans] = {}
+
+    def scans(self, lidar: str) -> SharedScans:
+        """Of a LiDAR by its name."""
+        return self._scans.setdefault(lidar, SharedScans())
+
+    def models(self, config: SemanticsConfig) -> Segmentation:
+        """Loaded once; for one at a time."""
+        return self._models(config, lambda: models_of(config))

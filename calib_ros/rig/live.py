@@ -1,0 +1,191 @@
+"""A rig while it drives: from what its pairs say of themselves to one solution, what of it to rely on, and which sensor moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from calib_ros.arrays import Covariance, Transform
+from calib_ros.config import RefineConfig
+from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
+from calib_ros.rig.description import RigDescription
+from calib_ros.rig.edges import Measurement
+from calib_ros.rig.graph import Edge, RigSolution, solve
+from calib_ros.rig.moved import MOVED as KNOCKED
+from calib_ros.rig.moved import hypotheses, verdict
+from calib_ros.rig.report import RigReport
+
+UNCHECKED = "unchecked"  # status of a sensor whose pairs get no data
+KIND = "registration"
+Pair = tuple[str, str]  # camera, LiDAR
+
+
+@dataclass(frozen=True, eq=False)
+class PairState:
+    """What a pair says of itself. extrinsic: None before its first messages. usable: to be relied on now. unchecked: why it is
+    not looked at any more, naming the silent sensor; "" = it is."""
+
+    camera: str
+    lidar: str
+    extrinsic: Extrinsic | None = None
+    usable: bool = False
+    unchecked: str = ""
+
+    @property
+    def pair(self) -> Pair:
+        """Camera, LiDAR."""
+        return self.camera, self.lidar
+
+    @property
+    def status(self) -> str:
+        """Of the extrinsic."""
+        return INITIAL if self.extrinsic is None else self.extrinsic.result.status
+
+    @property
+    def reason(self) -> str:
+        """Why not to rely on it, for a person."""
+        own = "" if self.extrinsic is None else self.extrinsic.result.reason
+        return self.unchecked or f"{self.camera} with {self.lidar}: {own or self.status}"
+
+    def edge(self) -> Edge | None:
+        """What it has measured; None while it has not, or what it had does not hold any more."""
+        extrinsic = self.extrinsic
+        if extrinsic is None or self.status in (INITIAL, MOVED) or not (extrinsic.accepted or extrinsic.usable):
+            return None
+        r = extrinsic.result
+        if r.covariance is None:
+            return None
+        offset = (r.time_offset_s, r.time_offset_sigma_s)
+        return Edge(self.camera, self.lidar, r.T_camera_lidar, r.covariance, KIND, *offset, samples=r.frames_used)
+
+    def says_as(self, other: PairState) -> bool:
+        """Whether nothing has changed from another state of the pair."""
+        return (self.extrinsic, self.usable, bool(self.unchecked)) == (other.extrinsic, other.usable, bool(other.unchecked))
+
+
+@dataclass(frozen=True, eq=False)
+class SensorState:
+    """T: T_reference_sensor (4, 4). covariance: (6, 6) of its left twist. moved: deg and m of its last displacement."""
+
+    name: str
+    T: Transform
+    covariance: Covariance
+    status: str
+    reason: str = ""
+    usable: bool = False
+    moved: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RigState:
+    """moved: sensors that have been displaced and are not found again. text: what is known of the last displacement."""
+
+    solution: RigSolution
+    sensors: tuple[SensorState, ...]
+    moved: tuple[str, ...] = ()
+    text: str = ""
+
+    def __str__(self) -> str:
+        used = [s.name for s in self.sensors if s.usable]
+        out = f"{len(used)} of {len(self.sensors)} sensors usable"
+        parts = [out, self.text, *(f"{e.name} contradicts the others" for e in self.solution.rejected)]
+        parts += [f"loop {', '.join(loop.sensors)} does not close" for loop in self.solution.loops if not loop.closes]
+        return "; ".join(filter(None, parts))
+
+
+class LiveRig:
+    """Solves the graph from the newest extrinsics of the pairs, and compares with the solution from before where one has moved.
+
+    limits: what every sensor has to be known to. Not thread-safe.
+    """
+
+    def __init__(self, description: RigDescription, limits: RefineConfig) -> None:
+        self._description, self._limits = description, limits
+        self._before: RigSolution | None = None  # the newest while all pairs agreed with their extrinsics
+        self._lost: set[Pair] = set()  # pairs that have moved since
+        self._named: tuple[str, ...] = ()  # what has moved, by the edges since
+        self._sizes: dict[str, tuple[float, float]] = {}
+        self._told = ""
+
+    def update(self, pairs: Sequence[PairState], priors: Mapping[str, tuple[Transform, Covariance]]) -> RigState:
+        """The state from what all pairs say. priors: T_reference_sensor and its covariance, of the sensors that have one."""
+        reference = self._description.reference
+        known = [p for p in pairs if all(name in priors or name == reference for name in p.pair)]
+        edges = {p.pair: e for p in known if (e := p.edge()) is not None}
+        solution = solve(list(edges.values()), priors, reference)
+        moved = self._moved(known, edges)
+        if not self._lost and not any(p.status == SUSPECT for p in known):
+            confirmed = [edges[p.pair] for p in known if p.pair in edges and p.status != TENTATIVE]
+            self._before = solution if len(confirmed) == len(edges) else solve(confirmed, priors, reference)
+        measured = [Measurement(*p.pair, KIND, edges.get(p.pair), p.reason) for p in known]
+        report = RigReport(self._description, solution, measured, {}, {}, limits=self._limits)
+        rejected = {(e.target, e.source) for e in (*solution.rejected, *solution.doubted)}
+        joined = _joined(reference, [p.pair for p in known if p.usable and p.pair in edges and p.pair not in rejected])
+        sensors = tuple(self._sensor(name, report, joined, moved, known) for name in solution.poses)
+        return RigState(solution, sensors, moved, self._told)
+
+    def _sensor(
+        self, name: str, report: RigReport, joined: set[str], moved: Sequence[str], pairs: Sequence[PairState]
+    ) -> SensorState:
+        (status, reason), own = report.status(name), [p for p in pairs if name in p.pair]
+        usable = name in joined and name not in moved
+        if usable and status == REFUSED:  # as uncertain as it is, its pairs are to be relied on
+            status = INSUFFICIENT
+        if name in moved:
+            status, reason = MOVED, self._told
+        elif not usable and (objecting := [p for p in own if not p.usable]):
+            # What a pair says now is nearer to the cause than what the graph lacks for it.
+            first = min(objecting, key=lambda p: (not p.unchecked, p.status in (INITIAL, CONVERGED)))
+            if first.unchecked or first.status != CONVERGED:
+                status, reason = UNCHECKED if first.unchecked else first.status, first.reason
+        solution = report.solution
+        return SensorState(
+            *(name, solution.poses[name], solution.marginal(name), status, reason, usable), self._sizes.get(name, (0.0, 0.0))
+        )
+
+    def _moved(self, pairs: Sequence[PairState], edges: Mapping[Pair, Edge]) -> tuple[str, ...]:
+        """The sensors that have been displaced and are not found again."""
+        lost = {p.pair for p in pairs if p.status == MOVED}
+        if lost and not self._lost:
+            self._named = ()
+        self._lost |= lost
+        if not any(p.pair in self._lost and not p.usable for p in pairs):
+            if self._lost:  # all have just been found again
+                self._compare(pairs, edges)
+            self._lost = set()
+            return ()
+        if self._lost - lost and self._before is not None:
+            self._compare(pairs, edges)
+        who = suspects(self._lost, [p.pair for p in pairs if p.pair not in self._lost])
+        if lost and not self._named:
+            self._told = f"{' or '.join(who)} moved; by how much is being estimated"
+        return self._named or who
+
+    def _compare(self, pairs: Sequence[PairState], edges: Mapping[Pair, Edge]) -> None:
+        """Name what moved by the edges since: of pairs that are found again, and of those that have been tested all the time."""
+        if self._before is None:  # by how much is not known
+            self._told = self._told.partition(";")[0]
+            return
+        after = [edges[p.pair] for p in pairs if p.pair in edges and (p.usable or p.pair in self._lost)]
+        likely, self._told = verdict(hypotheses(self._before, after))
+        if len(likely) == 1 and likely[0].kind == KNOCKED:
+            self._named = likely[0].sensors
+            self._sizes |= dict.fromkeys(self._named, likely[0].size)
+
+
+def suspects(lost: set[Pair], fitting: Sequence[Pair]) -> tuple[str, ...]:
+    """The sensors that may have moved where these pairs have lost their extrinsics and the others fit: one that all lost pairs
+    have in common, else all those without a pair that fits."""
+    right = {name for pair in fitting for name in pair}
+    names = sorted({name for pair in lost for name in pair} - right)
+    common = [name for name in names if all(name in pair for pair in lost)]
+    return tuple(common or names)
+
+
+def _joined(reference: str, pairs: Sequence[Pair]) -> set[str]:
+    """Sensors that pairs join to the reference, itself among them where there is one."""
+    joined, before = {reference}, 0
+    while len(joined) > before:
+        before = len(joined)
+        joined |= {name for pair in pairs if joined & set(pair) for name in pair}
+    return joined if len(joined) > 1 else set()

@@ -1,0 +1,341 @@
+"""All pairs of a rig in one process, one solution from what they find, and what the node says of it. No calibration happens here.
+
+Every pair has the interface of a node of its own, named by its LiDAR below the camera: ~/CAMERA/LIDAR/extrinsic and so on.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from calib_ros_msgs.msg import Rig, RigLoop, RigSensor
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TransformStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.timer import Timer
+
+from calib_ros import se3
+from calib_ros.arrays import Covariance, Transform
+from calib_ros.errors import BadInputError
+from calib_ros.frame import NANOSECONDS
+from calib_ros.online.common import Common
+from calib_ros.online.pacing import LoadBudget
+from calib_ros.online.worker import Worker
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.rig.description import CAMERA, RigDescription, Sensor, prior_covariance, read_rig
+from calib_ros.rig.edges import box_of
+from calib_ros.rig.graph import solve
+from calib_ros.rig.live import LiveRig, Pair, PairState, RigState
+from calib_ros.ros import parameters
+from calib_ros.ros.conversions import covariance_for_ros, time_message, transform_message
+from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
+from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.publishers import VALID_PERIODS
+from calib_ros.ros.rig_pairs import PairOfRig, SharedTopics, decoded_clouds, decoded_images
+from calib_ros.ros.tf import LATCHED, StaticTf
+
+if TYPE_CHECKING:
+    from calib_ros.ros.node import RosInterface
+
+TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")  # of the name of a node
+# Settings of a node of one pair that a rig has in another way, or a pair each by itself.
+OF_RIG = {"rig_file", "publish_tf", "tf_parent", "tf_child", "export.on_converged", "export.joint"}
+OF_PAIR = {"camera_frame", "lidar_frame", "initial_translation_m", "initial_quaternion_xyzw", "state_file", "capture_dir"}
+USED = {"rig_file", "publish_tf", "state_file", "capture_dir"}  # of these, by the rig as well
+Priors = dict[str, tuple[Transform, Covariance]]
+
+
+class RigInterface:
+    """Topics, services and parameters of a rig on a node, with the members of a `RosInterface`.
+
+    pairs: their interfaces. nodes: of the pairs, to spin along. state: the newest, None before the first second. make: the
+    interface of a pair. Raises a CalibrationError for a rig file or parameters that cannot work.
+    """
+
+    def __init__(self, node: Node, declared: Parameters, make: Callable[[Node, PairOfRig], RosInterface]) -> None:
+        self._node, self.parameters, self.health = node, declared, Health(node.get_logger())
+        self.description = read_rig(declared["rig_file"])
+        wanted = _pairs(self.description, declared["rig_file"])
+        overrides = node._parameter_overrides
+        for line in parameters.misspelt({name: p.value for name, p in overrides.items()}, node._parameters):
+            node.get_logger().warning(line)
+        for name in sorted(((OF_RIG | OF_PAIR) - USED) & set(overrides)):
+            node.get_logger().warning(f"parameter '{name}' has no effect with a rig_file")
+        self.state: RigState | None = None
+        self._priors_given = {s.name: (s.prior, _covariance(s)) for s in self.description.sensors if s.prior is not None}
+        self._live = LiveRig(self.description, declared.config.refine)
+        self.tf = StaticTf(node, declared["initial_from_tf"], declared["publish_tf"], self.health.error)
+        common, self._shared = Common(declared.config.online), SharedTopics(node)
+        self.load = LoadBudget(declared.config.online, purse=common.purse)  # of receiving messages
+        decoded = {s.name: decoded_images() if s.kind == CAMERA else decoded_clouds() for s in self.description.sensors}
+        self.pairs: dict[Pair, RosInterface] = {}
+        self.nodes: tuple[Node, ...] = ()
+        for camera, lidar in wanted:
+            pair = PairOfRig(*(camera, lidar, common, self._shared, self._topics(camera, lidar), decoded[camera], decoded[lidar]))
+            known = self._between(camera, lidar)
+            pair.T = None if known is None else known[0]
+            own = _node_of(node, camera, lidar, self._overrides(camera, lidar, known))
+            self.nodes = (*self.nodes, own)
+            self.pairs[camera, lidar] = made = make(own, pair)
+            if self.description.pairs is None:
+                pair.unseen = lambda why, made=made: self._unseen(made, why)
+        self._told: list[PairState] = []  # what the newest solution rests on
+        self._text = ""
+        self._edges: list[TransformStamped] = []  # of the newest solution
+        self._edges_told = self._edges
+        self._solver: Worker[tuple[list[PairState], Priors]] = Worker("calib_rig", self._solve, self._failed)
+        self.publisher = node.create_publisher(Rig, "~/rig", LATCHED)
+        self._diagnostics_pub = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._timers: list[Timer] = []
+        self._ended: bool | None = None
+        node.add_on_set_parameters_callback(self._on_parameters)
+
+    # ---- states -------------------------------------------------------------------------------------------------------
+
+    def activate(self) -> None:
+        """See `RosInterface`."""
+        for pair in self.pairs.values():
+            pair.activate()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timers = [
+            self._node.create_timer(1.0, self._every_second, clock=steady),
+            self._node.create_timer(self.parameters["publish_period_s"], self._publish, clock=steady),
+        ]
+        names = ", ".join(f"{camera} with {lidar}" for camera, lidar in self.pairs)
+        self._node.get_logger().info(f"a rig of {len(self.description.sensors)} sensors: {names}")
+
+    def deactivate(self) -> None:
+        """See `RosInterface`."""
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
+        self._timers = []
+        for pair in self.pairs.values():
+            pair.deactivate()
+        if self.state is not None:
+            self.publisher.publish(self._message(self.state, usable=False))
+
+    def stop(self) -> bool:
+        """See `RosInterface`."""
+        if self._ended is None:
+            with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
+                ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
+            self._ended = all([*ended, self._solver.stop()])
+        return self._ended
+
+    def destroy(self) -> bool:
+        """See `RosInterface`; the pairs' nodes are left to whoever spins them."""
+        if self._timers:
+            self.deactivate()
+        ended = self.stop()
+        for pair in self.pairs.values():
+            pair.destroy()
+        self._node.remove_on_set_parameters_callback(self._on_parameters)
+        self.tf.destroy()
+        for publisher in (self.publisher, self._diagnostics_pub):
+            self._node.destroy_publisher(publisher)
+        return ended
+
+    # ---- what the pairs start from --------------------------------------------------------------------------------------
+
+    def _topics(self, camera: str, lidar: str) -> tuple[str, str, str]:
+        image = self.description[camera].topic or f"{camera}/image"
+        # CameraInfo lies beside the images, as image_transport has it.
+        info = self.description[camera].camera_info or "".join(image.rpartition("/")[:2]) + "camera_info"
+        return image, self.description[lidar].topic or f"{lidar}/points", info
+
+    def _between(self, camera: str, lidar: str) -> tuple[Transform, SearchBox] | None:
+        """T_camera_lidar (4, 4) by the description, and how far around to search; None where it leaves that to TF."""
+        reference = self.description.reference
+        if not all(name in self._priors_given or name == reference for name in (camera, lidar)):
+            return None
+        T, C = solve([], self._priors_given, reference).between(camera, lidar)
+        return T, box_of(C)
+
+    def _overrides(self, camera: str, lidar: str, known: tuple[Transform, SearchBox] | None) -> list[Parameter]:
+        """Parameters of a pair: those of the rig's node, but for what is its own."""
+        given, sensors = self._node._parameter_overrides, self.description
+        known_names = [n for n in given if n in self._node._parameters and n not in OF_RIG | OF_PAIR]
+        own: dict[str, Any] = {"camera_frame": sensors[camera].frame, "lidar_frame": sensors[lidar].frame}
+        if sensors[camera].mask:
+            own["image.mask"] = sensors[camera].mask
+        if known is not None:
+            T, box = known
+            own["initial_translation_m"] = T[:3, 3].tolist()
+            own["initial_quaternion_xyzw"] = se3.quaternion_from_rotation(T[:3, :3]).tolist()
+            own["search.rotation_deg"], own["search.translation_m"] = np.max(box.rotation_deg), np.max(box.translation_m)
+            own |= {name: given[name].value for name in ("search.rotation_deg", "search.translation_m") if name in given}
+        if path := self.parameters["state_file"]:
+            stem, dot, ending = path.rpartition(".")
+            own["state_file"] = f"{stem}.{camera}.{lidar}.{ending}" if dot else f"{path}.{camera}.{lidar}"
+        if folder := self.parameters["capture_dir"]:
+            own["capture_dir"] = f"{folder}/{camera}/{lidar}"
+        return [given[n] for n in known_names if n not in own] + [Parameter(n, value=v) for n, v in own.items()]
+
+    def _unseen(self, pair: RosInterface, why: str) -> None:
+        pair.pipeline.pause(why)
+        self._node.get_logger().info(why)
+
+    def _frame(self, name: str) -> str:
+        """TF frame of a sensor, as far as it is known."""
+        if frame := self.description[name].frame:
+            return frame
+        for (camera, lidar), pair in self.pairs.items():
+            if name in (camera, lidar) and (recalibrator := pair.pipeline.recalibrator) is not None:
+                names = recalibrator.tracker.initial
+                return names.camera_frame if name == camera else names.lidar_frame
+        return name
+
+    def _priors(self) -> Priors:
+        """Of all sensors whose places are known, by the description or TF."""
+        found, reference = dict(self._priors_given), self._frame(self.description.reference)
+        for sensor in self.description.sensors:
+            if sensor.name not in found and sensor.name != self.description.reference:
+                T, _ = self.tf.lookup(reference, self._frame(sensor.name))
+                if T is not None:
+                    found[sensor.name] = T, prior_covariance(T, sensor.sigma_deg, sensor.sigma_m)
+        return found
+
+    # ---- every second ---------------------------------------------------------------------------------------------------
+
+    def _every_second(self) -> None:
+        with self.health.guard():
+            self.health.log.catch_up()
+            self.load.count_messages()
+            self.tf.check()
+            states, priors = [self._state_of(*names, pair) for names, pair in self.pairs.items()], self._priors()
+            changed = len(states) != len(self._told) or not all(map(PairState.says_as, states, self._told))
+            if changed or self.state is None or len(priors) + 1 != len(self.state.sensors):
+                self._told = states
+                self._solver.put((states, priors))
+            if (edges := self._edges) is not self._edges_told and self.tf.publish_tree(edges):
+                self._edges_told = edges
+            self._diagnostics_pub.publish(self._diagnostics(priors))
+
+    def _state_of(self, camera: str, lidar: str, pair: RosInterface) -> PairState:
+        recalibrator = pair.pipeline.recalibrator
+        if recalibrator is None or pair.pipeline.paused:
+            return PairState(camera, lidar, unchecked=pair.sensors.silent() if recalibrator is None else "")
+        extrinsic = recalibrator.current
+        validity = pair.extrinsic.validity(extrinsic)
+        unchecked = "" if validity.usable or not extrinsic.usable else pair.sensors.silent() or validity.reason
+        return PairState(camera, lidar, extrinsic, validity.usable, unchecked)
+
+    def _solve(self, item: tuple[list[PairState], Priors]) -> None:
+        """On a thread of its own."""
+        self.state = state = self._live.update(*item)
+        if self._ended is not None:
+            return
+        if state.text != self._text:
+            self._text = state.text
+            if state.moved:
+                self.health.error(state.text, "rig moved")
+            else:
+                self.health.note(state.text, "rig")
+        self.publisher.publish(self._message(state))
+        reference = self._frame(state.solution.reference)
+        others = [own for own in state.sensors if own.name != state.solution.reference]
+        self._edges = [transform_message(own.T, reference, self._frame(own.name), self._stamp(own.name)) for own in others]
+
+    def _failed(self, error: Exception) -> None:
+        self.health.unexpected(error)
+
+    # ---- messages -------------------------------------------------------------------------------------------------------
+
+    def _publish(self) -> None:
+        with self.health.guard():
+            if self.state is not None:
+                self.publisher.publish(self._message(self.state))
+
+    def _stamp(self, name: str = "") -> int:
+        """Of the newest data of a sensor's pairs, ns; of all pairs without a name."""
+        return max((p.extrinsic.stamp for names, p in self.pairs.items() if not name or name in names), default=0)
+
+    def _message(self, state: RigState, usable: bool = True) -> Rig:
+        now, reference = self._node.get_clock().now().nanoseconds, self._frame(state.solution.reference)
+        msg = Rig(reference=state.solution.reference, moved=list(state.moved), text=str(state))
+        msg.header.frame_id, msg.header.stamp = reference, time_message(now)
+        msg.valid_until = time_message(now + round(VALID_PERIODS * self.parameters["publish_period_s"] * NANOSECONDS))
+        for own in state.sensors:
+            said = RigSensor(name=own.name, status=own.status, reason=own.reason, usable=own.usable and usable)
+            said.transform = transform_message(own.T, reference, self._frame(own.name), self._stamp(own.name))
+            said.covariance, (said.moved_deg, said.moved_m) = covariance_for_ros(own.covariance), own.moved
+            msg.sensors.append(said)
+        for loop in state.solution.loops:
+            deg, m = loop.size
+            msg.loops.append(
+                RigLoop(sensors=list(loop.sensors), rotation_deg=deg, translation_m=m, p_value=loop.p_value, closes=loop.closes)
+            )
+        msg.rejected, msg.doubted = ([e.name for e in edges] for edges in (state.solution.rejected, state.solution.doubted))
+        return msg
+
+    def _diagnostics(self, priors: Mapping[str, Any]) -> DiagnosticArray:
+        state = self.state
+        status = DiagnosticStatus(level=OK, name=f"{self._node.get_fully_qualified_name().lstrip('/')}: rig")
+        status.hardware_id = self.parameters["vehicle"]
+        missing = [s.name for s in self.description.sensors if s.name not in priors and s.name != self.description.reference]
+        values = {f"{name}": "nobody knows where it is: set its prior, or publish it on /tf_static" for name in missing}
+        if state is not None:
+            status.message = str(state)
+            good = all(s.usable for s in state.sensors) and not missing and not state.solution.rejected
+            status.level = ERROR if state.moved else OK if good else WARN
+            values |= {s.name: ": ".join(filter(None, [s.status, s.reason])) for s in state.sensors}
+        values |= {"errors": str(self.health.errors), "last error": self.health.last_error[0]}
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        return message
+
+    # ---- parameters -------------------------------------------------------------------------------------------------------
+
+    def _on_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
+        """What changes holds for all pairs, but for what is each one's own."""
+        answer, new = parameters.on_change(self.parameters, list(changed), None)
+        if answer.successful and new["publish_tf"] and self.tf.missing:
+            return SetParametersResult(successful=False, reason=self.tf.missing)
+        passed = [p for p in changed if p.name not in OF_RIG | OF_PAIR]
+        for own in self.nodes if answer.successful and passed else ():
+            told = own.set_parameters_atomically(passed)
+            if not told.successful:
+                return told
+        if answer.successful:
+            self.parameters, self.load.config = new, new.config.online
+            self.tf.switch(new["publish_tf"])
+            self._edges_told = []
+        return answer
+
+
+def _covariance(sensor: Sensor) -> Covariance:
+    assert sensor.prior is not None
+    return prior_covariance(sensor.prior, sensor.sigma_deg, sensor.sigma_m)
+
+
+def _pairs(description: RigDescription, path: str) -> list[Pair]:
+    """Cameras and LiDARs to be estimated. BadInputError for names that no topic may have, or a rig without such pairs."""
+    for sensor in description.sensors:
+        if not TOKEN.fullmatch(sensor.name):
+            raise BadInputError(f"{path}: sensors.{sensor.name} cannot be part of a topic's name; use letters, digits and _")
+    given = description.pairs
+    found = list(product(description.cameras, description.lidars)) if given is None else list(given)
+    found = [(a, b) for a, b in found if description[a].kind == CAMERA]
+    if not found:
+        raise BadInputError(f"{path}: pairs holds no camera with a LiDAR, which the node estimates; add one")
+    return found
+
+
+def _node_of(node: Node, camera: str, lidar: str, overrides: list[Parameter]) -> Node:
+    """A node of a pair: what is remapped or renamed on the command line is the rig's."""
+    return Node(
+        lidar,
+        context=node.context,
+        namespace=f"{node.get_fully_qualified_name()}/{camera}",
+        use_global_arguments=False,
+        parameter_overrides=overrides,
+        allow_undeclared_parameters=True,
+    )

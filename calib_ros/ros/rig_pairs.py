@@ -1,0 +1,148 @@
+"""A camera and a LiDAR of a rig, as the node of a single pair sees them: each message is received and decoded once for all."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+
+from calib_ros.arrays import Transform
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.messages import stamp_ns
+from calib_ros.online.common import Common, Newest
+from calib_ros.rig.edges import SEEN, seen_share
+from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message
+from calib_ros.ros.subscriptions import AdaptiveSubscription, Form
+
+CLOUDS_KEPT, IMAGES_KEPT = 6, 2  # decoded messages: of clouds, those before a keyframe's are asked for as well
+CHECKED_AGAIN_S = 0.5  # everybody who listens checks once a second
+
+
+class SharedTopics:
+    """Subscriptions of one node that several listen to, each with a callback of its own."""
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self._topics: dict[str, _Topic] = {}
+
+    def subscribe(
+        self,
+        forms: Sequence[Form],
+        topic: str,
+        callback: Callable[[int, Any], None],
+        preference: str,
+        latched: bool = False,
+        guard: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> Listener:
+        """As an `AdaptiveSubscription`, which the first one makes."""
+        if topic not in self._topics:
+            self._topics[topic] = _Topic(self.node, forms, topic, preference, latched)
+        return Listener(self._topics[topic], callback, guard, self._leave)
+
+    def _leave(self, topic: _Topic) -> None:
+        topic.subscription.destroy()
+        self._topics = {name: own for name, own in self._topics.items() if own is not topic}
+
+
+class _Topic:
+    def __init__(self, node: Node, forms: Sequence[Form], topic: str, preference: str, latched: bool) -> None:
+        self.listeners: list[Listener] = []
+        self.checked, self.problem = 0.0, ""
+        self.subscription = AdaptiveSubscription(node, forms, topic, self._receive, preference, latched)
+
+    def _receive(self, stamp: int, message: Any) -> None:
+        for listener in list(self.listeners):
+            with listener.guard():
+                listener.callback(stamp, message)
+
+
+class Listener:
+    """One of those who share a subscription, with the members of an `AdaptiveSubscription`."""
+
+    def __init__(
+        self,
+        topic: _Topic,
+        callback: Callable[[int, Any], None],
+        guard: Callable[[], AbstractContextManager[None]],
+        leave: Callable[[_Topic], None],
+    ) -> None:
+        self._topic, self.callback, self.guard, self._leave = topic, callback, guard, leave
+        self.preference = topic.subscription.preference
+        topic.listeners.append(self)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._topic.subscription, name)
+
+    def check(self) -> str:
+        """See `AdaptiveSubscription`."""
+        own, now = self._topic, time.monotonic()
+        if now - own.checked >= CHECKED_AGAIN_S:
+            own.checked, own.subscription.preference = now, self.preference
+            own.problem = own.subscription.check()
+        return own.problem
+
+    def destroy(self) -> None:
+        """Receive nothing any more; the last one ends the subscription."""
+        if self in self._topic.listeners:
+            self._topic.listeners.remove(self)
+            if not self._topic.listeners:
+                self._leave(self._topic)
+
+
+class Decoded:
+    """What the messages of one sensor hold, decoded once for all who ask."""
+
+    def __init__(self, decode: Callable[[Serialized], Any], kept: int) -> None:
+        self._decode, self._newest = decode, Newest(kept)
+
+    def __call__(self, message: Serialized) -> Any:
+        return self._newest(message, lambda: self._decode(message))
+
+
+def decoded_clouds() -> Decoded:
+    """Of a LiDAR."""
+    return Decoded(cloud_from_message, CLOUDS_KEPT)
+
+
+def decoded_images() -> Decoded:
+    """Of a camera."""
+    return Decoded(pixels_from_message, IMAGES_KEPT)
+
+
+@dataclass(eq=False)
+class PairOfRig:
+    """What a pair's interface takes from its rig.
+
+    camera, lidar: names. topics: of image, points and CameraInfo. T: T_camera_lidar (4, 4) by the priors; None = unknown. unseen:
+    called with a line for people where no point of a scan is in view by it; None: not to be asked, the pair is given.
+    """
+
+    camera: str
+    lidar: str
+    common: Common
+    shared: SharedTopics
+    topics: tuple[str, str, str]
+    image: Decoded
+    cloud: Decoded
+    T: Transform | None = None
+    unseen: Callable[[str], None] | None = None
+
+    def frame(self, image: Serialized, cloud: Serialized, camera: Camera) -> Frame:
+        """Image and cloud -> Frame. BadInputError if one of them cannot be decoded, or shows nothing of the other."""
+        points: PointCloud = self.cloud(cloud)
+        if self.unseen is not None and self.T is not None:
+            unseen, self.unseen = self.unseen, None
+            if seen_share(camera, self.T, points.finite().xyz.astype(float)) < SEEN:
+                line = f"{self.camera} and {self.lidar} share no view by their priors, and are not estimated"
+                unseen(line)
+                raise BadInputError(line)
+        pixels: NDArray[np.uint8] = self.image(image)
+        return Frame(pixels, points, camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))

@@ -1,0 +1,220 @@
+"""The node with a rig of two cameras and a LiDAR over real DDS: topics, one solution, a dead driver, a knock, wrong files."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from subprocess import run
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rig_peer import RigPeer, again, describe, measured, poses
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+from waiting import pause
+
+from calib_ros import se3
+from calib_ros.config import OnlineConfig
+from calib_ros.errors import BadInputError
+from calib_ros.lidar.edges import edge_points
+from calib_ros.lidar.ego_motion import estimate_motion
+from calib_ros.messages import decode_cloud
+from calib_ros.online import common
+from calib_ros.online.common import Common
+from calib_ros.registration import features
+from calib_ros.ros import conversions
+from calib_ros.ros.lifecycle_node import CalibLifecycleNode
+from calib_ros.ros.rig_pairs import PairOfRig
+from calib_ros.ros.tf import LATCHED
+from calib_ros_synthetic.rig import SyntheticRig
+
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
+LEFT, RIGHT, TOP = "back_left", "back_right", "lidar_top"
+SECONDS, PAUSE_S = 3.0, 1.0  # of the drive, and before it begins again: too long for a motion from scan to scan
+SETTINGS = {"seed": 3, "frames": 4, "width": 320, "clocks": 0.0, "speed": 4.0}
+
+
+@pytest.fixture(scope="module")
+def rig() -> SyntheticRig:
+    return SyntheticRig("six_cameras_one_lidar", **SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def driven(rig, tmp_path_factory, ros_in_this_process) -> Iterator[Any]:
+    """A peer whose node has found both cameras; what was driven; how often what was computed."""
+    items, counts = measured(rig, (LEFT, RIGHT), SECONDS), Counter[str]()
+
+    def counted(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any) -> Any:
+            counts[what] += 1
+            return function(*given)
+
+        return call
+
+    file = describe(rig, (LEFT, RIGHT), tmp_path_factory.mktemp("rig") / "rig.yaml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conversions, "decode_cloud", counted("clouds", decode_cloud))
+        patch.setattr(common, "estimate_motion", counted("motions", estimate_motion))
+        patch.setattr(features, "edge_points", counted("scans", edge_points))
+        with RigPeer(rig, (LEFT, RIGHT), file, publish_tf=True) as peer:
+            peer.drive(items)
+            yield SimpleNamespace(peer=peer, items=items, counts=counts, at=SECONDS)
+
+
+def is_near(rig: SyntheticRig, peer: RigPeer, names: Any = (LEFT, RIGHT), D: Any = None) -> bool:
+    errors = [se3.error(rig.reference(n) if D is None else D(n), T) for n, T in poses(peer.rigs[-1]) if n in names]
+    return all(deg < 0.5 and m < 0.15 for deg, m in errors)
+
+
+def test_one_solution_of_all_pairs_and_each_with_topics_of_its_own(rig, driven) -> None:
+    peer = driven.peer
+    peer.until(lambda: peer.usable() == {TOP, LEFT, RIGHT}, "all sensors")
+    assert is_near(rig, peer), [se3.error(rig.reference(n), T) for n, T in poses(peer.rigs[-1])]
+    message = peer.rigs[-1]
+    assert (message.reference, message.header.frame_id, list(message.moved), list(message.rejected)) == (TOP, TOP, [], [])
+    assert message.text == "3 of 3 sensors usable"
+    assert [s.transform.child_frame_id for s in message.sensors] == [TOP, rig.frame_id(LEFT), rig.frame_id(RIGHT)]
+    assert all(s.covariance[0] > 0 for s in message.sensors if s.name != TOP)
+    for camera in (LEFT, RIGHT):
+        newest = peer.extrinsics[camera][-1]
+        assert (newest.transform.header.frame_id, newest.usable) == (rig.frame_id(camera), True)
+    peer.until(lambda: "calib_ros: rig" in peer.statuses and peer.statuses["calib_ros: rig"].level == DiagnosticStatus.OK)
+    assert {f"calib_ros/{c}/{TOP}: extrinsic" for c in (LEFT, RIGHT)} <= peer.statuses.keys()
+
+
+def test_each_cloud_is_decoded_once_and_each_scan_aligned_once(driven) -> None:
+    clouds = sum(name == TOP for _, name, _ in driven.items)
+    assert clouds - 3 <= driven.counts["clouds"] <= clouds
+    first, second = (driven.peer.pair(c).pipeline for c in (LEFT, RIGHT))
+    assert 0 < driven.counts["motions"] <= clouds
+    assert driven.counts["scans"] < first.recalibrator.keyframes_seen + second.recalibrator.keyframes_seen
+    assert first.load._purse is second.load._purse
+
+
+def test_tf_is_one_tree_from_the_reference(rig, driven) -> None:
+    got = []
+    driven.peer.peer.create_subscription(TFMessage, "/tf_static", got.append, LATCHED)
+    driven.peer.until(lambda: got, "/tf_static")
+    assert [(t.header.frame_id, t.child_frame_id) for t in got[-1].transforms] == [
+        (TOP, rig.frame_id(LEFT)),
+        (TOP, rig.frame_id(RIGHT)),
+    ]
+
+
+def doubted(peer: RigPeer, since: int, *names: str) -> list[str]:
+    """What was said against some sensors."""
+    said = [peer.sensor(name, rig) for rig in peer.rigs[since:] for name in names]
+    return sorted({f"{own.name}: {own.status}: {own.reason}" for own in said if not own.usable})
+
+
+def test_a_dead_driver_is_named_and_the_other_pair_stays(driven) -> None:
+    peer = driven.peer
+    peer.change(max_data_age_s=3.0, online__mode="manual")
+    assert peer.pair(RIGHT).parameters["max_data_age_s"] == 3.0
+    driven.at = SECONDS + PAUSE_S
+    before = len(peer.rigs)
+    for item in again(driven.items, driven.at):
+        peer.drive([item], without=[LEFT])
+        pause()
+        if peer.sensor(LEFT).status == "unchecked":
+            break
+    left = peer.until(lambda: peer.sensor(LEFT).status == "unchecked" and peer.sensor(LEFT))
+    assert left.reason == f"nothing comes from {LEFT} on /{LEFT}/image"
+    peer.until(lambda: LEFT in peer.extrinsics[LEFT][-1].reason, "the reason of the pair")
+    assert doubted(peer, before, TOP, RIGHT) == []
+    driven.at += SECONDS + PAUSE_S
+    peer.drive(again(driven.items, driven.at)[:12])
+    peer.until(lambda: peer.usable() == {TOP, LEFT, RIGHT}, "that it is used again")
+    peer.change(max_data_age_s=3600.0, online__mode="continuous")
+
+
+@pytest.mark.slow
+def test_a_knocked_camera_is_named_with_its_size_and_found_again(rig, driven) -> None:
+    peer = driven.peer
+    knocked = SyntheticRig("six_cameras_one_lidar", **SETTINGS, knock=LEFT, knock_at=0.0, knock_deg=2.0, knock_m=0.08)
+    pictures = iter(item for item in measured(knocked, (LEFT,), SECONDS) if item[1] == LEFT)
+    items = [next(pictures) if item[1] == LEFT else item for item in driven.items]
+    driven.at += SECONDS + PAUSE_S
+    before = len(peer.rigs)
+    peer.drive(again(items, driven.at))
+    for _ in range(3):
+        driven.at += SECONDS + PAUSE_S
+        if peer.usable() == {TOP, LEFT, RIGHT} and peer.sensor(LEFT).moved_deg:
+            break
+        peer.drive(again(items, driven.at))
+    peer.until(lambda: peer.usable() == {TOP, LEFT, RIGHT}, "that it is found again")
+    assert [LEFT] in [list(rig.moved) for rig in peer.rigs[before:]]
+    assert doubted(peer, before, RIGHT) == []
+    left = peer.sensor(LEFT)
+    assert (left.moved_deg, left.moved_m) == (pytest.approx(2.0, abs=0.5), pytest.approx(0.08, abs=0.08))
+    assert f"{LEFT} moved by" in peer.rigs[-1].text
+    stamp = driven.items[-1][0]
+    assert is_near(rig, peer, (LEFT,), lambda name: knocked.reference_at(name, stamp))
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_pair_that_shares_no_view_by_its_priors_is_left_out_unless_it_is_listed(rig, given) -> None:
+    """Of the front camera, the points behind the vehicle."""
+    cloud, camera, told = rig.scans(TOP)[0][1], rig.camera("front"), []
+    behind = replace(cloud, xyz=cloud.xyz * np.float32([-1, -1, 1])).select(cloud.xyz[:, 0] > 0)
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    pair = PairOfRig("front", TOP, Common(OnlineConfig()), None, ("",) * 3, lambda _: image, lambda _: behind)
+    pair.T, pair.unseen = se3.inverse(rig.reference("front")), None if given else told.append
+    message = SimpleNamespace(header=Header())
+    if given:
+        assert pair.frame(message, message, camera).image is image
+        return
+    with pytest.raises(BadInputError, match="front and lidar_top share no view by their priors"):
+        pair.frame(message, message, camera)
+    assert len(told) == 1
+    assert pair.frame(message, message, camera).image is image  # whoever asks again knows it
+
+
+def test_a_managed_node_makes_its_pairs_and_leaves_none_behind(rig, tmp_path) -> None:
+    context = Context()
+    rclpy.init(context=context)
+    file = str(describe(rig, (LEFT, RIGHT), tmp_path / "rig.yaml"))
+    node = CalibLifecycleNode(context=context, parameter_overrides=[Parameter("rig_file", value=file)])
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    for transition in (node.trigger_configure, node.trigger_activate):
+        assert transition() == TransitionCallbackReturn.SUCCESS
+    assert [own.get_fully_qualified_name() for own in node.calibration.nodes] == [f"/calib_ros/{c}/{TOP}" for c in (LEFT, RIGHT)]
+    assert len(executor.get_nodes()) == 3
+    executor.spin_once(timeout_sec=0.1)
+    for transition in (node.trigger_deactivate, node.trigger_cleanup):
+        assert transition() == TransitionCallbackReturn.SUCCESS
+    assert (executor.get_nodes(), node.calibration) == ([node], None)
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ("sensors: 3", "reference is missing"),
+        ("reference: a\nsensors: {a: {kind: lidar}, b-1: {kind: camera, prior: tf}}", "sensors.b-1 cannot be part of a topic"),
+        ("reference: a\nsensors: {a: {kind: lidar}, b: {kind: lidar}}", "pairs holds no camera"),
+        ("reference: a\nsensors: {a: {kind: lidar}, b: {kind: camera, topc: /b}}", "do you mean topic?"),
+    ],
+)
+def test_a_wrong_rig_file_ends_the_node_with_one_line(tmp_path, wrong, named) -> None:
+    file = tmp_path / "rig.yaml"
+    file.write_text(wrong)
+    command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args", "-p", f"rig_file:={file}"]
+    ended = run(command, capture_output=True, text=True, timeout=240)
+    assert ended.returncode == 2
+    assert named in ended.stderr
+    assert ended.stderr.startswith(f"calib_node: {file}")
+    assert ended.stderr.count("\n") == 1

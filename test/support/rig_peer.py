@@ -1,0 +1,177 @@
+"""A node with a rig and a peer that publishes what its sensors measure, over real DDS in this process."""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import yaml
+from calib_ros_msgs.msg import Extrinsic, Rig
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy._rclpy_pybind11 import InvalidHandle
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_peer import LATCHED, camera_info_message, cloud_message
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from vehicle import QUICK
+from waiting import LIMIT_S, until
+
+from calib_ros import se3
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.ros.conversions import image_message, matrix_from_transform
+from calib_ros.ros.node import CalibNode
+from calib_ros_synthetic.rig import SyntheticRig
+
+Measured = tuple[int, str, Any]  # stamp, sensor, image or cloud
+NO_CLOUD = PointCloud(np.zeros((0, 3), np.float32))
+
+
+def measured(rig: SyntheticRig, cameras: Sequence[str], until_s: float) -> list[Measured]:
+    """What the first LiDAR and some cameras measure, in the order of time."""
+    found: list[Measured] = []
+    for name in (*cameras, rig.lidars[0]):
+        own = rig.pictures(name) if name in cameras else rig.scans(name)
+        first = int(own.stamps[0])
+        found += [(stamp, name, value) for stamp, value in own[: sum(own.stamps - first <= until_s * NANOSECONDS)]]
+    return sorted(found, key=lambda item: item[:2])
+
+
+def describe(rig: SyntheticRig, cameras: Sequence[str], path: Path, **changed: Any) -> Path:
+    """rig.yaml of the first LiDAR and some cameras, with the priors of the source."""
+    lidar = rig.lidars[0]
+    sensors: dict[str, Any] = {lidar: {"kind": "lidar", "topic": f"/{lidar}/points", "frame": lidar}}
+    for name in cameras:
+        T = rig.prior(name)
+        prior = {"translation_m": T[:3, 3].tolist(), "quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist()}
+        own = {"kind": "camera", "topic": f"/{name}/image", "frame": rig.frame_id(name), "prior": prior}
+        sensors[name] = own
+    path.write_text(yaml.safe_dump({"reference": lidar, "sensors": sensors} | changed))
+    return path
+
+
+def again(items: Iterable[Measured], after_s: float) -> list[Measured]:
+    """The same, so much later."""
+    return [(stamp + round(after_s * NANOSECONDS), name, value) for stamp, name, value in items]
+
+
+class RigPeer:
+    """The node under test, its pairs and a peer, each on an executor's thread. parameters: as of `Peer`."""
+
+    def __init__(self, rig: SyntheticRig, cameras: Sequence[str], rig_file: Path, **parameters: Any) -> None:
+        values = {**QUICK, "semantics__segmentation": "none", "online__rest_period_s": 0.0, "online__max_load": 1.0}
+        values |= {"max_data_age_s": 3600.0, "initial_from_tf": False, "publish_period_s": 0.2, **parameters}
+        self.rig, self.cameras, self.lidar = rig, tuple(cameras), rig.lidars[0]
+        self.context = Context()
+        rclpy.init(context=self.context)
+        overrides = [Parameter(n.replace("__", "."), value=v) for n, v in {"rig_file": str(rig_file), **values}.items()]
+        self.node = CalibNode(context=self.context, parameter_overrides=overrides)
+        self.peer = rclpy.create_node("peer", context=self.context)
+        reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+        topics = [(CameraInfo, f"/{c}/camera_info") for c in cameras] + [(Image, f"/{c}/image") for c in cameras]
+        topics += [(PointCloud2, f"/{self.lidar}/points")]
+        self.publishers = {topic: self.peer.create_publisher(kind, topic, reliable) for kind, topic in topics}
+        self.rigs: list[Rig] = []
+        self._sent: dict[tuple[str, str], int] = defaultdict(int)
+        self.statuses: dict[str, Any] = {}
+        self.extrinsics: dict[str, list[Extrinsic]] = defaultdict(list)
+        self.peer.create_subscription(Rig, "/calib_ros/rig", self.rigs.append, LATCHED)
+        self.peer.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        for camera in cameras:
+            heard = self.extrinsics[camera].append
+            self.peer.create_subscription(Extrinsic, f"/calib_ros/{camera}/{self.lidar}/extrinsic", heard, LATCHED)
+        self._spinning = [self._spin(self.node, *self.node.others), self._spin(self.peer)]
+        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()), "the subscriptions")
+
+    @property
+    def calibration(self) -> Any:
+        """Of the rig."""
+        return self.node.calibration
+
+    def pair(self, camera: str) -> Any:
+        """The interface of a pair."""
+        return self.calibration.pairs[camera, self.lidar]
+
+    def sensor(self, name: str, rig: Rig | None = None) -> Any:
+        """What the newest message, or another one, says of a sensor."""
+        return next(own for own in (rig or self.rigs[-1]).sensors if own.name == name)
+
+    def usable(self) -> set[str]:
+        """The sensors to be relied on, by the newest message."""
+        return {own.name for own in self.rigs[-1].sensors if own.usable} if self.rigs else set()
+
+    def drive(self, items: Iterable[Measured], without: Sequence[str] = ()) -> None:
+        """Publish, each when the pairs have worked off the one before; nothing of some sensors."""
+        for stamp, name, value in items:
+            if name in without:
+                continue
+            if name == self.lidar:
+                self.publishers[f"/{name}/points"].publish(cloud_message(value, stamp, frame_id=name))
+                pairs, stream = self.cameras, "clouds"
+            else:
+                image = value[0] if isinstance(value, tuple) else value
+                frame = Frame(image, NO_CLOUD, self.rig.camera(name), stamp)
+                info = camera_info_message(frame, self.rig.frame_id(name))
+                self.publishers[f"/{name}/camera_info"].publish(info)
+                self.until(lambda name=name: self.pair(name).pipeline.camera is not None, "the camera")
+                message = image_message(image, self.rig.frame_id(name), stamp)
+                self.publishers[f"/{name}/image"].publish(message)
+                pairs, stream = (name,), "images"
+            self._sent[stream, name] += 1
+            for camera in pairs:
+                counts = self.pair(camera).pipeline.synchronizer.counts
+                want = self._sent[stream, name]
+                self.until(lambda c=counts, s=stream, w=want: getattr(c, s) >= w, f"{stream} of {name}")
+                with self.pair(camera).pipeline._lock:
+                    pass
+                assert self.pair(camera).pipeline.wait_idle(LIMIT_S)
+
+    def change(self, **named: Any) -> None:
+        """Set parameters of the node, with __ for the dot; they must be taken."""
+        answer = self.node.set_parameters_atomically([Parameter(n.replace("__", "."), value=v) for n, v in named.items()])
+        assert answer.successful, answer.reason
+
+    def until(self, condition: Callable[[], Any], what: object = "") -> Any:
+        """Wait until the condition holds."""
+        return until(condition, what, state=lambda: self.calibration.health.last_error[0])
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.statuses |= {status.name: status for status in message.status}
+
+    def _spin(self, *nodes: Any) -> tuple[SingleThreadedExecutor, threading.Thread]:
+        executor = SingleThreadedExecutor(context=self.context)
+        for node in nodes:
+            executor.add_node(node)
+
+        def run() -> None:
+            with suppress(ExternalShutdownException, InvalidHandle):
+                executor.spin()
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        return executor, thread
+
+    def __enter__(self) -> RigPeer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.node.stop()
+        for executor, thread in self._spinning:
+            executor.shutdown(timeout_sec=LIMIT_S)
+            thread.join(LIMIT_S)
+        self.node.destroy_node()
+        self.peer.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+def poses(rig: Rig) -> Iterator[tuple[str, Any]]:
+    """T_reference_sensor (4, 4) of a message."""
+    for own in rig.sensors:
+        yield own.name, matrix_from_transform(own.transform.transform)
