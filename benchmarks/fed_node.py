@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,7 @@ class Feeder:
         self._publishers: dict[str, Any] = {
             topic: node.create_publisher(message_class(kind), topic, qos) for topic, kind in types.items()
         }
-        self._messages = messages
+        self._messages = restamped(messages)
         self.sent = dict.fromkeys(types, 0)
 
     @property
@@ -113,11 +113,13 @@ class Feeder:
         return all(publisher.get_subscription_count() for publisher in self._publishers.values())
 
     def run(self, pairs: int, rate: float, idle: Callable[[float], None], stopped: Callable[[], bool]) -> None:
-        """Publish so many pairs, `rate` a second. idle: called with the time at which the next one is due, once for each."""
+        """Publish until so many pairs are sent, `rate` a second; the next call goes on behind them. idle: called with the time at
+        which the next one is due, once for each."""
         due = time.monotonic()
-        for message in restamped(self._messages):
+        for message in self._messages:
             if message.topic == IMAGE:
                 if self.sent[IMAGE] == pairs or stopped():
+                    self._messages = chain([message], self._messages)
                     return
                 due = max(due + 1 / rate, time.monotonic() - 1 / rate)  # a delay is not made up for in a burst
                 idle(due)

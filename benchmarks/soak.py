@@ -1,6 +1,6 @@
 """Soak test: hours of data through the node. Does its memory grow, is an estimate lost, are callbacks delayed?
 
-    python -m benchmarks.soak [SOURCE] [--minutes 60] [--rate 30] [--out FOLDER]
+    python -m benchmarks.soak [SOURCE] [--minutes 60] [--rate 30] [--out FOLDER] [--parameters NAME:=VALUE...]
 
 SOURCE: as for calib-ros; by default a synthetic drive of 60 frames. It is written as a bag once and fed in laps over DDS, with
 stamps that go on at 10 Hz of data time, to a node with its default configuration in a process of its own. Ends with 1 if memory
@@ -158,12 +158,13 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0, help="of data at 10 Hz (default 60)")
     parser.add_argument("--rate", type=float, default=30.0, help="pairs per second of wall time (default 30)")
     parser.add_argument("--out", metavar="FOLDER", help="keep bag and node.log here; reuses the bag")
+    parser.add_argument("--parameters", nargs="*", default=[], metavar="NAME:=VALUE", help="more parameters of the node")
     args = parser.parse_args()
     problems: list[str] = []
 
     def soak(bag: Path, reference: Any, folder: Path) -> None:
         pairs = round(args.minutes * PAIRS_PER_MINUTE)
-        with fed_node(bag, se3.perturb(reference, *OFF), folder) as fed:
+        with fed_node(bag, se3.perturb(reference, *OFF), folder, *args.parameters) as fed:
             watcher = Watcher(fed, pairs)
             fed.run(pairs, args.rate)
             watcher.finish()
