@@ -83,10 +83,13 @@ def read_rig(path: str | Path) -> RigDescription:
     """The description in a YAML file. BadInputError names the file, the key and what to do, in one line."""
     path = Path(path).expanduser()
     try:
-        data = io.load(io.read_text(path, "rig", "a description of a rig, see docs/rig.md"))
+        text = io.read_text(path, "rig", "a description of a rig, see docs/rig.md")
+        data, root = io.load(text), io.compose(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise BadInputError(f"{path} is no valid YAML{io.what_is_wrong(error)}; correct it") from None
-    return _Reader(path).rig(data)
+    reader = _Reader(path)
+    reader.check_unique(root)
+    return reader.rig(data)
 
 
 class _Reader:
@@ -98,6 +101,15 @@ class _Reader:
 
     def wrong(self, key: str, problem: str) -> BadInputError:
         return BadInputError(f"{self.path}: {key}{' ' if key else ''}{problem}")
+
+    def check_unique(self, node: yaml.Node | None) -> None:
+        """BadInputError for a key that a mapping has twice, of which YAML takes the last."""
+        seen: set[str] = set()
+        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+            if key.value in seen:
+                raise self.wrong(key.value, f"is given again in line {key.start_mark.line + 1}; leave one of them")
+            seen.add(key.value)
+            self.check_unique(value)
 
     def mapping(self, value: Any, key: str, known: Collection[str] | None, example: str) -> Mapping[str, Any]:
         if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):

@@ -24,8 +24,8 @@ from calib_ros.rig.graph import Edge
 
 SCANS = 20  # that are registered: what more of them show is much the same
 VOXEL_M = 0.4  # half of the odometry's, since both scanners see the same at once
-REACHES_M = (3.0, 1.0, 0.5)  # of matches: at first the prior's error at 30 m and more
-MATCHED_M = 1.0  # of the match that MIN_MATCHED is about
+# Of matches: the prior's error at 30 m and more; that which MIN_MATCHED is about; and what the scans in place need.
+REACHES_M = (3.0, 1.0, 0.5)
 SHARED_M, SHARED = 1.5, 0.3  # points nearer than this to another scanner's by the priors are shared; so many are a view
 ROUNDS = 5  # of reweighting
 # Standard deviations of what all scans have in common, so that their spread does not show it: data sheets give ranges to 1 to
@@ -150,7 +150,8 @@ def scan_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], T:
         between = se3.exp(np.zeros(6) if twist is None else twist * late_s)
         guess = between @ T
         # The narrower scanner's points are looked for among the wider one's.
-        turned, matched = len(B) > len(A), 0.0
+        turned = len(B) > len(A)
+        inliers: list[int] = []
         for reach in REACHES_M:
             if not np.isfinite(guess).all():
                 break
@@ -160,12 +161,13 @@ def scan_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], T:
             else:
                 result = align(A, B, guess, reach)
                 guess = np.asarray(result.T_target_source, float)
-            if reach == MATCHED_M:
-                matched = result.num_inliers / min(len(A), len(B))
-        H = np.asarray(result.H, float)
+            inliers.append(result.num_inliers)
+        # Of what both see, since either sees other things, too.
+        matched, H = inliers[1] / max(inliers[0], 1) if len(inliers) > 1 else 0.0, np.asarray(result.H, float)
         curvature = float(np.linalg.eigvalsh(H[3:, 3:])[0]) / max(result.num_inliers, 1)
         if not result.converged or not np.isfinite(guess).all() or matched < MIN_MATCHED or curvature < MIN_CURVATURE:
-            reason = f"their scans match at {matched:.0%} of the points, {MIN_MATCHED:.0%} are needed, or slide along each other"
+            slides = " but slide along each other" if matched >= MIN_MATCHED else f", {MIN_MATCHED:.0%} are needed"
+            reason = f"their scans match at {matched:.0%} of the points that both see{slides}"
             continue
         # From a right twist of what was aligned to a left one of T_target_source.
         to_right = -np.eye(6) if turned else se3.adjoint(se3.inverse(guess))

@@ -67,6 +67,7 @@ MISTAKES = {
     GOOD + "pair: [[a, b]]": "pair is not known; do you mean pairs?",
     GOOD.replace("reference: top", "reference: tpo"): "reference names 'tpo', which is no sensor here; do you mean top?",
     GOOD.replace("kind: camera}", "knd: camera}"): "sensors.rear.knd is not known; do you mean kind?",
+    GOOD + "  front: {kind: camera}": "front is given again in line 8; leave one of them",
     GOOD.replace("kind: camera}", "frame: x}"): "sensors.rear.kind is missing; give camera or lidar",
     GOOD.replace("kind: camera}", "kind: radar}"): "sensors.rear.kind is 'radar'; give camera or lidar",
     GOOD.replace("sigma_deg: 2", "sigma_deg: 0"): "sensors.front.sigma_deg = 0 is no standard deviation; give a number above 0",
