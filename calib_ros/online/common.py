@@ -35,17 +35,19 @@ class Turns:
         self._queue: deque[object] = deque()
 
     @contextmanager
-    def mine(self, check: Callable[[], object] = lambda: None) -> Iterator[None]:
-        """Context of one's own turn. check: asked now and then while waiting; may raise to give up."""
+    def mine(self, check: Callable[[], object] = lambda: None) -> Iterator[bool]:
+        """Context of one's own turn: whether others had theirs before. check: asked now and then while waiting; may raise to give
+        up."""
         ticket = object()
         with self._changed:
             self._queue.append(ticket)
         try:
             with self._changed:
+                waits = self._queue[0] is not ticket
                 while self._queue[0] is not ticket:
                     self._changed.wait(POLL_S)
                     check()
-            yield
+            yield waits
         finally:
             with self._changed:
                 self._queue.remove(ticket)

@@ -259,8 +259,12 @@ class Pipeline:
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
     def _ingest(self, intake: Intake) -> None:
-        with self._common.intake.mine(self._ingester.check_cancelled), self.load.counting(Work.INTAKE) as meter:
-            self._take_in(intake, meter)
+        with self._common.intake.mine(self._ingester.check_cancelled) as waited, self.load.counting(Work.INTAKE) as meter:
+            newest = self._ingester.newer(intake) if waited else intake
+            if newest is not intake:  # of an older one the scan before, which tells the motion, may be gone
+                with self._lock:
+                    self.dropped_pairs += intake.paired
+            self._take_in(newest, meter)
 
     def _take_in(self, intake: Intake, meter: Meter) -> None:
         if self.paused:

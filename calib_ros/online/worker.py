@@ -53,6 +53,12 @@ class Worker(Generic[Item]):
             self._changed.notify_all()
         return replaced
 
+    def newer(self, item: Item) -> Item:
+        """For an item that is worked on: the newest that waits, which is taken in its place, or itself."""
+        with self._changed:
+            waiting, self._waiting = self._waiting, []
+        return waiting[-1] if waiting else item
+
     @property
     def stopping(self) -> bool:
         """True once stop() was called."""

@@ -167,6 +167,8 @@ class LiveRig:
             self._told = self._told.partition(";")[0]
             return
         after = [edges[p.pair] for p in pairs if p.pair in edges and (p.usable or p.pair in self._lost)]
+        if not after:
+            return
         likely, self._told = verdict(hypotheses(self._before, after))
         if len(likely) == 1 and likely[0].kind == KNOCKED:
             self._named = likely[0].sensors

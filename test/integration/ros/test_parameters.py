@@ -149,7 +149,9 @@ def test_rapid_changes_while_data_flow(vehicle, monkeypatch):
     client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
     before = {name: peer.node.get_parameter(name) for name, _ in GOOD_VALUES}
     original = recalibrator_module.Calibrator
-    monkeypatch.setattr(recalibrator_module, "Calibrator", lambda *given: made.append(given) or original(*given))
+    monkeypatch.setattr(
+        recalibrator_module, "Calibrator", lambda *given, **named: made.append(given) or original(*given, **named)
+    )
     counts, frames = peer.pipeline.synchronizer.counts, len(GOOD_VALUES)
     pairs, unpaired = counts.pairs, counts.unpaired_images
 

@@ -153,3 +153,14 @@ def test_what_an_idle_thread_was_woken_for_is_not_replaced(make):
         assert [recorder.worker.put(k) for k in range(4)] == [[], [], [1], [2]]
     assert recorder.worker.wait_idle(SOON)
     assert recorder.items == [0, 3]
+
+
+def test_what_waits_can_be_taken_in_place_of_what_is_worked_on(make) -> None:
+    recorder = make(blocked=True)
+    recorder.begin("old")
+    assert recorder.worker.newer("old") == "old"
+    recorder.worker.put("new")
+    assert recorder.worker.newer("old") == "new"
+    recorder.go.set()
+    assert recorder.worker.wait_idle(SOON)
+    assert recorder.items == ["old"]
