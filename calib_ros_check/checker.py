@@ -24,7 +24,7 @@ from calib_ros.frame import Frame
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, at_time_offset
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.nuisance.parameters import noise_of
 from calib_ros.registration.progress import Callback, Progress
@@ -83,17 +83,23 @@ class Checker:
     """Checks extrinsics by frames of one camera.
 
     camera: the intrinsics that the frames were taken with, as they are claimed to be. config: all settings; any uncertainty is
-    accepted. segmentation: the models of ``config.semantics``, where they are loaded already.
+    accepted. segmentation: the models of ``config.semantics``, where they are loaded already. scans: as of `Calibrator`.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None, segmentation: Segmentation | None = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        segmentation: Segmentation | None = None,
+        scans: ScanEdges | None = None,
+    ) -> None:
         config = config or Config()
         refine = {"tolerance_deg": NO_LIMIT_DEG, "tolerance_m": NO_LIMIT_M, "objective": "fast"}
         # Three searches look further than one would: more rounds of each hardly find another optimum.
         search = {"rounds": min(config.search.rounds, FRUITLESS_ROUNDS)}
         self.config = update(config, {"refine": refine, "search": search})
         self.camera = camera
-        self._calibrator = Calibrator(camera, self.config, segmentation)
+        self._calibrator = Calibrator(camera, self.config, segmentation, scans=scans)
         self._alternatives = Alternatives(self._calibrator, camera)
         as_stamped = update(self.config, {"motion": {"time_offset": "fixed"}})
         self._at_stamps = Calibrator(camera, as_stamped, self._calibrator.segmentation)

@@ -25,6 +25,7 @@ def options_of(args: argparse.Namespace) -> CheckOptions:
         args.clock,
         args.incomplete,
         configuration(args.config),
+        args.rig or "",
     )
 
 

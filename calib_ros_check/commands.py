@@ -22,6 +22,9 @@ class Check:
             metavar="WHAT",
             help="what is checked: reference = of the source (default), tf = the static transforms of a bag, or a result file",
         )
+        command.add_argument(
+            "--rig", metavar="YAML", help="several cameras and LiDARs, as for `calib-ros rig`; --extrinsic may be its JSON result"
+        )
         for option, default, unit in (("--tolerance-deg", 0.5, "deg"), ("--tolerance-m", 0.1, "m")):
             command.add_argument(
                 option, type=float, default=default, help=f"error up to which it is right, {unit} (default {default})"
@@ -55,6 +58,11 @@ class Check:
         from calib_ros_check.cli import check_one, options_of
         from calib_ros_check.fleet.recordings import is_fleet
 
+        if args.rig is not None:
+            from calib_ros_check.rig.cli import check_one_rig, is_one_rig
+
+            if is_one_rig(args.source, args.rig):
+                return check_one_rig(args)
         if is_fleet(args.source):
             from calib_ros_check.fleet.cli import check_many
 

@@ -32,7 +32,8 @@ class CheckOptions:
 
     extrinsic: ``reference``, what the source says; ``tf``, the static transforms of a bag; or a result file. frames: positions as
     `frame_positions` has them; "" = FRAMES, evenly spread. camera, topics and clock: as `open_dataset`. config: the default is
-    the node's own for what the node has captured.
+    the node's own for what the node has captured. rig: a description of several sensors, "" = one camera and one LiDAR; extrinsic
+    may be a result of `calib-ros rig` then.
     """
 
     extrinsic: str = REFERENCE
@@ -45,6 +46,7 @@ class CheckOptions:
     clock: str | None = None
     incomplete: bool = False
     config: Config = field(default_factory=Config)
+    rig: str = ""
 
 
 @dataclass(frozen=True, eq=False)

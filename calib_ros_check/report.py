@@ -45,8 +45,7 @@ CAUSE_NAMES = {
     "body_frame": "camera_link instead of the optical frame",
     "cloud_frame": "points in another frame",
 }
-TEMPLATE = """\
-{% block style %}
+STYLE = """\
 .verdict { display: inline-block; padding: .25rem .9rem; border-radius: 6px; color: #fff; font-weight: 700; font-size: 1.2rem; }
 .pass { background: #1d7a3a; } .fail { background: #b3261e; } .inconclusive { background: #8a6d00; }
 .said { font-size: 1.05rem; margin: .8rem 0 1.2rem; overflow-wrap: anywhere; }
@@ -66,7 +65,10 @@ td.words { white-space: normal; min-width: 13rem; }
   .bar { width: 100%; }
 }
 nav { display: none; }
-{% endblock %}
+"""
+TEMPLATE = (
+    f"{{% block style %}}\n{STYLE}{{% endblock %}}"
+    + """
 {% block contents %}{% endblock %}
 {% block main %}
 <p><span class="verdict {{ result.verdict.value }}">{{ result.verdict.value }}</span></p>
@@ -112,6 +114,7 @@ Points are coloured by depth, near ones warm.</p>
 </div>
 {% endblock %}
 """
+)
 
 
 def write_report(path: str | Path, result: CheckResult, frames: Sequence[Frame], source: str, config: Config) -> None:
@@ -136,7 +139,7 @@ def write_report(path: str | Path, result: CheckResult, frames: Sequence[Frame],
         result=result,
         rows=[_row(own, result) for own in (result.rotation, *result.axes[:3], result.translation, *result.axes[3:])],
         causes=[(CAUSE_NAMES[f.cause.value], f.state.value, f.message) for f in result.causes],
-        pictures=[(frame.name, _picture(frame, result, config)) for frame in _shown(frames)],
+        pictures=[(frame.name, picture_of(frame, result, config)) for frame in _shown(frames)],
         both=result.T_estimated is not None,
     )
     write_atomically(path, page.encode())
@@ -184,7 +187,7 @@ def _shown(frames: Sequence[Frame]) -> list[Frame]:
     return [frames[int((k + 0.5) * len(frames) / n)] for k in range(n)]
 
 
-def _picture(frame: Frame, result: CheckResult, config: Config) -> bytes:
+def picture_of(frame: Frame, result: CheckResult, config: Config) -> bytes:
     """JPEG of a frame under the extrinsic as given and as the scenes show it."""
     found, shown = result.T_estimated, deskewed_frame(frame, config.motion)
     error = "" if found is None else f"{se3.rotation_error_deg(found, result.T_checked):.2f} deg apart"

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from calib_ros.datasets.camera_files import camera_file, read_camera
 from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, FOREIGN, TEXT_SUFFIXES, read_cloud
+from calib_ros.datasets.recent import Recent
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages.image_encodings import picture_to_bgr
 from calib_ros.messages.pictures import decode_picture
 from calib_ros.messages.wire import shown
@@ -33,36 +34,43 @@ class FolderSource:
     A frame is a name with an image and a cloud; files are read on access. calibration.yaml is what ROS camera_calibration writes,
     with an optional T_camera_lidar (four rows), or a file of `camera_files`, of which `camera` is a name or number. times.csv has
     the columns name, image_ns and, where known, cloud_ns; frames are in the order of their image's stamp, without it in the order
-    of their names, 0.1 s apart.
+    of their names, 0.1 s apart. Of a rig, clouds is the folder of a LiDAR's clouds, among which frames without times.csv are
+    counted, and calibration a file beside the sensors' folders.
 
     Raises BadInputError, with the file and what to do, for missing, contradictory or damaged files.
     """
 
     lidar_frame = "lidar"
 
-    def __init__(self, path: str | Path, camera: int | str | None = None) -> None:
-        self.path = Path(path)
+    def __init__(
+        self, path: str | Path, camera: int | str | None = None, clouds: Path | None = None, calibration: Path | None = None
+    ) -> None:
+        self.path, self.recent = Path(path), Recent(0)
         self.name = self.path.resolve().name
         self._images = named_files(self.path / IMAGES, IMAGE_SUFFIXES)
-        self._calibration = camera_file(self.path)
+        self._calibration = calibration or camera_file(self.path)
         read = read_camera(self._calibration, camera, self._first_size)
         self.camera, self.reference, self.camera_frame, self._other_cameras = read
-        self._clouds = named_files(self.path / CLOUDS, CLOUD_SUFFIXES)
+        folder = clouds or self.path / CLOUDS
+        self._clouds = named_files(folder, CLOUD_SUFFIXES)
         names = sorted(self._images.keys() & self._clouds.keys(), key=_natural)
         if not names:
-            for part, found, known in ((IMAGES, self._images, IMAGE_SUFFIXES), (CLOUDS, self._clouds, CLOUD_SUFFIXES)):
+            parts = (self.path / IMAGES, self._images, IMAGE_SUFFIXES), (folder, self._clouds, CLOUD_SUFFIXES)
+            for part, found, known in parts:
                 if not found:
-                    raise BadInputError(_nothing_readable(self.path / part, known))
+                    raise BadInputError(_nothing_readable(part, known))
             raise BadInputError(
                 f"{self.path}: no name has both an image ({len(self._images)} in {IMAGES}) and a cloud ({len(self._clouds)} in "
-                f"{CLOUDS}); give the two files of a frame the same name, like {IMAGES}/000000.png and {CLOUDS}/000000.pcd"
+                f"{CLOUDS if clouds is None else clouds}); give the two files of a frame the same name, like {IMAGES}/000000.png "
+                f"and {CLOUDS}/000000.pcd"
             )
         self._has_times = (self.path / TIMES).exists()
         if self._has_times:
             self._stamps = _read_times(self.path / TIMES, names)
             names.sort(key=lambda name: self._stamps[name][0])
         else:
-            self._stamps = {name: (k * PERIOD_NS, None) for k, name in enumerate(names)}
+            counted = names if clouds is None else sorted(self._clouds, key=_natural)
+            self._stamps = {name: (k * PERIOD_NS, None) for k, name in enumerate(counted)}
         self.names = names
         self._read_image(names[0])
 
@@ -74,13 +82,23 @@ class FolderSource:
         image_ns, cloud_ns = self._stamps[name]
         return Frame(
             image=self._read_image(name),
-            cloud=read_cloud(self._clouds[name], image_ns if cloud_ns is None else cloud_ns),
+            cloud=self.scan(index)[1],
             camera=self.camera,
             stamp=image_ns,
             cloud_stamp=cloud_ns,
             reference=self.reference,
             name=name,
         )
+
+    def scan(self, index: int) -> tuple[int, PointCloud]:
+        """The scan of a frame with its stamp, ns, which is the image's where the scan has none."""
+        path, stamp = self._clouds[self.names[index]], self.stamp_of_scan(index)
+        return stamp, self.recent((path, stamp), lambda: read_cloud(path, stamp))
+
+    def stamp_of_scan(self, index: int) -> int:
+        """That stamp."""
+        image_ns, cloud_ns = self._stamps[self.names[index]]
+        return image_ns if cloud_ns is None else cloud_ns
 
     def describe(self) -> dict[str, str]:
         """What the folder holds: label -> text."""

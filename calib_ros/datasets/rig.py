@@ -10,6 +10,7 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
+from calib_ros.datasets.folder_rig import FolderRig, is_folder_rig
 from calib_ros.datasets.kitti import KittiSource
 from calib_ros.datasets.nuscenes import NuScenesSource
 from calib_ros.datasets.open import is_bag, open_dataset
@@ -31,8 +32,9 @@ __all__ = ["RecordedRig", "RigSource", "named_rig", "open_rig"]
 
 
 def open_rig(path_or_text: str | Path, description: DescribedRig, **options: Any) -> RigSource:
-    """Open the recording of the rig that is described: a bag by the topics of its sensors; or a synthetic rig, nuScenes or KITTI,
-    where `topic` is the recording's own name of a sensor (nuScenes: channel; KITTI: number of the camera), by default its name.
+    """Open the recording of the rig that is described: a bag by the topics of its sensors; or a synthetic rig, nuScenes, KITTI or
+    plain folders, where `topic` is the recording's own name of a sensor (nuScenes: channel; KITTI: number of the camera; plain
+    folders: see `FolderRig`), by default its name.
 
     options : of a bag, see `BagSource`: tolerance_s, rectified, motion, windows, clock, incomplete.
 
@@ -45,6 +47,8 @@ def open_rig(path_or_text: str | Path, description: DescribedRig, **options: Any
         from calib_ros.datasets.bag_rig import BagRig
 
         return BagRig(path, description, **options)
+    if is_folder_rig(path, description):
+        return FolderRig(path, description)
     return OneLidarRig(text, description)
 
 
@@ -110,7 +114,9 @@ class OneLidarRig(ByDescription):
         for name in self.cameras:
             source = open_dataset(text, self.sensors[name].topic or name)
             if not isinstance(source, (KittiSource, NuScenesSource)):
-                raise BadInputError(f"{text} is no recording of a rig; give a bag, KITTI, nuScenes or synthetic:rig=NAME")
+                raise BadInputError(
+                    f"{text} is no recording of a rig; give a bag, KITTI, nuScenes, synthetic:rig=NAME, or folders of cameras"
+                )
             source.recent = recent
             self._sources[name] = source
 

@@ -157,12 +157,13 @@ class _Reader:
         return RigDescription(sensors, rig.reference, self.pairs(top["pairs"], rig), self.path.parent)
 
     def _unique(self, sensors: tuple[Sensor, ...], key: str) -> None:
-        seen: dict[str, str] = {}
+        seen: dict[tuple[str, str], str] = {}
         for sensor in sensors:
             value = getattr(sensor, key)
-            if value and value in seen:
-                raise self.wrong(f"sensors.{sensor.name}.{key}", f"is {value}, as of {seen[value]}; give each its own")
-            seen[value] = sensor.name
+            own = value, sensor.kind if key == "topic" else ""  # a folder may hold images and clouds
+            if value and own in seen:
+                raise self.wrong(f"sensors.{sensor.name}.{key}", f"is {value}, as of {seen[own]}; give each its own")
+            seen[own] = sensor.name
 
     def sensor(self, name: str, value: Any) -> Sensor:
         key = f"sensors.{name}"

@@ -14,9 +14,9 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
-from calib_ros.datasets.positions import frame_positions
+from calib_ros.datasets.positions import frame_positions, spread_positions
 from calib_ros.datasets.rig_source import RigSource
-from calib_ros.datasets.source import neighbours
+from calib_ros.datasets.source import Source, neighbours
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.lidar.ego_motion import needs_ego_motion
@@ -66,26 +66,36 @@ def priors_of(description: RigDescription, rig: RigSource) -> dict[str, tuple[Tr
 
 
 class RigMeasurer:
-    """Measures the edges of a rig. config: of all its cameras. frames: which of every pair, as --frames. progress: gets what is
-    done and the share of it."""
+    """Measures the edges of a rig. config: of all its cameras. frames: which of every pair, as --frames, or about how many,
+    evenly spread. progress: gets what is done and the share of it."""
 
     def __init__(
-        self, rig: RigSource, description: RigDescription, config: Config, frames: str = "all", progress: Progress | None = None
+        self,
+        rig: RigSource,
+        description: RigDescription,
+        config: Config,
+        frames: str | int = "all",
+        progress: Progress | None = None,
     ) -> None:
         self.rig, self.description, self.config, self.frames = rig, description, config, frames
         self.priors = priors_of(description, rig)
         self.progress = progress or (lambda text, share: None)
         self.scans = {name: LidarScans(rig.scans(name), config.motion, self._window(name)) for name in description.lidars}
-        self._shared: dict[str, ScanEdges] = {name: {} for name in description.lidars}
+        self.shared: dict[str, ScanEdges] = {name: {} for name in description.lidars}
 
     def _window(self, lidar: str) -> tuple[int, int] | None:
         """From and to which scan the chosen frames last; None = all."""
-        if self.frames == "all" or not self.description.cameras:
+        if self.frames == "all" or isinstance(self.frames, int) or not self.description.cameras:
             return None
         source = self.rig.pair(self.description.cameras[0], lidar)
-        positions = frame_positions(self.frames, len(source))
+        positions = self._positions(source)
         first, last = (source[k].moment_of_cloud for k in (min(positions), max(positions)))
         return first, last
+
+    def _positions(self, source: Source) -> list[int]:
+        if isinstance(self.frames, int):
+            return spread_positions(self.frames, len(source))
+        return frame_positions(self.frames, len(source))
 
     def measure(self) -> list[Measurement]:
         """All edges: LiDARs first, whose places narrow the search for cameras. Deterministic. Raises what reading raises."""
@@ -145,11 +155,10 @@ class RigMeasurer:
     def camera_edge(self, camera: str, lidar: str, known: RigSolution) -> Measurement:
         """Registration of a camera with a LiDAR, around where they are by what is known."""
         T, C = known.between(camera, lidar)
-        source, config = self.rig.pair(camera, lidar), self._config(camera)
-        positions = frame_positions(self.frames, len(source))
+        source = self.rig.pair(camera, lidar)
         try:
-            frames = [self._with_motion(source[i], lidar, config) for i in positions]
-            calibrator = Calibrator(frames[0].camera, config, scans=self._shared[lidar])
+            frames = self.frames_of(camera, lidar)
+            calibrator = Calibrator(frames[0].camera, self.config_of(camera), scans=self.shared[lidar])
             result = calibrator.calibrate(frames, T, box_of(C))
         except CalibrationError as error:
             return Measurement(camera, lidar, "registration", None, str(error))
@@ -174,9 +183,8 @@ class RigMeasurer:
         return out
 
     def _turns(self, camera: str, lidar: str, known: RigSolution) -> Edge:
-        source, config = self.rig.pair(camera, lidar), self._config(camera)
-        positions = frame_positions(self.frames, len(source))
-        frames = [self._with_motion(frame, lidar, config) for frame in neighbours(source, positions)]
+        source, config = self.rig.pair(camera, lidar), self.config_of(camera)
+        frames = [self._with_motion(frame, lidar, config) for frame in neighbours(source, self._positions(source))]
         guess = motion_guess(frames, FeatureExtractor(source.camera, config), config.search.seed)
         T, _ = known.between(camera, lidar)
         R = min((h[:3, :3] for h in guess.hypotheses), key=lambda R: se3.rotation_error_deg(R, T))
@@ -185,7 +193,13 @@ class RigMeasurer:
         at = se3.inverse(T)[:3, 3]  # the camera stays where it is believed to be: it turns about itself
         return Edge(camera, lidar, se3.from_parts(R, -R @ at), C, "motion", samples=len(frames))
 
-    def _config(self, camera: str) -> Config:
+    def frames_of(self, camera: str, lidar: str) -> list[Frame]:
+        """The chosen frames of a pair, with the LiDAR's motion. Raises what reading raises."""
+        source, config = self.rig.pair(camera, lidar), self.config_of(camera)
+        return [self._with_motion(source[i], lidar, config) for i in self._positions(source)]
+
+    def config_of(self, camera: str) -> Config:
+        """The configuration with the camera's mask."""
         mask = self.description[camera].mask
         return update(self.config, {"image": {"mask": mask}}) if mask else self.config
 

@@ -20,7 +20,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.result import CONSUMERS_SIGMAS, CONVERGED, INSUFFICIENT, REFUSED, VERSION, Consumer
 from calib_ros.rig.description import CAMERA, RigDescription
 from calib_ros.rig.edges import Measurement, RigMeasurer
-from calib_ros.rig.graph import PRIOR, Edge, RigSolution
+from calib_ros.rig.graph import PRIOR, Edge, Loop, RigSolution
 from calib_ros.rig.moved import RigHypothesis, hypotheses, verdict
 
 REFERENCE = "reference"
@@ -131,14 +131,10 @@ class RigReport:
             "edges": [self._edge(m) for m in self.measured],
             "rejected": [e.name for e in s.rejected],
             "doubted": [e.name for e in s.doubted],
-            "loops": [
-                {"sensors": list(loop.sensors), "rotation_deg": loop.size[0], "translation_m": loop.size[1],
-                 "p_value": loop.p_value, "closes": loop.closes}
-                for loop in s.loops
-            ],
+            "loops": [loop_dict(loop) for loop in s.loops],
             **({} if self.before is None else {"changes": [_change(h) for h in self.changes[0]], "change": self.changes[1]}),
             "version": VERSION,
-        }  # fmt: skip
+        }
 
     def _sensor(self, name: str) -> dict[str, Any]:
         T, (status, reason) = self.solution.poses[name], self.status(name)
@@ -275,6 +271,12 @@ class RigReport:
             export.write_joints(path, poses, edges)
         else:
             io.write_atomically(path, export.autoware_yaml(*poses).encode())
+
+
+def loop_dict(loop: Loop) -> dict[str, Any]:
+    """Plain numbers, lists and texts of a loop."""
+    names = "sensors", "rotation_deg", "translation_m", "p_value", "closes"
+    return dict(zip(names, (list(loop.sensors), *loop.size, loop.p_value, loop.closes), strict=True))
 
 
 def _change(found: RigHypothesis) -> dict[str, Any]:

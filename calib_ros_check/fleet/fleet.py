@@ -139,7 +139,7 @@ def _written(fleet: Fleet, options: FleetOptions, facts: Mapping[str, str], note
 
 
 def _portable(options: CheckOptions) -> CheckOptions:
-    """With an absolute path, since workers may have started elsewhere."""
-    if options.extrinsic in (REFERENCE, TF):
-        return options
-    return replace(options, extrinsic=str(Path(options.extrinsic).expanduser().resolve()))
+    """With absolute paths, since workers may have started elsewhere."""
+    files = {"rig": options.rig, "extrinsic": "" if options.extrinsic in (REFERENCE, TF) else options.extrinsic}
+    absolute: dict[str, Any] = {name: str(Path(file).expanduser().resolve()) for name, file in files.items() if file}
+    return replace(options, **absolute)

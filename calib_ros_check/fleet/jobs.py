@@ -16,8 +16,10 @@ from pathlib import Path
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
+from calib_ros.rig.description import read_rig
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.recording import REFERENCE, TF, CheckOptions, check_source
+from calib_ros_check.rig.check import as_given, as_row, check_recording
 
 # What an error comes from: the recording, which stays as it is until its files change, or anything else, which is tried again.
 INPUT, OTHER = "input", "other"
@@ -55,7 +57,10 @@ def options_key(options: CheckOptions) -> str:
     content = asdict(options)
     semantics = options.config.semantics
     content["weights"] = _weights(semantics)
-    if options.extrinsic not in (REFERENCE, TF):
+    if options.rig:
+        description = as_given(read_rig(options.rig), options.extrinsic)
+        content["rig"] = repr((description.sensors, description.reference, description.pairs))
+    elif options.extrinsic not in (REFERENCE, TF):
         from calib_ros import result
 
         content["extrinsic"] = result.load(options.extrinsic).T_camera_lidar.tolist()
@@ -82,7 +87,8 @@ def _checked(job: CheckJob, options: CheckOptions) -> Answer:
     usage = Usage()
     answer: Answer
     try:
-        answer = {"result": check_source(job.path, options).result.to_dict()}
+        found = as_row(check_recording(job.path, options)) if options.rig else check_source(job.path, options).result.to_dict()
+        answer = {"result": found}
     except (MissingDependencyError, ImportError):
         raise
     except CalibrationError as error:

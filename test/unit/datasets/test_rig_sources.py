@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from calib_ros.datasets.recent import Recent
 from calib_ros.datasets.rig import open_rig
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
+from calib_ros.registration.initial_guess import nominal
 from calib_ros_synthetic.rig import SyntheticRig
 
 TEXT = "synthetic:seed=3,frames=1,width=96,noise=0.0,rig=two_lidars_three_cameras"
@@ -170,6 +172,45 @@ def test_nuscenes_by_its_channels(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     np.testing.assert_allclose(opened.reference("LIDAR_TOP"), frame.reference, atol=1e-9)
     with pytest.raises(BadInputError, match="has no camera CAM_ROOF; choose one of"):
         open_rig(tmp_path, described("LIDAR_TOP", LIDAR_TOP=lidar(), roof=camera("CAM_ROOF")))
+
+
+def test_plain_folders_of_cameras_share_the_scans_of_one(tmp_path: Path) -> None:
+    for name in ("front", "left"):
+        sample_sources.plain(tmp_path / name)
+    text = (tmp_path / "left/calibration.yaml").read_text(encoding="utf-8")
+    moved = se3.inverse(se3.exp([0, 0, 0, 0.5, 0, 0])) @ nominal(0.0)
+    (tmp_path / "left/calibration.yaml").write_text(f"{text.split('T_camera')[0]}T_camera_lidar: {moved.tolist()}", "utf-8")
+    shutil.rmtree(tmp_path / "left/clouds")
+    opened = open_rig(tmp_path, described("roof", roof=lidar(), eye=camera("front"), left=camera()))
+    frames = [opened.pair(name, "roof")[0] for name in opened.cameras]
+    listed = opened.scans("roof")
+    assert listed.stamps.tolist() == [opened.pair("eye", "roof")[k].moment_of_cloud for k in range(2)]
+    assert listed[0] == (frames[0].moment_of_cloud, frames[0].cloud)
+    assert frames[0].cloud is frames[1].cloud
+    between = se3.inverse(opened.reference("eye")) @ opened.reference("left")
+    np.testing.assert_allclose(between[:3, 3], [0.5, 0, 0], atol=1e-9)
+    assert (opened.frame_id("roof"), opened.frame_id("left")) == ("roof", "camera")
+
+
+def test_plain_folders_with_lidars_and_a_calibration_beside_them(tmp_path: Path) -> None:
+    for name in ("cam0", "a", "b"):
+        sample_sources.plain(tmp_path / name)
+    text = (tmp_path / "cam0/calibration.yaml").read_text(encoding="utf-8")
+    (tmp_path / "calibration.yaml").write_text(text, encoding="utf-8")
+    (tmp_path / "cam0/calibration.yaml").unlink()
+    shutil.rmtree(tmp_path / "cam0/clouds")
+    (tmp_path / "cam0/times.csv").unlink()
+    (tmp_path / "cam0/images/0.bmp").unlink()
+    opened = open_rig(tmp_path, described("a", a=lidar(), b=lidar(), cam0=camera()))
+    frame = opened.pair("cam0", "b")[0]
+    assert (frame.name, frame.stamp) == ("1", 10**8)  # counted among the clouds, not among the images
+    assert opened.camera("cam0").width == 40
+    assert opened.reference("a") is not None
+    assert opened.reference("cam0") is None is frame.reference  # to which of the two is not said
+    with pytest.raises(BadInputError, match=r"images of camera rear is missing; name by sensors.rear.topic .*: a, b, cam0"):
+        open_rig(tmp_path, described("a", a=lidar(), cam0=camera(), rear=camera()))
+    with pytest.raises(BadInputError, match=r"clouds of LiDAR roof is missing; name by sensors.roof.topic a folder"):
+        open_rig(tmp_path, described("roof", roof=lidar(), cam0=camera()))
 
 
 def test_what_is_no_recording_of_a_rig_is_said(tmp_path: Path, written: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,75 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scenes import QUICK, RenderedDrive
+from two_halves import HALVES, TwoHalves
 
 from calib_ros import se3
-from calib_ros.camera import Camera
 from calib_ros.cli.main import main
 from calib_ros.errors import BadInputError
-from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.features import FeatureExtractor, ScanEdges
 from calib_ros.rig import edges
 from calib_ros.rig.description import RigDescription, Sensor
 from calib_ros.rig.edges import RigMeasurer, box_of, priors_of, seen_share
 from calib_ros.rig.report import RigReport
-
-HALVES = {"left": slice(0, 380), "right": slice(260, 640)}  # columns
-
-
-class Half:
-    """Some columns of a drive's pictures as a source of their own."""
-
-    lidar_frame = "lidar"
-
-    def __init__(self, drive: RenderedDrive, name: str) -> None:
-        self._drive, self._columns, self.name, self.camera_frame = drive, HALVES[name], name, name
-        K = drive.camera.K.copy()
-        K[0, 2] -= self._columns.start
-        own = drive.camera
-        self.camera = Camera(K, self._columns.stop - self._columns.start, own.height, own.model, own.D)
-        self.reference = drive.reference
-
-    def __len__(self) -> int:
-        return len(self._drive)
-
-    def __getitem__(self, index: int) -> Frame:
-        frame = self._drive[index]
-        return replace(frame, image=np.ascontiguousarray(frame.image[:, self._columns]), camera=self.camera, classes=None)
-
-    def describe(self) -> dict[str, str]:
-        return {}
-
-
-class TwoHalves:
-    """A rig of one LiDAR and two cameras, which are the halves of one."""
-
-    name, cameras, lidars, reference_sensor = "two halves", ("left", "right"), ("top",), "top"
-
-    def __init__(self, drive: RenderedDrive) -> None:
-        self._drive, self._pairs = drive, {name: Half(drive, name) for name in HALVES}
-
-    def camera(self, name: str) -> Camera:
-        return self._pairs[name].camera
-
-    def frame_id(self, name: str) -> str:
-        return name
-
-    def reference(self, name: str) -> np.ndarray | None:
-        return np.eye(4) if name == "top" else se3.inverse(self._drive.reference)
-
-    def pair(self, camera: str, lidar: str) -> Half:
-        return self._pairs[camera]
-
-    def scans(self, lidar: str) -> Sequence[tuple[int, PointCloud]]:
-        frames = [self._drive[k] for k in range(len(self._drive))]
-        return [(frame.moment_of_cloud, frame.cloud) for frame in frames]
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +48,7 @@ def test_two_cameras_are_found_around_their_lidar(halves: TwoHalves, description
     T, C = report.solution.between("left", "right")
     xi = se3.log(T)
     assert xi @ np.linalg.solve(C, xi) < 22.5
-    assert len(measurer._shared["top"]) == len(halves.scans("top"))
+    assert len(measurer.shared["top"]) == len(halves.scans("top"))
 
 
 def test_a_scan_is_searched_once_for_all_cameras(halves: TwoHalves, monkeypatch: pytest.MonkeyPatch) -> None:

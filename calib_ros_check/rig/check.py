@@ -1,0 +1,324 @@
+"""The check of a rig: every pair that shares a view is checked, and the graph of their edges says which sensor is off."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.arrays import Transform
+from calib_ros.datasets.rig import open_rig
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.frame import Frame
+from calib_ros.io import write_atomically
+from calib_ros.result import VERSION
+from calib_ros.rig.description import MAX_SIGMA_DEG, MAX_SIGMA_M, RigDescription, prior_covariance, read_rig
+from calib_ros.rig.edges import Measurement, Progress, RigMeasurer
+from calib_ros.rig.graph import Edge, RigSolution, solve
+from calib_ros.rig.report import load, loop_dict
+from calib_ros_check.checker import Checker
+from calib_ros_check.outcome import Cause, CheckResult, CheckVerdict, Tolerance, plain
+from calib_ros_check.recording import FRAMES, REFERENCE, TF, CheckOptions
+from calib_ros_check.rig.blame import Blame, blame, claimed
+from calib_ros_check.tolerance import CONFIDENCE, MORE_FRAMES, Judgement, judge, unknown
+
+PASS, FAIL, INCONCLUSIVE = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE
+OF_ONE_PAIR = ("camera", "image_topic", "points_topic", "camera_info_topic")
+NO_EDGE = "no pair joins it to the others"
+
+
+@dataclass(frozen=True, eq=False)
+class PairCheck:
+    """The check of a pair: T_target_source as given, by a measured edge, None where there is none. check: of a camera with a
+    LiDAR; frame: one of its frames, to be drawn."""
+
+    target: str
+    source: str
+    kind: str
+    judgement: Judgement
+    reason: str
+    edge: Edge | None = None
+    check: CheckResult | None = None
+    frame: Frame | None = None
+
+    @property
+    def verdict(self) -> CheckVerdict:
+        """With other causes than the extrinsic."""
+        return self.judgement.verdict if self.check is None else self.check.verdict
+
+    @property
+    def trusted(self) -> Edge | None:
+        """The edge, unless it is one of an optimum elsewhere that does not convince."""
+        doubtful = self.verdict is INCONCLUSIVE and not self.judgement.p_within > 1 - CONFIDENCE
+        return None if doubtful else self.edge
+
+    @property
+    def cause(self) -> Cause | None:
+        """What else than the mount is wrong."""
+        return None if self.check is None else self.check.cause
+
+
+@dataclass(frozen=True, eq=False)
+class SensorCheck:
+    """The verdict about a sensor's pose, and its error against the sensor `against`, in its own axes; not known of that sensor
+    itself."""
+
+    verdict: CheckVerdict
+    reason: str
+    judgement: Judgement
+    against: str
+
+
+@dataclass(frozen=True, eq=False)
+class RigCheck:
+    """Whether the extrinsics of a rig are right to within a tolerance.
+
+    verdict: fail where any sensor fails, pass where all pass. given: T_reference_sensor (4, 4) as checked. solution: by the
+    pairs' edges alone, with loops, rejected and doubted edges. blame: which sensors explain what is off.
+    """
+
+    verdict: CheckVerdict
+    reason: str
+    tolerance: Tolerance
+    given: Mapping[str, Transform]
+    sensors: Mapping[str, SensorCheck]
+    pairs: Sequence[PairCheck]
+    solution: RigSolution
+    blame: Blame
+    source: str = ""
+    notes: Sequence[str] = field(default_factory=tuple)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, None for what is not known; docs/rig.md."""
+        s = self.solution
+        return {
+            "verdict": self.verdict.value,
+            "reason": self.reason,
+            "source": self.source,
+            "reference": s.reference,
+            "tolerance": plain(self.tolerance),
+            "sensors": {
+                name: {**_told(own.verdict, own.reason, own.judgement), "against": own.against,
+                       "T_checked": plain(self.given[name]), "T_estimated": plain(s.poses[name]),
+                       "covariance": plain(s.marginal(name))}
+                for name, own in self.sensors.items()
+            },
+            "pairs": [
+                {"target": p.target, "source": p.source, "kind": p.kind, **_told(p.verdict, p.reason, p.judgement),
+                 "check": None if p.check is None else p.check.to_dict()}
+                for p in self.pairs
+            ],
+            "off": dict(self.blame.off),
+            "rejected": [e.name for e in s.rejected],
+            "doubted": [e.name for e in s.doubted],
+            "loops": [loop_dict(loop) for loop in s.loops],
+            "notes": list(self.notes),
+            "version": VERSION,
+        }  # fmt: skip
+
+    def dumps(self) -> str:
+        """JSON."""
+        return json.dumps(self.to_dict(), indent=1) + "\n"
+
+    def save(self, path: str | Path) -> None:
+        """Write JSON atomically. BadInputError if the folder cannot be written."""
+        write_atomically(path, self.dumps().encode())
+
+
+def _told(verdict: CheckVerdict, reason: str, judgement: Judgement) -> dict[str, Any]:
+    parts = {name: plain(getattr(judgement, name)) for name in ("p_within", "rotation", "translation", "axes")}
+    return {"verdict": verdict.value, "reason": reason, **parts}
+
+
+def as_given(description: RigDescription, extrinsic: str = REFERENCE) -> RigDescription:
+    """The description with the extrinsics that are to be checked as priors: its own by ``reference``, the recording's by ``tf``,
+    or those of a result of `calib-ros rig`, a file. BadInputError for one of other sensors."""
+    if extrinsic == REFERENCE:
+        return description
+    poses: Mapping[str, Transform] = {} if extrinsic == TF else load(extrinsic).poses
+    missing = [s.name for s in description.sensors if s.name not in poses]
+    if extrinsic != TF and missing:
+        raise BadInputError(f"--extrinsic {extrinsic} has no {missing[0]}, but {', '.join(poses)}; give a result of this rig")
+    base = None if extrinsic == TF else se3.inverse(poses[description.reference])
+    sensors = [replace(s, prior=None if base is None else base @ poses[s.name]) for s in description.sensors]
+    return replace(description, sensors=tuple(sensors))
+
+
+def check_recording(path: str, options: CheckOptions, progress: Progress | None = None) -> RigCheck:
+    """Check the rig that options describe by a recording. BadInputError for what cannot be read, or belongs to one pair."""
+    for name in OF_ONE_PAIR:
+        if getattr(options, name) is not None:
+            raise BadInputError(f"--{name.replace('_', '-')} is of one pair; name topics in {options.rig}, or leave --rig out")
+    description = as_given(read_rig(options.rig), options.extrinsic)
+    given = {name: value for name in ("clock", "incomplete") if (value := getattr(options, name))}
+    rig = open_rig(path, description, **given)
+    return check_rig(RigMeasurer(rig, description, options.config, options.frames or FRAMES, progress), options.tolerance)
+
+
+def as_row(found: RigCheck) -> dict[str, Any]:
+    """The verdict with the errors of the worst pair, as of `CheckResult.to_dict`, for a fleet's table. Without an estimate, since
+    histories are of one extrinsic. BadInputError where no camera was checked."""
+    checks = [pair.check for pair in found.pairs if pair.check is not None]
+    if not checks:
+        raise BadInputError(
+            f"{found.source}: {'; '.join(p.reason for p in found.pairs) or 'no camera shares a view with a LiDAR'}"
+        )
+    worst = min(checks, key=lambda check: (FAIL, INCONCLUSIVE, PASS).index(check.verdict))
+    return worst.to_dict() | {"verdict": found.verdict.value, "reason": found.reason, "T_estimated": None, "covariance": None}
+
+
+def check_rig(measurer: RigMeasurer, tolerance: Tolerance) -> RigCheck:
+    """Check the extrinsics that are the measurer's priors. Deterministic. A pair whose frames cannot be
+    read is inconclusive."""
+    known = measurer.solution([])
+    pairs = [_between_lidars(known, m, tolerance) for m in _once(measurer.between_lidars())]
+    listed = measurer.camera_pairs(known)
+    for k, (camera, lidar) in enumerate(listed):
+        measurer.progress(f"{camera} with {lidar}", k / len(listed))
+        pairs.append(_check_pair(measurer, camera, lidar, known, tolerance))
+    joined = {pair.target for pair in pairs if pair.edge is not None}
+    for camera in (name for name in measurer.description.cameras if name not in joined):
+        pairs += [_between_lidars(known, m, tolerance) for m in measurer.by_motion(camera, known)]
+    return judged(known, measurer.description, pairs, tolerance, measurer.config.motion.time_offset_s, measurer.rig.name)
+
+
+def judged(
+    known: RigSolution,
+    description: RigDescription,
+    pairs: Sequence[PairCheck],
+    tolerance: Tolerance,
+    clock_s: float = 0.0,
+    source: str = "",
+) -> RigCheck:
+    """What the checks of pairs say of the sensors. known: the rig as given. clock_s: offset of the clocks as configured, s."""
+    edges = [pair.trusted for pair in pairs if pair.trusted is not None]
+    # Priors as wide as they may be: what is checked must not speak for itself.
+    wide = {n: (T, prior_covariance(T, MAX_SIGMA_DEG, MAX_SIGMA_M)) for n, T in known.poses.items() if n != known.reference}
+    solution = solve(edges, wide, known.reference)
+    mounts = [p.trusted for p in pairs if p.trusted is not None and p.cause in (None, Cause.TIME_OFFSET)]
+    off = any(p.edge in mounts and p.judgement.p_within <= 1 - CONFIDENCE for p in pairs)
+    clocks = any(p.cause is Cause.TIME_OFFSET for p in pairs)
+    found = blame(claimed(known.poses, known.reference, tolerance, mounts if clocks else (), clock_s), mounts, off, clocks)
+    anchor = _anchor(solution, found)
+    causes = _causes(pairs, found)
+    sensors = {
+        s.name: _sensor(s.name, anchor, known, solution, pairs, tolerance, causes.get(s.name) or found.off.get(s.name, ""))
+        for s in description.sensors
+        if s.name != anchor
+    }
+    sensors[anchor] = _of_anchor(anchor, sensors, causes.get(anchor) or found.off.get(anchor, ""))
+    notes = [f"the loop {', '.join(loop.sensors)} does not close: {loop.size[0]:.2f} deg, {100 * loop.size[1]:.1f} cm"
+             for loop in solution.loops if not loop.closes]  # fmt: skip
+    notes += [f"{e.name} contradicts the other pairs and is left out" for e in solution.rejected]
+    notes += [f"{e.name} may be wrong: it cannot be told which of several pairs is" for e in solution.doubted]
+    ordered = {s.name: sensors[s.name] for s in description.sensors}
+    verdict, reason = _verdict(ordered, pairs, found, tolerance)
+    return RigCheck(verdict, reason, tolerance, known.poses, ordered, pairs, solution, found, source, notes)
+
+
+def _check_pair(measurer: RigMeasurer, camera: str, lidar: str, known: RigSolution, tolerance: Tolerance) -> PairCheck:
+    T, kind = known.between(camera, lidar)[0], "check"
+    try:
+        frames = measurer.frames_of(camera, lidar)
+        checker = Checker(frames[0].camera, measurer.config_of(camera), scans=measurer.shared[lidar])
+        found = checker.check(frames, T, tolerance)
+    except CalibrationError as error:
+        return PairCheck(camera, lidar, kind, unknown(), str(error))
+    judgement = Judgement(*(getattr(found, name) for name in ("verdict", "p_within", "rotation", "translation", "axes")))
+    frame, edge = frames[len(frames) // 2], None
+    if found.T_estimated is not None and found.covariance is not None:
+        offset = found.time_offset_s, found.time_offset_sigma_s
+        edge = Edge(camera, lidar, found.T_estimated, found.covariance, kind, *offset, samples=found.frames_used)
+    return PairCheck(camera, lidar, kind, judgement, found.reason, edge, found, frame)
+
+
+def _once(measured: Sequence[Measurement]) -> list[Measurement]:
+    """Of every pair that with an edge, or the first."""
+    found: dict[tuple[str, str], Measurement] = {}
+    for m in measured:
+        if m.edge is not None or (m.target, m.source) not in found:
+            found[m.target, m.source] = m
+    return list(found.values())
+
+
+def _between_lidars(known: RigSolution, m: Measurement, tolerance: Tolerance) -> PairCheck:
+    if m.edge is None:
+        return PairCheck(m.target, m.source, m.kind, unknown(), m.reason)
+    judgement = judge(known.between(m.target, m.source)[0], m.edge.T, m.edge.covariance, tolerance)
+    return PairCheck(m.target, m.source, m.kind, judgement, _sizes(judgement), m.edge)
+
+
+def _sizes(judgement: Judgement) -> str:
+    return f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
+
+
+def _causes(pairs: Sequence[PairCheck], found: Blame) -> dict[str, str]:
+    """By sensor, what else than its mount is wrong: points in another frame are the LiDAR's, the rest is the camera's, but for
+    clocks that the graph tells."""
+    out: dict[str, str] = {}
+    for pair in pairs:
+        finding = next((f for f in pair.check.causes if f.cause is pair.cause), None) if pair.check and pair.cause else None
+        if finding is None or (finding.cause is Cause.TIME_OFFSET and {pair.target, pair.source} & found.off.keys()):
+            continue
+        out.setdefault(pair.source if finding.cause is Cause.CLOUD_FRAME else pair.target, finding.message)
+    return out
+
+
+def _anchor(solution: RigSolution, found: Blame) -> str:
+    """The sensor that the others are judged against: the reference, or, if that is off, the one that is known best to it."""
+    if solution.reference not in found.displaced:
+        return solution.reference
+    rest = [name for name in solution.columns if name not in found.displaced]
+    return min(rest, key=lambda name: float(np.trace(solution.marginal(name)))) if rest else solution.reference
+
+
+def _sensor(
+    name: str,
+    anchor: str,
+    known: RigSolution,
+    solution: RigSolution,
+    pairs: Sequence[PairCheck],
+    tolerance: Tolerance,
+    wrong: str,
+) -> SensorCheck:
+    """A sensor against the anchor. wrong: what it is known to be, "" = nothing."""
+    own = [pair for pair in pairs if name in (pair.target, pair.source)]
+    if len(own) == 1 and anchor in (own[0].target, own[0].source):
+        judgement, reason = own[0].judgement, own[0].reason
+    elif any(pair.trusted is not None for pair in own):
+        judgement = judge(known.between(name, anchor)[0], *solution.between(name, anchor), tolerance)
+        reason = _sizes(judgement)
+    else:
+        judgement, reason = unknown(), "; ".join(pair.reason for pair in own) or f"{NO_EDGE}; {MORE_FRAMES}"
+    return SensorCheck(FAIL if wrong else judgement.verdict, wrong or reason, judgement, anchor)
+
+
+def _of_anchor(anchor: str, others: Mapping[str, SensorCheck], wrong: str) -> SensorCheck:
+    agree = [name for name, own in others.items() if own.verdict is PASS]
+    if wrong:
+        return SensorCheck(FAIL, wrong, unknown(), anchor)
+    if agree:
+        return SensorCheck(PASS, f"the others are judged against it, and {', '.join(agree)} agree with it", unknown(), anchor)
+    return SensorCheck(INCONCLUSIVE, "the others are judged against it, and none agrees with it", unknown(), anchor)
+
+
+def _verdict(
+    sensors: Mapping[str, SensorCheck], pairs: Sequence[PairCheck], found: Blame, tolerance: Tolerance
+) -> tuple[CheckVerdict, str]:
+    limits = f"{tolerance.deg:g} deg / {100 * tolerance.m:g} cm"
+    failed = {name: own for name, own in sensors.items() if own.verdict is FAIL}
+    if failed:
+        told = [own.reason if own.reason in found.lines else f"{name}: {own.reason}" for name, own in failed.items()]
+        return FAIL, "; ".join(dict.fromkeys([*told, *found.doubts]))
+    against = [f"{p.target} with {p.source}" for p in pairs if p.verdict is FAIL]
+    if against:
+        return INCONCLUSIVE, f"{', '.join(against)} alone would fail, but the other pairs contradict it; {MORE_FRAMES}"
+    untold = [name for name, own in sensors.items() if own.verdict is INCONCLUSIVE]
+    if untold:
+        return INCONCLUSIVE, f"the scenes do not tell to within {limits} whether {', '.join(untold)} is right; {MORE_FRAMES}"
+    return PASS, f"all {len(sensors)} sensors are right to within {limits}"

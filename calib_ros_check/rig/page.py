@@ -1,0 +1,86 @@
+"""The page of a rig's check: sensors, pairs, loops, and a frame of every camera with a LiDAR."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from calib_ros.config import Config
+from calib_ros.io import write_atomically
+from calib_ros.result import VERSION
+from calib_ros_check.page import page_template
+from calib_ros_check.report import STYLE, picture_of
+from calib_ros_check.rig.check import RigCheck
+from calib_ros_check.tolerance import Judgement
+
+TEMPLATE = (
+    f"{{% block style %}}\n{STYLE}{{% endblock %}}"
+    + """
+{% block contents %}{% endblock %}
+{% block main %}
+<p><span class="verdict {{ found.verdict.value }}">{{ found.verdict.value }}</span></p>
+<p class="said">{{ found.reason }}</p>
+{% for caption, names, rows in tables if rows %}
+<h2>{{ caption }}</h2>
+<div class="sheet"><div class="scroll"><table>
+<tr>{% for name in names %}<th>{{ name }}</th>{% endfor %}</tr>
+{% for row in rows %}
+<tr>{% for cell in row %}<td class="{{ cell if cell in ('pass', 'fail', 'inconclusive') else 'words' }}">{{ cell }}</td>
+{% endfor %}</tr>
+{% endfor %}
+</table></div></div>
+{% endfor %}
+{% if found.notes %}
+<h2>Notes</h2>
+<ul>{% for note in found.notes %}<li>{{ note }}</li>{% endfor %}</ul>
+{% endif %}
+<h2>Frames</h2>
+<p class="intro">Before: as given. After: as the pair's scenes show it. Points are coloured by depth, near ones warm.</p>
+<div class="grid">
+{% for name, picture in pictures %}
+<figure class="wide"><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="{{ name }}">
+<figcaption><b>{{ name }}</b></figcaption></figure>
+{% endfor %}
+</div>
+{% endblock %}
+"""
+)
+
+
+def write_page(path: str | Path, found: RigCheck, config: Config) -> None:
+    """Write the page, atomically. MissingDependencyError without Jinja2, BadInputError if the folder cannot be written."""
+    sensors = [[name, own.verdict.value, *_errors(own.judgement), own.reason] for name, own in found.sensors.items()]
+    pairs = [[f"{p.target} with {p.source}", p.verdict.value, *_errors(p.judgement), p.reason] for p in found.pairs]
+    loops = [
+        [", ".join(loop.sensors), "yes" if loop.closes else "no", f"{loop.size[0]:.2f} deg", f"{100 * loop.size[1]:.1f} cm"]
+        for loop in found.solution.loops
+    ]
+    names = ["verdict", "rotation", "translation", ""]
+    page = page_template(TEMPLATE).render(
+        command="check",
+        title=f"Check of {found.source}",
+        facts={
+            "recording": found.source,
+            "reference": found.solution.reference,
+            "tolerance": f"{found.tolerance.deg:g} deg, {100 * found.tolerance.m:g} cm",
+            "version": VERSION,
+        },
+        configuration=yaml.safe_dump(config.to_dict(), sort_keys=False),
+        found=found,
+        tables=[
+            ("Sensors", ["sensor", *names], sensors),
+            ("Pairs", ["pair", *names], pairs),
+            ("Loops", ["sensors", "closes", "rotation", "translation"], loops),
+        ],
+        pictures=[
+            (f"{p.target} with {p.source}", picture_of(p.frame, p.check, config))
+            for p in found.pairs
+            if p.frame is not None and p.check is not None
+        ],
+    )
+    write_atomically(path, page.encode())
+
+
+def _errors(judgement: Judgement) -> list[str]:
+    return [judgement.rotation.words, judgement.translation.words]
