@@ -7,22 +7,34 @@ import sys
 import webbrowser
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_source
+from calib_ros.cli.inputs import bag_options, configuration, initial_extrinsic, open_named_source
 from calib_ros.cli.output import note, progress_bar
 from calib_ros.datasets.positions import frame_positions, spread_positions
+from calib_ros.datasets.rig import open_rig
 from calib_ros.errors import BadInputError
 from calib_ros.io import check_output
 from calib_ros.registration.progress import Progress
+from calib_ros.rig.description import read_rig
+from calib_ros.rig.edges import priors_of
+from calib_ros.rig.graph import solve
 from calib_ros.runtime import return_freed_memory
+from calib_ros_view.session.rig_session import RigSession
+from calib_ros_view.session.rig_shown import of_priors, of_result
 from calib_ros_view.session.session import Session
 from calib_ros_view.web.server import Address, Pictures, listening, require_nicegui, serve
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 FRAMES = 10  # of a source, unless said otherwise
 OUT = "extrinsic.json"
 TITLE = "calib-ros view"
+PAIR = "/pair/{camera}/{lidar}"  # of a rig
+OF_ONE_PAIR = ("yaw_deg", "camera", "image_topic", "points_topic", "camera_info_topic")
 OF_SOURCES = (
-    *("source", "initial", "yaw_deg", "config", "frames", "out"),
+    *("source", "rig", "initial", "yaw_deg", "config", "frames", "out"),
     *("camera", "image_topic", "points_topic", "camera_info_topic", "clock", "incomplete"),
 )
 
@@ -38,6 +50,9 @@ def view(args: argparse.Namespace) -> None:
     if args.node is not None:
         _view_node(args, address)
         return
+    if args.rig is not None:
+        _view_rig(args, address)
+        return
     session = _session(args)
     from calib_ros_view.session.jobs import SessionJobs
     from calib_ros_view.web.source_page import SourcePage
@@ -52,12 +67,45 @@ def _view_node(args: argparse.Namespace, address: Address) -> None:
     given = [name.replace("_", "-") for name in OF_SOURCES if getattr(args, name)]
     if given:
         raise BadInputError(f"--node watches a running node: leave out {', '.join(given)}, which only a source can have")
+    from calib_ros_view.node.rig_watch import RigWatch
     from calib_ros_view.node.watch import Watch
     from calib_ros_view.web.live_page import LivePage
+    from calib_ros_view.web.rig_live import LivePairs
+    from calib_ros_view.web.rig_page import RigPages
 
-    with Watch(args.node) as watch:
-        live = LivePage(watch)
-        serve(live.page, f"{watch.name} · {TITLE}", address, live.routes, partial(_ready, opened=args.open))
+    with Watch(args.node) as watch, LivePairs(RigWatch(watch)) as pairs:
+        feed, pictures = pairs.feed, Pictures()
+        live, rig = LivePage(watch, other=lambda: feed.rig is not None), RigPages(feed, pictures)
+
+        def routes(app: FastAPI) -> None:
+            for own in (live, pairs, pictures):
+                own.routes(app)
+
+        serve(
+            *(lambda: live.page() if feed.rig is None else rig.page(), f"{watch.name} · {TITLE}", address, routes),
+            partial(_ready, opened=args.open),
+            others={PAIR: pairs.page},
+        )
+
+
+def _view_rig(args: argparse.Namespace, address: Address) -> None:
+    """Serve the page of a recording of several sensors."""
+    given = [name.replace("_", "-") for name in OF_ONE_PAIR if getattr(args, name)]
+    if given:
+        raise BadInputError(f"--rig says what {', '.join(given)} would: leave them out, and set them in {args.rig}")
+    from calib_ros_view.web.rig_page import RigPages
+    from calib_ros_view.web.rig_sessions import SessionPairs
+
+    config, description = configuration(args.config, preset_name=args.preset), read_rig(args.rig)
+    out = Path(args.out or OUT)
+    check_output(str(out), "--out")
+    rig = None if args.initial is None else of_result(args.initial, description)  # before frames are read for nothing
+    source = open_rig(args.source, description, **bag_options(args))
+    rig = rig or of_priors(description, solve([], priors_of(description, source), description.reference))
+    pictures, session = Pictures(), RigSession(source, description, rig, config, args.frames, out)
+    pairs, title = SessionPairs(session, pictures), f"{source.name} · {TITLE}"
+    ready = partial(_ready, opened=args.open)
+    serve(RigPages(session, pictures).page, title, address, pictures.routes, ready, pairs.close, {PAIR: pairs.page})
 
 
 def _session(args: argparse.Namespace) -> Session:

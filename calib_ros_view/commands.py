@@ -17,9 +17,11 @@ class ViewCommand:
         command.add_argument("source", nargs="?", help=f"{SOURCE}; or --node")
         add_camera_and_topics(command)
         command.add_argument("--node", metavar="NAME", help="watch a running node instead, for example /calib_ros")
+        command.add_argument("--rig", metavar="FILE", help="all sensors of a rig that this YAML file describes, see docs/rig.md")
         command.add_argument(
             "--initial",
-            help="where to start: reference (default), nominal, or a result file; nominal if there is no reference",
+            help="where to start: reference (default), nominal, or a result file; nominal if there is no reference. "
+            "With --rig a result of calib-ros rig (default: the priors)",
         )
         add_yaw_and_config(command)
         command.add_argument("--frames", help="all, 0,4,8 or 0:100:5 (default: ten, evenly spread)")

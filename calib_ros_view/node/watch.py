@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
@@ -218,6 +219,12 @@ class Watch:
     def keyframes(self, count: int = 0, width: int = 0) -> Future[Answer]:
         """Ask for pictures of the newest `count` keyframes (0 = all), at most `width` px wide (0 = 320)."""
         return self.call(KEYFRAMES, GetKeyframes.Request(max_keyframes=count, max_width=width))
+
+    def on_its_thread(self, do: Callable[[Node], None]) -> None:
+        """Do something with the watch's own ROS node, on the thread that serves it."""
+        with self.lock:
+            self._jobs.append(lambda: do(self._node))
+        self._executor.wake()
 
     # ---- the executor's thread ----------------------------------------------------------------------------------------
 

@@ -49,10 +49,14 @@ EVENTS_SHOWN = 60
 
 
 class LivePage:
-    """The page of one node, and what its clients share: the keyframes drawn last."""
+    """The page of one node, and what its clients share: the keyframes drawn last.
 
-    def __init__(self, watch: Watch) -> None:
-        self.watch = watch
+    at: where its pictures are. back: address of the page that it belongs to, "" = none. other: whether another page is to be
+    shown at its place, which loading it again brings.
+    """
+
+    def __init__(self, watch: Watch, at: str = "/live", back: str = "", other: Callable[[], bool] = lambda: False) -> None:
+        self.watch, self.at, self.back, self.other = watch, at, back, other
         self.tiles: list[KeyframePicture] = []
         self.gallery_note = "not asked for yet"
         self.gallery_at = 0.0
@@ -65,15 +69,18 @@ class LivePage:
     def routes(self, app: FastAPI) -> None:
         """Add the addresses of the pictures. They are in memory: no path of the disk is made of a request."""
 
-        @app.get("/live/overlay.jpg")
-        def overlay() -> Response:
-            jpeg = self.watch.overlay.jpeg
-            return Response(jpeg, 200 if jpeg else 404, NO_STORE, "image/jpeg")
+        app.get(f"{self.at}/overlay.jpg", response_class=Response)(self.overlay)
+        app.get(f"{self.at}/keyframe/{{stamp}}.jpg", response_class=Response)(self.keyframe)
 
-        @app.get("/live/keyframe/{stamp}.jpg")
-        def keyframe(stamp: int) -> Response:
-            found = [bytes(tile.data) for tile in self.tiles if stamp_ns(tile.stamp) == stamp]
-            return Response(found[0] if found else b"", 200 if found else 404, NO_STORE, "image/jpeg")
+    def overlay(self) -> Response:
+        """The newest ~/overlay."""
+        jpeg = self.watch.overlay.jpeg
+        return Response(jpeg, 200 if jpeg else 404, NO_STORE, "image/jpeg")
+
+    def keyframe(self, stamp: int) -> Response:
+        """One of those drawn last."""
+        found = [bytes(tile.data) for tile in self.tiles if stamp_ns(tile.stamp) == stamp]
+        return Response(found[0] if found else b"", 200 if found else 404, NO_STORE, "image/jpeg")
 
     async def draw_keyframes(self) -> None:
         """Ask the node for pictures; clients that ask meanwhile share the answer."""
@@ -118,6 +125,8 @@ class _ClientPage:
             with ui.row().classes("w-full items-center justify-between no-wrap"):
                 ui.label(f"{self.watch.name}").classes("text-lg font-bold wrap").props("role=heading aria-level=1")
                 with ui.row().classes("no-wrap gap-1"):
+                    if self.page.back:
+                        theme.icon_button("hub", "all sensors of the rig", partial(ui.navigate.to, self.page.back))
                     theme.icon_button("contrast", "dark or light", partial(theme.switch, self.dark), "d")
                     theme.icon_button("keyboard", "keys", self.help.open, "?")
             self._build_status()
@@ -298,6 +307,9 @@ class _ClientPage:
     def update(self) -> None:
         """Bring everything up to date that has changed."""
         now = time.time()
+        if self.page.other():
+            ui.navigate.reload()
+            return
         with self.watch.lock:
             history = self.watch.history
             said = said_of(self.watch, now)
@@ -363,13 +375,15 @@ class _ClientPage:
         overlay = self.watch.overlay
         if overlay.number and overlay.number != self.overlay_number:
             self.overlay_number = overlay.number
-            self.picture.props(f'src="/live/overlay.jpg?n={overlay.number}"')
+            self.picture.props(f'src="{self.page.at}/overlay.jpg?n={overlay.number}"')
             self.picture.set_visibility(True)
         if overlay.number:
             self.overlay_note.text = f"drawn {ago(now - overlay.at)}; before: initial extrinsic, after: current one"
         if self.page.gallery_at != self.gallery_shown:
             self.gallery_shown = self.page.gallery_at
-            self.gallery.content = f'<div class="tiles">{"".join(map(tile_html, self.page.tiles))}</div>'
+            self.gallery.content = (
+                f'<div class="tiles">{"".join(tile_html(tile, self.page.at) for tile in self.page.tiles)}</div>'
+            )
         history = self.watch.history
         keyframes = history.diagnosis.number("keyframes in the buffer")
         if history.presence is Presence.LIVE and keyframes >= 0 and self.page.is_due(int(keyframes)):

@@ -169,12 +169,12 @@ def event_html(event: Event) -> str:
     )
 
 
-def tile_html(tile: KeyframePicture) -> str:
-    """A keyframe of the gallery."""
+def tile_html(tile: KeyframePicture, at: str) -> str:
+    """A keyframe of the gallery. at: where the pictures of its page are."""
     score = "too little in view" if math.isnan(tile.score) else f"score {tile.score:.2f}"
     age = "newest" if tile.age <= 0 else f"{tile.age:.1f} s older"
     return (
-        f'<figure><img src="/live/keyframe/{stamp_ns(tile.stamp)}.jpg" alt="keyframe, {age}" loading="lazy">'
+        f'<figure><img src="{at}/keyframe/{stamp_ns(tile.stamp)}.jpg" alt="keyframe, {age}" loading="lazy">'
         f"<figcaption>{age} · {score} · {tile.in_view} of {tile.edge_points} edge points</figcaption></figure>"
     )
 

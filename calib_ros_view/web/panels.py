@@ -3,9 +3,11 @@ cloud in three dimensions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from html import escape
 
 import numpy as np
 from nicegui import run, ui
@@ -14,11 +16,12 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.arrays import Matrix
 from calib_ros.errors import CalibrationError
-from calib_ros_view.session.colored_cloud import colored_cloud
+from calib_ros_view.session.colored_cloud import MOST_POINTS, colored_cloud
 from calib_ros_view.session.jobs import SessionJob
 from calib_ros_view.session.motion import AXES
 from calib_ros_view.session.picture import COLORINGS, Look, encoded
 from calib_ros_view.session.plots import curve_plots, ellipse_plots, frame_bars
+from calib_ros_view.session.rig_shown import RigShown
 from calib_ros_view.session.session import Session, SessionState
 from calib_ros_view.web import theme
 from calib_ros_view.web.server import Pictures
@@ -29,6 +32,11 @@ POINT_SIZE = 0.06  # m
 EYE, AIM = (-6.0, -6.0, -12.0), (0.0, 0.0, 10.0)  # m, camera frame: what is looked at, and from where at first
 GAMMA = 2.2  # of the colours of pictures
 RISE_DEG = (-80.0, 80.0)  # of the eye above what is looked at
+RIG_EYE, RIG_AIM = (-9.0, -7.0, 9.0), (2.0, 0.0, 0.0)  # m, of a rig in the frame of its reference
+UPRIGHT = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # a camera as reference: z up in the scene
+CLOUD_COLORS = ("#56b4e9", "#e69f00", "#f0e442", "#cc79a7")  # of LiDARs, on the dark ground; apart for all colour vision
+FRUSTUM_M, FRUSTUM_COLOR = 1.2, "#ffffff"  # how far cameras of a rig are drawn
+REDRAWN_S = 5.0  # between two drawings of moving clouds: half a megabyte goes over the wire
 # How the view is moved by buttons: turn about the vertical and upwards, deg; pan to the right, and distance, times the distance.
 STEPS = (
     ("rotate_left", "turn to the left", (-15.0, 0.0), 0.0, 1.0),
@@ -134,11 +142,11 @@ class Sheet:
         return encoded(picture.draw(self._session.shown_at(frame, state), None, look))
 
 
-class ScenePanel:
-    """The cloud in the colours of the image, with the camera; made when it is looked at first."""
+class TurnedScene:
+    """A scene in three dimensions that is turned by mouse, fingers or buttons; made when it is looked at first."""
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self, height: str = "26rem") -> None:
+        self._height = height
         self._scene: ui.scene | None = None
         self._aim = np.zeros(3)
         self._place = ui.element("div").classes("w-full")
@@ -147,26 +155,24 @@ class ScenePanel:
                 theme.icon_button(icon, hint, partial(self._step, turn, pan, factor))
         ui.label("or drag to turn, right button or two fingers to pan, wheel to come near").classes("text-xs soft p-2")
 
-    async def show(self, state: SessionState, frame: int, look: Look) -> None:
-        """Colour the cloud of a frame."""
-        T = self._session.shown_at(frame, state)
-        cloud = await run.io_bound(colored_cloud, self._session.frames[frame], T)
-        if cloud is None:
-            return
+    def _opened(self, eye: Matrix, aim: Matrix) -> ui.scene:
+        """The scene, empty; at first seen from `eye` (3,)."""
         if self._scene is None:
             with self._place:
-                self._scene = ui.scene(grid=False, background_color="#181a1d").classes("w-full").style("height: 26rem")
-            # From behind the camera, whichever way it looks: not all LiDARs call that x.
-            eye, self._aim = se3.transform(se3.inverse(T), np.array([EYE, AIM]))
+                self._scene = ui.scene(grid=False, background_color="#181a1d").classes("w-full").style(f"height: {self._height}")
+            self._aim = aim
             self._look(eye, 0.0)
         self._scene.clear()
-        linear = (cloud.rgb / 255.0) ** GAMMA  # as the scene wants colours; those of pictures would look pale
-        with self._scene:
-            self._scene.point_cloud(_rounded(cloud.xyz), _rounded(linear), point_size=POINT_SIZE)
-            centre = se3.inverse(T)[:3, 3]
-            for u, v in FRUSTUM:
-                corner = se3.transform(se3.inverse(T), np.array([[u, v, 1.0]]))[0]
-                self._scene.line(centre.tolist(), corner.tolist()).material("#fb923c")
+        return self._scene
+
+    def _frustum(self, T: Matrix, corners: Matrix, color: str) -> None:
+        """A camera at T_scene_camera (4, 4) that sees as far as corners (4, 3), m; inside of the scene."""
+        assert self._scene is not None
+        centre, ends = T[:3, 3].tolist(), se3.transform(T, corners).tolist()
+        for k, end in enumerate(ends):
+            self._scene.line(centre, end).material(color)
+            if len(ends) == 4:
+                self._scene.line(end, ends[k - 1]).material(color)
 
     async def _step(self, turn: tuple[float, float], pan: float, factor: float) -> None:
         """Turn about what is looked at, from wherever the mouse has taken the view; or look at what is beside it."""
@@ -185,6 +191,77 @@ class ScenePanel:
         assert self._scene is not None
         (x, y, z), (u, v, w) = eye.tolist(), self._aim.tolist()
         self._scene.move_camera(x, y, z, u, v, w, 0, 0, 1, duration=seconds)
+
+
+class ScenePanel(TurnedScene):
+    """The cloud in the colours of the image, with the camera."""
+
+    def __init__(self, session: Session) -> None:
+        super().__init__()
+        self._session = session
+
+    async def show(self, state: SessionState, frame: int, look: Look) -> None:
+        """Colour the cloud of a frame."""
+        T = self._session.shown_at(frame, state)
+        cloud = await run.io_bound(colored_cloud, self._session.frames[frame], T)
+        if cloud is None:
+            return
+        # From behind the camera, whichever way it looks: not all LiDARs call that x.
+        scene = self._opened(*se3.transform(se3.inverse(T), np.array([EYE, AIM])))
+        linear = (cloud.rgb / 255.0) ** GAMMA  # as the scene wants colours; those of pictures would look pale
+        with scene:
+            scene.point_cloud(_rounded(cloud.xyz), _rounded(linear), point_size=POINT_SIZE)
+            self._frustum(se3.inverse(T), np.array([[u, v, 1.0] for u, v in FRUSTUM]), "#fb923c")
+
+
+class RigScene(TurnedScene):
+    """The clouds of all LiDARs of a rig, each in a colour of its own, with the cameras, in the frame of the reference."""
+
+    def __init__(self) -> None:
+        super().__init__("30rem")
+        self._names = ui.html("", sanitize=False).classes("text-xs px-2 pb-2")
+        self._drawn: list[object] = []
+        self._next = 0.0
+
+    async def show(self, rig: RigShown, clouds: Mapping[str, NDArray[np.float32]], corners: Callable[[str], Matrix]) -> None:
+        """Draw them, if they are others than before. clouds: (n, 3) in the frames of LiDARs. corners: (4, 3) of a camera's
+        picture at a depth of 1 m."""
+        now = time.monotonic()
+        drawn: list[object] = [rig.poses[name].tobytes() for name in rig.poses] + [(n, id(xyz)) for n, xyz in clouds.items()]
+        if drawn == self._drawn or not clouds or now < self._next:
+            return
+        self._drawn, self._next = drawn, now + REDRAWN_S
+        upright = UPRIGHT if rig.reference in rig.cameras else np.eye(4)
+        poses = {name: upright @ T for name, T in rig.poses.items()}
+        made = await run.io_bound(_colored_clouds, clouds, poses, rig.lidars)
+        if made is None:
+            return
+        scene = self._opened(np.array(RIG_EYE), np.array(RIG_AIM))
+        with scene:
+            for xyz, rgb in made:
+                scene.point_cloud(xyz, rgb, point_size=POINT_SIZE)
+            for name in rig.cameras:
+                self._frustum(poses[name], FRUSTUM_M * corners(name), FRUSTUM_COLOR)
+            for name, T in poses.items():
+                scene.text(name, "color: #fff; font-size: 11px; background: #0008; padding: 0 3px").move(*T[:3, 3].tolist())
+        colors = ((name, CLOUD_COLORS[k % len(CLOUD_COLORS)]) for k, name in enumerate(rig.lidars) if name in clouds)
+        self._names.set_content(" &nbsp; ".join(f'<span style="color: {c}">■</span> {escape(name)}' for name, c in colors))
+
+
+def _colored_clouds(
+    clouds: Mapping[str, NDArray[np.float32]], poses: Mapping[str, Matrix], lidars: Sequence[str]
+) -> list[tuple[list[list[float]], list[list[float]]]]:
+    """Points and colours of every cloud in the scene: high points are brighter, so that things stand out from the road."""
+    found, most = [], MOST_POINTS // (2 * max(len(clouds), 1))
+    for k, name in enumerate(lidars):
+        if name in clouds and name in poses:
+            kept = clouds[name][:: max(-(-len(clouds[name]) // most), 1)]
+            xyz = se3.transform(poses[name], kept)
+            color = np.array([int(CLOUD_COLORS[k % len(CLOUD_COLORS)][i : i + 2], 16) / 255 for i in (1, 3, 5)]) ** GAMMA
+            low, high = np.quantile(xyz[:, 2], [0.05, 0.95]) if len(xyz) else (0.0, 1.0)
+            bright = np.clip((xyz[:, 2] - low) / max(high - low, 1e-3), 0, 1)
+            found.append((_rounded(xyz), _rounded((0.3 + 0.7 * bright[:, None]) * color)))
+    return found
 
 
 def _rounded(values: NDArray[np.floating]) -> list[list[float]]:

@@ -16,6 +16,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -37,6 +38,7 @@ TOKEN = re.compile(r"[A-Za-z0-9._-]+")
 REFUSED_ORIGIN = b"refused: this request comes from another page; open the address that calib-ros printed"
 REFUSED_TOKEN = b"refused: open the whole address that calib-ros printed, with its token"
 PICTURES_HELD = 128  # of all browsers together
+PAGE_S = 300.0  # in which the frames of a pair are read and searched for edges
 FINISH_S = 2  # seconds that open connections get at the end
 
 
@@ -209,11 +211,13 @@ def serve(
     routes: Callable[[FastAPI], None],
     ready: Callable[[str], None],
     ended: Callable[[], None] = lambda: None,
+    others: Mapping[str, Callable[..., Awaitable[None]]] = MappingProxyType({}),
 ) -> None:
     """Serve a page until Ctrl-C or SIGTERM.
 
     routes: adds routes to the FastAPI application. ready: called with the address to open, once it can be. ended: called when no
-    more requests come. Raises BadInputError if the address cannot be used.
+    more requests come. others: further pages by their paths, as "/pair/{name}", which may take PAGE_S to be built. Raises
+    BadInputError if the address cannot be used.
     """
     import uvicorn
     from fastapi import FastAPI
@@ -225,6 +229,8 @@ def serve(
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     routes(app)
     ui.page("/", title=title)(page)
+    for path, other in others.items():
+        ui.page(path, title=title, response_timeout=PAGE_S)(other)
     # Undelivered messages hold pictures of the past: few are kept.
     ui.run_with(app, title=title, dark=None, message_history_length=50, show_welcome_message=False)
     names = frozenset(LOCAL_NAMES) if address.is_local else None

@@ -52,9 +52,10 @@ HINTS = {"ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight":
 
 
 class SourcePage:
-    """Everything that one browser sees of a session."""
+    """Everything that one browser sees of a session. back: address of the page that it belongs to, "" = none."""
 
-    def __init__(self, session: Session, jobs: SessionJobs, pictures: Pictures) -> None:
+    def __init__(self, session: Session, jobs: SessionJobs, pictures: Pictures, back: str = "") -> None:
+        self._back = back
         self._session, self._jobs, self._pictures = session, jobs, pictures
         self._frame = 0
         self._seen, self._drag = -1, 0
@@ -89,6 +90,8 @@ class SourcePage:
     # --- parts of the page
 
     def _actions(self) -> None:
+        if self._back:
+            theme.icon_button("hub", "all sensors of the rig", partial(ui.navigate.to, self._back))
         theme.icon_button("chevron_left", "previous frame", lambda: self._go(-1), "p")
         theme.icon_button("chevron_right", "next frame", lambda: self._go(1), "n")
         self._frame_label = ui.label().classes("figures text-sm")

@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from pages import POLLING, Page, open_page, press, shows, text  # noqa: F401  # a fixture
 from waiting import until
 
 from calib_ros import result, se3
 from calib_ros.cli import main
 from calib_ros.datasets import open_dataset
+from calib_ros.datasets.rig import named_rig
 
 pytest.importorskip("nicegui", reason="needs nicegui")
 SOURCE = "synthetic:seed=1,frames=4,rings=32,width=640,height=192,speed=3,stride=10"
+RIG_SOURCE = "synthetic:rig=two_lidars_three_cameras,frames=2,width=320,stride=5"
 PAGES = [
     pytest.param([SOURCE, "--frames", "0"], id="source"),
     pytest.param(["--node", "/calib_ros"], id="node", marks=pytest.mark.ros),
@@ -75,6 +78,8 @@ def test_bad_requests_get_one_line(capsys):
             ([], "name a source"),
             (["--node", "/a b"], "no name of a ROS node"),
             ([SOURCE, "--node", "/calib_ros", "--out", "x.json"], "leave out source, out"),
+            ([RIG_SOURCE, "--rig", "/nowhere/rig.yaml"], "rig.yaml"),
+            ([RIG_SOURCE, "--rig", "rig.yaml", "--camera", "2"], "leave them out"),
         ):
             assert main.main(["view", "--port", "0", *options]) == 2, options
             said = capsys.readouterr().err
@@ -82,7 +87,48 @@ def test_bad_requests_get_one_line(capsys):
             assert said.count("\n") == 1
 
 
+@pytest.fixture(scope="module")
+def rig_page(tmp_path_factory):
+    """Of a rig of which only priors are known."""
+    source = named_rig(RIG_SOURCE)
+    sensors = {name: {"kind": "camera" if name in source.cameras else "lidar"} for name in (*source.lidars, *source.cameras)}
+    file = tmp_path_factory.mktemp("rig") / "rig.yaml"
+    file.write_text(yaml.safe_dump({"reference": source.lidars[0], "sensors": sensors}))
+    with Page(RIG_SOURCE, "--rig", str(file), "--frames", "0,1") as made:
+        yield made
+        made.end()
+
+
+def test_the_page_of_a_rig_leads_to_those_of_its_pairs(rig_page):
+    assert rig_page.get()[0] == 200
+    status, content = rig_page.get("/pair/front/lidar_left")
+    assert status == 200
+    assert b"all sensors of the rig" in content
+    assert b"Refine" in content
+    status, content = rig_page.get("/pair/left/lidar_rear")
+    assert status == 200
+    assert b"left and lidar_rear are no pair of this rig" in content
+    assert rig_page.get("/pair/..%2f..%2fetc/passwd")[0] in (200, 404)
+
+
 # --- in a browser
+
+
+@pytest.mark.parametrize("width", [1400, pytest.param(420, marks=pytest.mark.slow)])
+def test_a_rig_in_a_browser_fits_and_shows_every_sensor(rig_page, open_page, width):  # noqa: F811
+    browser = open_page(rig_page.url, width, 900)
+    shows(
+        browser, "nothing is estimated", "front with lidar_left", "front with lidar_right", "lidar_right", "no edges close a loop"
+    )
+    loaded = "return [...document.querySelectorAll('.tiles img')].filter(i => i.complete && i.naturalWidth).length"
+    until(lambda: browser.execute_script(loaded) == 3, "three pictures")
+    widths = browser.execute_script("return [document.documentElement.scrollWidth, window.innerWidth]")
+    assert widths[0] <= widths[1]
+    before = browser.execute_script("return document.querySelector('.tiles img').src")
+    press(browser, "n")
+    until(lambda: browser.execute_script("return document.querySelector('.tiles img').src") != before, "another picture")
+    errors = [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert not errors, json.dumps(errors)
 
 
 class Walk:
