@@ -212,6 +212,11 @@ class BagSource:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def cloud_ahead_ns(self) -> int:
+        """What is taken out of the clouds' stamps, since their clock is ahead of the images'."""
+        return self._index.clock_difference
+
     def __len__(self) -> int:
         return len(self._pairs[0])
 

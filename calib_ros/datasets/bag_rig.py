@@ -24,13 +24,14 @@ from calib_ros.datasets.bag_file import (
     is_rectified,
     peek_header,
 )  # fmt: skip
-from calib_ros.datasets.bag_index import TopicIndex
+from calib_ros.datasets.bag_index import RECORDING, TopicIndex
 from calib_ros.datasets.bag_types import typestore
 from calib_ros.datasets.bag_writer import MAX_STAMP_NS, TF_STATIC, Message, MessageBuilder, write_messages
 from calib_ros.datasets.recent import Recent, Timed
 from calib_ros.datasets.rig_source import CAMERA, KEPT_CLOUDS, ByDescription, DescribedRig, RecordedRig
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
+from calib_ros.io import write_atomically
 from calib_ros.messages import decode_camera_info
 
 DESCRIPTION = ".rig.yaml"  # beside a bag that was written
@@ -72,18 +73,31 @@ class BagRig(ByDescription):
             of_camera, of_lidar = self._believed(camera), self._believed(lidar)
             view = None if of_camera is None or of_lidar is None else se3.inverse(of_camera) @ of_lidar
             topics = self._topics[camera], self._topics[lidar], self._info_topic(camera)
-            source = BagSource(self.path, *topics, **{"T_camera_lidar": view, **self._options})
+            clock = {} if self._by_headers else {"clock": RECORDING}
+            source = BagSource(self.path, *topics, **{"T_camera_lidar": view, **self._options, **clock})
             source.recent = self._recent
             self._pairs[camera, lidar] = source
         return self._pairs[camera, lidar]
 
     def scans(self, lidar: str) -> Timed:
-        """By the stamps of the headers, or of the recording where they have none."""
-        index = TopicIndex(self._topics[lidar])
-        for _, recorded, data in self._bag.heads([index.topic], []):
-            index.add(recorded, data)
-        index.finish(index.has_stamps)
+        """By the clock of the pairs, differences between clocks not taken out."""
+        index = self._indices[self._topics[lidar]]
         return Timed(index.stamps, lambda k: self._scan(index.topic, int(index.recorded[k]), int(index.headers[k])))
+
+    @cached_property
+    def _indices(self) -> dict[str, TopicIndex]:
+        """Of all sensors' messages, by topic."""
+        found = {topic: TopicIndex(topic) for topic in self._topics.values()}
+        for topic, recorded, data in self._bag.heads(list(found), []):
+            found[topic].add(recorded, data)
+        for index in found.values():
+            index.finish(self._options.get("clock") != RECORDING and all(own.has_stamps for own in found.values()))
+        return found
+
+    @property
+    def _by_headers(self) -> bool:
+        """Whether the headers' stamps count, which needs them of all sensors; else the times of recording."""
+        return self._options.get("clock") != RECORDING and all(own.has_stamps for own in self._indices.values())
 
     def _scan(self, topic: str, recorded: int, header: int) -> PointCloud:
         def read() -> PointCloud:
@@ -130,7 +144,7 @@ def write_rig_bag(
         raise BadInputError(f"{described} exists already and is not overwritten; remove it or give another path")
     write_messages(_messages(rig, progress), path, storage)
     text = yaml.safe_dump(description_of(rig), sort_keys=False, default_flow_style=None, width=200)
-    described.write_text(text, encoding="utf-8")
+    write_atomically(described, text.encode())
     return path, described
 
 

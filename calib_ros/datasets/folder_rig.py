@@ -72,7 +72,9 @@ class FolderRig(ByDescription):
     def scans(self, lidar: str) -> Timed:
         """The scans that any camera has an image with."""
         sources = [self.pair(camera, lidar) for camera in self.cameras]
-        found = {source.stamp_of_scan(k): (source, k) for source in reversed(sources) for k in range(len(source))}
+        # Cameras may stamp one scan differently, where it has no stamp of its own.
+        by_name = {name: (source, k) for source in reversed(sources) for k, name in enumerate(source.names)}
+        found = {source.stamp_of_scan(k): (source, k) for source, k in by_name.values()}
         stamps = np.array(sorted(found), np.int64)
 
         def read(k: int) -> object:

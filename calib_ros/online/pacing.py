@@ -75,6 +75,7 @@ class Purse:
     def __init__(self, config: OnlineConfig, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock, self.lock = clock, threading.Lock()
         self.at, self.saved = clock(), SAVED_S * config.max_load
+        self.last_estimate_s = 0.0  # CPU time of the last estimate of any
 
 
 class LoadBudget:
@@ -120,8 +121,9 @@ class LoadBudget:
                 self._keyframes_since_s += seconds
             elif work is Work.ESTIMATES:
                 self._last_estimate_s, self._keyframes_since_s = seconds, 0.0
+                self._purse.last_estimate_s = seconds
             # Intake goes on whatever it costs. Large debts are forgiven, or a larger max_load would help only after hours.
-            self._purse.saved = max(self._purse.saved, -max(SAVED_S, self._last_estimate_s))
+            self._purse.saved = max(self._purse.saved, -max(SAVED_S, self._purse.last_estimate_s))
 
     def count_messages(self) -> None:
         """The calling thread receives the messages: its CPU time counts from now on. Does nothing where it cannot be told."""

@@ -98,7 +98,8 @@ class Pipeline:
     def _recalibrator_at(self, camera: Camera, initial: Result, current: Result | None = None) -> Recalibrator:
         """A new one; its frames are those of the initial extrinsic."""
         names = initial.camera_frame, initial.lidar_frame
-        return Recalibrator(camera, initial, self.config, *names, current, self.speed_gate, self.segmentation, self._scans)
+        shared = self._scans, self._common.models
+        return Recalibrator(camera, initial, self.config, *names, current, self.speed_gate, self.segmentation, *shared)
 
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config
+from calib_ros.config import Config, SemanticsConfig
 from calib_ros.config.online import CONTINUOUS
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.intrinsics import RefinedCamera
@@ -68,6 +68,8 @@ class Recalibrator:
         The models, where they are loaded already.
     scans : SharedScans, optional
         What is found out of the LiDAR's scans, shared with the recalibrators of other cameras beside it.
+    models : callable, optional
+        Models of a configuration, shared as well.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class Recalibrator:
         speed_gate: SpeedGate | None = None,
         segmentation: Segmentation | None = None,
         scans: SharedScans | None = None,
+        models: Callable[[SemanticsConfig], Segmentation] = models_of,
     ) -> None:
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
         self._configured = config or Config()
@@ -91,10 +94,10 @@ class Recalibrator:
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
         self.glance = Glance()
-        self.segmentation = segmentation or models_of(self.config.semantics)
+        self.segmentation = segmentation or models(self.config.semantics)
         self.segmenter = KeyframeSegmenter()
         self.selector = KeyframeSelector(self.config.online)
-        self._scans = scans
+        self._scans, self._models = scans, models
         self.motion = EgoMotion(
             self.config.motion, self.config.lidar.accumulate_s, estimate_motion if scans is None else scans.motion
         )
@@ -433,7 +436,7 @@ class Recalibrator:
                 config = replace(config, motion=self.config.motion)
             features_changed = feature_config(config) != feature_config(self.config)
             if config.semantics != self.config.semantics:  # else the models stay loaded
-                self.segmentation = models_of(config.semantics)
+                self.segmentation = self._models(config.semantics)
             self.config, self._enough = config, None
             # Where it begins to guess, only points near the nominal view have classes so far.
             features_changed = self.first_guess.configure(config, self.tracker.current.accepted > 0) or features_changed

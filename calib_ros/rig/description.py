@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -114,7 +114,7 @@ class _Reader:
     def mapping(self, value: Any, key: str, known: Collection[str] | None, example: str) -> Mapping[str, Any]:
         if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
             raise self.wrong(key, f"must be a mapping such as {example}")
-        for name in value.keys() - (known or value.keys()):
+        for name in sorted(value.keys() - (known or value.keys())):
             raise self.wrong(f"{key}.{name}" if key else name, f"is not known; {_nearest(name, known or ())}")
         return value
 
@@ -124,10 +124,9 @@ class _Reader:
         return value
 
     def sigma(self, value: Any, key: str, most: float) -> float:
-        number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
-        if not 0 < number <= most:
+        if not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 < value <= most:
             raise self.wrong(key, f"= {value!r} is no standard deviation; give a number above 0, up to {most:g}")
-        return number
+        return float(value)
 
     def name(self, value: Any, key: str, names: Collection[str]) -> str:
         if not isinstance(value, str) or value not in names:
@@ -186,7 +185,7 @@ class _Reader:
         return Sensor(name, kind, topic, info, frame, prior, deg, m, mask)
 
     def file(self, text: str, key: str) -> Path:
-        path = self.path.parent / Path(text).expanduser()
+        path = self.path.parent / os.path.expanduser(text)  # which leaves an unknown user as it is
         if not path.is_file():
             raise self.wrong(key, f"names {path}, which is no file; give a path from the folder of {self.path.name}")
         return path

@@ -89,7 +89,7 @@ class RigMeasurer:
             return None
         source = self.rig.pair(self.description.cameras[0], lidar)
         positions = self._positions(source)
-        first, last = (source[k].moment_of_cloud for k in (min(positions), max(positions)))
+        first, last = (source[k].moment_of_cloud + _ahead(source) for k in (min(positions), max(positions)))
         return first, last
 
     def _positions(self, source: Source) -> list[int]:
@@ -184,7 +184,9 @@ class RigMeasurer:
 
     def _turns(self, camera: str, lidar: str, known: RigSolution) -> Edge:
         source, config = self.rig.pair(camera, lidar), self.config_of(camera)
-        frames = [self._with_motion(frame, lidar, config) for frame in neighbours(source, self._positions(source))]
+        frames = [
+            self._with_motion(frame, lidar, config, _ahead(source)) for frame in neighbours(source, self._positions(source))
+        ]
         guess = motion_guess(frames, FeatureExtractor(source.camera, config), config.search.seed)
         T, _ = known.between(camera, lidar)
         R = min((h[:3, :3] for h in guess.hypotheses), key=lambda R: se3.rotation_error_deg(R, T))
@@ -196,17 +198,23 @@ class RigMeasurer:
     def frames_of(self, camera: str, lidar: str) -> list[Frame]:
         """The chosen frames of a pair, with the LiDAR's motion. Raises what reading raises."""
         source, config = self.rig.pair(camera, lidar), self.config_of(camera)
-        return [self._with_motion(source[i], lidar, config) for i in self._positions(source)]
+        return [self._with_motion(source[i], lidar, config, _ahead(source)) for i in self._positions(source)]
 
     def config_of(self, camera: str) -> Config:
         """The configuration with the camera's mask."""
         mask = self.description[camera].mask
         return update(self.config, {"image": {"mask": mask}}) if mask else self.config
 
-    def _with_motion(self, frame: Frame, lidar: str, config: Config) -> Frame:
+    def _with_motion(self, frame: Frame, lidar: str, config: Config, ahead_ns: int) -> Frame:
         if not needs_ego_motion(frame, config.motion):
             return frame
-        return replace(frame, twist=self.scans[lidar].twist_at(frame.cloud_stamp))
+        stamp = None if frame.cloud_stamp is None else frame.cloud_stamp + ahead_ns
+        return replace(frame, twist=self.scans[lidar].twist_at(stamp))
+
+
+def _ahead(source: Source) -> int:
+    """What a source has taken out of the stamps of its clouds, ns; of the LiDAR's own scans it is not."""
+    return int(getattr(source, "cloud_ahead_ns", 0))
 
 
 def _apart(a: str, b: str) -> Measurement:

@@ -144,17 +144,21 @@ def solve(edges: Sequence[Edge], priors: Priors, reference: str) -> RigSolution:
     freedom = 6 * len(edges)  # every edge adds six measurements and no unknown
     while True:
         poses, covariance, cost = _solved(factors, names, reference)
-        if doubted or freedom <= 0 or chi2.sf(cost, freedom) > SIGNIFICANCE:
+        tried = [k for k in range(len(factors)) if k not in left_out and k not in doubted]
+        if not tried or freedom <= 0 or not chi2.sf(cost, freedom) <= SIGNIFICANCE:
             break
-        tried = [k for k in range(len(factors)) if k not in left_out]
         drops = np.array([cost - _solved(_scaled(factors, [k], NOTHING_SAID), names, reference)[2] for k in tried])
-        wrong = [tried[k] for k in np.flatnonzero(np.exp(drops / 2 - logsumexp(drops / 2)) > 1 - SURE)]
+        # Those of which one is wrong, as far as one is sure.
+        order = np.argsort(-drops, kind="stable")
+        known = np.cumsum(np.exp(drops[order] / 2 - logsumexp(drops / 2)))
+        wrong = [tried[k] for k in order[: int(np.searchsorted(known, SURE)) + 1]]
         if len(wrong) == 1:
             factors, freedom = _scaled(factors, wrong, NOTHING_SAID), freedom - 6
             left_out += wrong
             continue
         # Which of them is wrong cannot be told: all are believed less, by how much too far they are apart (Birge 1932).
-        factors, doubted = _scaled(factors, wrong, max(cost / freedom, drops.max() / 6)), wrong
+        factors = _scaled(factors, wrong, max(cost / freedom, drops.max() / 6))
+        doubted += wrong
     used = tuple(f for k, f in enumerate(factors[: len(edges)]) if k not in left_out)
     given = [*edges, *factors[len(edges) :]]
     solution = RigSolution(

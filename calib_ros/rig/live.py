@@ -119,7 +119,7 @@ class LiveRig:
             self._before = solution if len(confirmed) == len(edges) else solve(confirmed, priors, reference)
         measured = [Measurement(*p.pair, KIND, edges.get(p.pair), p.reason) for p in known]
         report = RigReport(self._description, solution, measured, {}, {}, limits=self._limits)
-        rejected = {(e.target, e.source) for e in (*solution.rejected, *solution.doubted)}
+        rejected = {(e.target, e.source) for e in (*solution.rejected, *solution.doubted) if e.kind == KIND}
         joined = _joined(reference, [p.pair for p in known if p.usable and p.pair in edges and p.pair not in rejected])
         sensors = tuple(self._sensor(name, report, joined, moved, known) for name in solution.poses)
         return RigState(solution, sensors, moved, self._told)
@@ -156,7 +156,7 @@ class LiveRig:
             return ()
         if self._lost - lost and self._before is not None:
             self._compare(pairs, edges)
-        who = suspects(self._lost, [p.pair for p in pairs if p.pair not in self._lost])
+        who = suspects(self._lost, [p.pair for p in pairs if p.usable and p.pair not in self._lost])
         if lost and not self._named:
             self._told = f"{' or '.join(who)} moved; by how much is being estimated"
         return self._named or who

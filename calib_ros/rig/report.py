@@ -111,7 +111,13 @@ class RigReport:
         """What may have happened since `before`, and a line about it; nothing where that is unknown."""
         if self.before is None:
             return (), ""
-        return verdict(hypotheses(self.before, [m.edge for m in self.measured if m.edge is not None]))
+        edges = [m.edge for m in self.measured if m.edge is not None and self._fate(m) != "rejected"]
+        edges = [e for e in edges if {e.target, e.source} <= self.before.poses.keys()]
+        if not edges:
+            return (), "nothing was measured that could be compared"
+        likely, text = verdict(hypotheses(self.before, edges))
+        unseen = [name for name in self.before.poses if all(name not in (e.target, e.source) for e in edges)]
+        return likely, text + (f"; nothing is known of {', '.join(unseen)}" if unseen else "")
 
     @property
     def converged(self) -> bool:
@@ -196,8 +202,8 @@ class RigReport:
         for measured in self.measured:
             sigma = "" if measured.edge is None else _amounts(*_sigmas(measured.edge.covariance))
             edges.append([measured.target, measured.source, measured.kind, self._fate(measured), sigma, measured.reason])
-        priors = [e.target + "-" + e.source for e in self.solution.rejected if e.kind == PRIOR]
-        edges += [[*name.split("-", 1), PRIOR, "rejected", "", "the edges contradict it"] for name in priors]
+        priors = [e for e in self.solution.rejected if e.kind == PRIOR]
+        edges += [[e.target, e.source, PRIOR, "rejected", "", "the edges contradict it"] for e in priors]
         loops = [
             [", ".join(loop.sensors), _amounts(*loop.size), f"{loop.p_value:.3g}", "yes" if loop.closes else "NO"]
             for loop in self.solution.loops
@@ -262,6 +268,11 @@ class RigReport:
         """Write to a file of another tool, by its ending: the joints of a robot's description (.urdf, .xacro), whose origins
         change where the file exists; Autoware's YAML; Kalibr's camera chain where the name begins with camchain."""
         check_out(path)
+        frames = sorted(self.frames.values())
+        if len(set(frames)) < len(frames) or "" in frames:
+            raise BadInputError(
+                f"--out {path}: sensors share a TF frame or have none ({', '.join(frames)}); set sensors.NAME.frame"
+            )
         edges, name = self.edges_of_frames(), Path(path).name
         poses = [export.Pose(a, b, T) for (a, b), T in edges.items() if a == self.frames[self.solution.reference]]
         if name.startswith(CAMCHAIN):
@@ -270,6 +281,8 @@ class RigReport:
         elif Path(path).suffix.lower() in export.DESCRIPTIONS:
             export.write_joints(path, poses, edges)
         else:
+            if Path(path).is_file():
+                io.write_atomically(path + export.FORMER, Path(path).read_bytes())
             io.write_atomically(path, export.autoware_yaml(*poses).encode())
 
 
@@ -309,6 +322,10 @@ def load(path: str | Path) -> RigSolution:
         )
         solution = RigSolution(data["reference"], poses, covariance, edges)
         if covariance.shape != (6 * len(solution.columns),) * 2 or list(solution.columns) != data["covariance_of"]:
+            raise ValueError
+        for C in (covariance, *(e.covariance for e in edges)):
+            np.linalg.cholesky(C + 1e-18 * np.eye(len(C)))  # raises LinAlgError, a ValueError, for what is none
+        if any(e.covariance.shape != (6, 6) for e in edges):
             raise ValueError
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
         raise BadInputError(f"{path} is no result of calib-ros rig; give the file that --json wrote") from None

@@ -58,7 +58,8 @@ class RosInterface:
             node.get_logger().info(line)
         # What may be missing is asked for before anything is made that would have to be taken back.
         motion = motion_source(self.parameters["motion_source"])
-        self.tf = StaticTf(node, self.parameters["initial_from_tf"], self.parameters["publish_tf"], self.health.error)
+        listener = node if rig is None else rig.shared.node  # whose remapping holds for the topic
+        self.tf = StaticTf(listener, self.parameters["initial_from_tf"], self.parameters["publish_tf"], self.health.error)
         self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
         self._files = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_files")  # disks may be slow

@@ -6,6 +6,7 @@ Every pair has the interface of a node of its own, named by its LiDAR below the 
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
@@ -69,7 +70,8 @@ class RigInterface:
         for name in sorted(((OF_RIG | OF_PAIR) - USED) & set(overrides)):
             node.get_logger().warning(f"parameter '{name}' has no effect with a rig_file")
         self.state: RigState | None = None
-        self._priors_given = {s.name: (s.prior, _covariance(s)) for s in self.description.sensors if s.prior is not None}
+        others = [s for s in self.description.sensors if s.name != self.description.reference]
+        self._priors_given = {s.name: (s.prior, _covariance(s)) for s in others if s.prior is not None}
         self._live = LiveRig(self.description, declared.config.refine)
         self.tf = StaticTf(node, declared["initial_from_tf"], declared["publish_tf"], self.health.error)
         common, self._shared = Common(declared.config.online), SharedTopics(node)
@@ -86,6 +88,8 @@ class RigInterface:
             self.pairs[camera, lidar] = made = make(own, pair)
             if self.description.pairs is None:
                 pair.unseen = lambda why, made=made: self._unseen(made, why)
+        self._lock = threading.Lock()  # of state, active and what is published of them
+        self._active = False
         self._told: list[PairState] = []  # what the newest solution rests on
         self._text = ""
         self._edges: list[TransformStamped] = []  # of the newest solution
@@ -101,6 +105,7 @@ class RigInterface:
 
     def activate(self) -> None:
         """See `RosInterface`."""
+        self._active = True
         for pair in self.pairs.values():
             pair.activate()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -118,8 +123,9 @@ class RigInterface:
         self._timers = []
         for pair in self.pairs.values():
             pair.deactivate()
-        if self.state is not None:
-            self.publisher.publish(self._message(self.state, usable=False))
+        with self._lock:
+            self._active = False
+            self._forget()
 
     def stop(self) -> bool:
         """See `RosInterface`."""
@@ -229,27 +235,37 @@ class RigInterface:
 
     def _solve(self, item: tuple[list[PairState], Priors]) -> None:
         """On a thread of its own."""
-        self.state = state = self._live.update(*item)
-        if self._ended is not None:
-            return
+        state = self._live.update(*item)
+        with self._lock:
+            if not self._active or self._ended is not None:  # the last message has been sent
+                return
+            self.state = state
+            self.publisher.publish(self._message(state))
         if state.text != self._text:
             self._text = state.text
             if state.moved:
                 self.health.error(state.text, "rig moved")
             else:
                 self.health.note(state.text, "rig")
-        self.publisher.publish(self._message(state))
         reference = self._frame(state.solution.reference)
         others = [own for own in state.sensors if own.name != state.solution.reference]
         self._edges = [transform_message(own.T, reference, self._frame(own.name), self._stamp(own.name)) for own in others]
 
     def _failed(self, error: Exception) -> None:
+        with self._lock:
+            self._forget()
         self.health.unexpected(error)
+
+    def _forget(self) -> None:
+        """With the lock held: what was found does not hold any more, until it is solved anew."""
+        if self.state is not None:
+            self.publisher.publish(self._message(self.state, usable=False))
+        self.state, self._told = None, []
 
     # ---- messages -------------------------------------------------------------------------------------------------------
 
     def _publish(self) -> None:
-        with self.health.guard():
+        with self.health.guard(), self._lock:
             if self.state is not None:
                 self.publisher.publish(self._message(self.state))
 

@@ -23,6 +23,7 @@ from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_fro
 from calib_ros.ros.subscriptions import AdaptiveSubscription, Form
 
 CLOUDS_KEPT, IMAGES_KEPT = 6, 2  # decoded messages: of clouds, those before a keyframe's are asked for as well
+UNSEEN_SCANS = 10  # one after the other without a point in view: a second
 CHECKED_AGAIN_S = 0.5  # everybody who listens checks once a second
 
 
@@ -44,7 +45,7 @@ class SharedTopics:
     ) -> Listener:
         """As an `AdaptiveSubscription`, which the first one makes."""
         if topic not in self._topics:
-            self._topics[topic] = _Topic(self.node, forms, topic, preference, latched)
+            self._topics[topic] = _Topic(self.node, forms, topic, preference, latched, guard)
         return Listener(self._topics[topic], callback, guard, self._leave)
 
     def _leave(self, topic: _Topic) -> None:
@@ -53,10 +54,18 @@ class SharedTopics:
 
 
 class _Topic:
-    def __init__(self, node: Node, forms: Sequence[Form], topic: str, preference: str, latched: bool) -> None:
+    def __init__(
+        self,
+        node: Node,
+        forms: Sequence[Form],
+        topic: str,
+        preference: str,
+        latched: bool,
+        guard: Callable[[], AbstractContextManager[None]],
+    ) -> None:
         self.listeners: list[Listener] = []
         self.checked, self.problem = 0.0, ""
-        self.subscription = AdaptiveSubscription(node, forms, topic, self._receive, preference, latched)
+        self.subscription = AdaptiveSubscription(node, forms, topic, self._receive, preference, latched, guard)
 
     def _receive(self, stamp: int, message: Any) -> None:
         for listener in list(self.listeners):
@@ -134,15 +143,19 @@ class PairOfRig:
     cloud: Decoded
     T: Transform | None = None
     unseen: Callable[[str], None] | None = None
+    _unseen_scans: int = 0
 
     def frame(self, image: Serialized, cloud: Serialized, camera: Camera) -> Frame:
         """Image and cloud -> Frame. BadInputError if one of them cannot be decoded, or shows nothing of the other."""
         points: PointCloud = self.cloud(cloud)
         if self.unseen is not None and self.T is not None:
-            unseen, self.unseen = self.unseen, None
-            if seen_share(camera, self.T, points.finite().xyz.astype(float)) < SEEN:
+            if seen_share(camera, self.T, points.finite().xyz.astype(float)) >= SEEN:
+                self.unseen = None
+            else:
+                self._unseen_scans += 1  # a LiDAR that starts may send parts of scans
                 line = f"{self.camera} and {self.lidar} share no view by their priors, and are not estimated"
-                unseen(line)
+                if self._unseen_scans >= UNSEEN_SCANS:
+                    self.unseen(line)
                 raise BadInputError(line)
         pixels: NDArray[np.uint8] = self.image(image)
         return Frame(pixels, points, camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))

@@ -84,6 +84,28 @@ def test_which_edge_of_a_single_loop_is_wrong_is_not_claimed() -> None:
     assert loop.size[0] == pytest.approx(np.rad2deg(0.02), rel=0.3)
 
 
+def test_contradictions_apart_from_each_other_are_all_told() -> None:
+    """Two cameras of one LiDAR, each with an edge that contradicts its prior."""
+    poses = rig(1, 4)
+    rng = np.random.default_rng(8)
+    measured = edges(poses, [(f"c{k}", "l0") for k in range(4)], rng)
+    for k in (0, 2):
+        measured[k] = replace(measured[k], T=se3.exp(np.r_[0.2 - 0.05 * k, 0, 0, 0, 0, 0]) @ measured[k].T)
+    known = {name: (T, 1e-4 * C) for name, (T, C) in priors(poses, rng).items()}
+    solution = solve(measured, {n: (poses[n], C) for n, (_, C) in known.items()}, "l0")
+    assert {e.source if e.kind == PRIOR else e.target for e in (*solution.doubted, *solution.rejected)} == {"c0", "c2"}
+
+
+def test_many_equal_contradictions_end() -> None:
+    """Priors of another frame than the reference: every camera's edge and prior contradict each other by as much."""
+    poses = rig(1, 12)
+    rng = np.random.default_rng(9)
+    measured = edges(poses, [(f"c{k}", "l0") for k in range(12)], rng)
+    off = se3.exp(np.r_[0.0, 0.0, 0.0, 1.0, 0.0, 0.5])
+    known = {name: (off @ poses[name], 1e-2 * C) for name, (_, C) in priors(poses, rng).items()}
+    assert solve(measured, known, "l0").doubted
+
+
 def test_a_wrong_prior_does_not_cost_the_edges_that_contradict_it() -> None:
     poses, pairs = RIGS["loops"]
     rng = np.random.default_rng(6)

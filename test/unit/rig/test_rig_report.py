@@ -74,7 +74,8 @@ def test_a_former_result_tells_what_has_moved(report: RigReport, tmp_path: Path)
     report.save(str(path))
     before = load(path)
     assert np.array_equal(before.covariance, report.solution.covariance)
-    assert replace(report, before=before).changes[1] == "nothing has changed"
+    assert replace(report, before=before).changes[1] == "nothing has changed; nothing is known of c2"
+    assert replace(report, before=before, measured=[]).changes == ((), "nothing was measured that could be compared")
     knock = se3.exp([0, 0.02, 0, 0.05, 0, 0])
     moved = [m if m.target != "c1" else replace(m, edge=replace(m.edge, T=knock @ m.edge.T)) for m in report.measured if m.edge]
     told = replace(report, measured=moved, before=before)
