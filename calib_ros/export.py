@@ -225,19 +225,20 @@ def write_back(path: str, result: Result, edges: Edges, joint: str) -> None:
         io.write_atomically(path, data)
 
 
-def write_joints(path: str, poses: Sequence[Pose], edges: Edges) -> None:
+def write_joints(path: str, poses: Sequence[Pose], edges: Edges) -> set[str]:
     """Write to a robot's description: the origins of all joints between frames of `edges` change, and the former file is kept as
-    NAME.former; a missing file is made of joints of the poses. Raises BadInputError as `write_back`."""
+    NAME.former; a missing file is made of joints of the poses. Returns the frames that are joined. Raises BadInputError as
+    `write_back`."""
     try:
         before = Path(path).read_bytes()
     except FileNotFoundError:
         joints = "".join(map(urdf_joint, poses))
         io.write_atomically(path, f'<?xml version="1.0"?>\n<robot name="rig">\n{joints}</robot>\n'.encode())
-        return
+        return {frame for pose in poses for frame in (pose.parent, pose.child)}
     except OSError as error:
         raise BadInputError(f"cannot read {path}: {error.strerror}; name a file") from None
     data = before
-    ours = [n for n, (joint, *more) in _joints(data, path).items() if not more and _links(joint) in edges]
+    ours = {n: _links(joint) for n, (joint, *more) in _joints(data, path).items() if not more and _links(joint) in edges}
     if not ours:
         raise BadInputError(f"{path} has no joint between frames of the rig; {_no_edge(edges)}")
     for name in ours:
@@ -245,6 +246,7 @@ def write_joints(path: str, poses: Sequence[Pose], edges: Edges) -> None:
     if data != before:
         io.write_atomically(path + FORMER, before)
         io.write_atomically(path, data)
+    return {frame for links in ours.values() for frame in links}
 
 
 @dataclass

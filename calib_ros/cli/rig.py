@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from calib_ros.cli.inputs import configuration
 from calib_ros.cli.output import check_json, print_or_save, progress_bar
@@ -37,5 +38,6 @@ def run(args: argparse.Namespace) -> bool:
     if args.report is not None:
         write_atomically(args.report, report.html().encode())
     for path in args.out:
-        report.write(path)
+        if remark := report.write(path):
+            print(f"calib-ros: {remark}", file=sys.stderr)
     return report.converged

@@ -5,24 +5,23 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import LidarConfig, MotionConfig, OnlineConfig, SemanticsConfig
+from calib_ros.datasets.recent import Recent
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.edges import EdgePoints
 from calib_ros.lidar.ego_motion import Motion, estimate_motion
 from calib_ros.online.pacing import Purse
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.classes import segmentation as models_of
-from calib_ros.registration.features import ScanEdges
+from calib_ros.registration.features import ScanEdges, ScanKey
 
-T = TypeVar("T")
 SCANS_KEPT = 8  # of a LiDAR: the newest, and those before them that cameras out of step look at
 POLL_S = 0.1  # between two looks whether who waits for a turn is to stop
 
@@ -54,25 +53,8 @@ class Turns:
                 self._changed.notify_all()
 
 
-class Newest:
-    """The newest values by key, each made once, whichever thread asks first; what it raises is made anew. Thread-safe."""
-
-    def __init__(self, count: int) -> None:
-        self._count, self._lock = count, threading.Lock()
-        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
-
-    def __call__(self, key: Hashable, make: Callable[[], T]) -> T:
-        with self._lock:  # whoever else asks meanwhile mostly wants the same
-            if key not in self._kept:
-                self._kept[key] = make()
-                while len(self._kept) > self._count:
-                    self._kept.popitem(last=False)
-            value: T = self._kept[key]
-            return value
-
-
-class _Bounded(OrderedDict[int, tuple[bool, EdgePoints]]):
-    def __setitem__(self, key: int, value: tuple[bool, EdgePoints]) -> None:
+class _Bounded(OrderedDict[ScanKey, tuple[bool, EdgePoints]]):
+    def __setitem__(self, key: ScanKey, value: tuple[bool, EdgePoints]) -> None:
         super().__setitem__(key, value)
         while len(self) > SCANS_KEPT:
             self.popitem(last=False)
@@ -82,11 +64,11 @@ class SharedScans:
     """What is found out of the scans of one LiDAR: their edges, and how it moved from one to another."""
 
     def __init__(self) -> None:
-        self._motions = Newest(SCANS_KEPT)
+        self._motions = Recent(SCANS_KEPT)
         self._edges: tuple[LidarConfig, ScanEdges] | None = None
 
     def edges(self, config: LidarConfig) -> ScanEdges | None:
-        """By the scans' stamps; None where those of several scans are put together, which each camera does at its own times."""
+        """None where those of several scans are put together, which each camera does at its own times."""
         if config.accumulate_s > 0:
             return None
         if self._edges is None or self._edges[0] != config:
@@ -108,7 +90,7 @@ class Common:
     def __init__(self, config: OnlineConfig) -> None:
         self.purse = Purse(config)
         self.intake, self.estimates, self.classes = Turns(), Turns(), Turns()
-        self._models = Newest(1)
+        self._models = Recent(1)
         self._scans: dict[str, SharedScans] = {}
 
     def scans(self, lidar: str) -> SharedScans:

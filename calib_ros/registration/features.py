@@ -67,8 +67,17 @@ class FrameFeatures:
         return self if self.own is None else replace(self, own=None)
 
 
-# What does not depend on a camera: whether a scan has reflectivities, and its edges as measured, by its stamp.
-ScanEdges = MutableMapping[int, tuple[bool, EdgePoints]]
+# What does not depend on a camera: whether a scan has reflectivities, and its edges as measured, by `scan_key`.
+ScanKey = tuple[int, int, bytes]
+ScanEdges = MutableMapping[ScanKey, tuple[bool, EdgePoints]]
+
+
+def scan_key(frame: Frame) -> ScanKey | None:
+    """What tells the scan of a frame from others, also of drivers that do not stamp; None of one that is not to be shared."""
+    cloud = frame.cloud
+    if frame.cloud_stamp is None or cloud.label is not None or not len(cloud):
+        return None
+    return frame.cloud_stamp, len(cloud), cloud.xyz[len(cloud) // 2].tobytes()
 
 
 class FeatureExtractor:
@@ -141,9 +150,8 @@ class FeatureExtractor:
 
     def _scan_edges(self, frame: Frame, twist: NDArray[np.float64] | None) -> tuple[Frame, bool, EdgePoints]:
         """A frame as its scan was searched, whether that has reflectivities, and its edges."""
-        stamp = frame.cloud_stamp if self.scans is not None and frame.cloud.label is None else None
-        known = self.scans.get(stamp) if self.scans is not None and stamp is not None else None
-        if known is not None:
+        key = None if self.scans is None else scan_key(frame)
+        if self.scans is not None and key is not None and (known := self.scans.get(key)) is not None:
             return frame, *known
         scan, still = range_image(frame.cloud, self.config.lidar), frame
         if scan.layout == "projection" and twist is not None:
@@ -151,8 +159,8 @@ class FeatureExtractor:
             still = deskewed_frame(frame, self.config.motion)
             scan = range_image(still.cloud, self.config.lidar)
         found = scan.reflectivity is not None, edge_points(scan, self.config.lidar)
-        if self.scans is not None and stamp is not None and still is frame:
-            self.scans[stamp] = found
+        if self.scans is not None and key is not None and still is frame:
+            self.scans[key] = found
         return still, *found
 
     def seen_anew(self, features: FrameFeatures, image: NDArray[np.uint8]) -> FrameFeatures:

@@ -104,6 +104,19 @@ class RigSolution:
         return P, A @ self.covariance @ A.T
 
 
+def at_sensor(T: Transform, covariance: Covariance) -> Covariance:
+    """Covariance (6, 6) of the turn and place of a sensor, rad and m in the reference's axes, from that of the left twist of its
+    pose T (4, 4)."""
+    J = se3.parts_jacobian(T)
+    return np.asarray(J @ covariance @ J.T)
+
+
+def worst_sigmas(covariance: Covariance) -> tuple[float, float]:
+    """Standard deviations along the worst directions of a covariance (6, 6), rotation first, in rad and m: deg and m."""
+    turn, shift = (float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0))) for block in (covariance[:3, :3], covariance[3:, 3:]))
+    return float(np.rad2deg(turn)), shift
+
+
 def predicted(poses: Mapping[str, Transform], columns: Mapping[str, slice], target: str, source: str) -> tuple[Transform, Matrix]:
     """T_target_source (4, 4) by the poses, and how its left twist (6, n) follows from those of the poses, in the reference's
     frame: T_target' = exp(a) T_target and T_source' = exp(b) T_source give exp(Ad(T_target^-1) (b - a)) T_target_source."""

@@ -166,7 +166,8 @@ class LiveRig:
         if self._before is None:  # by how much is not known
             self._told = self._told.partition(";")[0]
             return
-        after = [edges[p.pair] for p in pairs if p.pair in edges and (p.usable or p.pair in self._lost)]
+        known = self._before.poses.keys()  # TF may have told of further sensors since
+        after = [edges[p.pair] for p in pairs if p.pair in edges and (p.usable or p.pair in self._lost) and known >= {*p.pair}]
         if not after:
             return
         likely, self._told = verdict(hypotheses(self._before, after))

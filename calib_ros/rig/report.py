@@ -20,7 +20,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.result import CONSUMERS_SIGMAS, CONVERGED, INSUFFICIENT, REFUSED, VERSION, Consumer
 from calib_ros.rig.description import CAMERA, RigDescription
 from calib_ros.rig.edges import Measurement, RigMeasurer
-from calib_ros.rig.graph import PRIOR, Edge, Loop, RigSolution
+from calib_ros.rig.graph import PRIOR, Edge, Loop, RigSolution, at_sensor, worst_sigmas
 from calib_ros.rig.moved import RigHypothesis, hypotheses, verdict
 
 REFERENCE = "reference"
@@ -62,8 +62,7 @@ class RigReport:
 
     def at_sensor(self, name: str) -> Covariance:
         """Covariance (6, 6) of a sensor's turn and place in the reference's axes, rad and m."""
-        J = se3.parts_jacobian(self.solution.poses[name])
-        return np.asarray(J @ self.solution.marginal(name) @ J.T)
+        return at_sensor(self.solution.poses[name], self.solution.marginal(name))
 
     def status(self, name: str) -> tuple[str, str]:
         """Status of a sensor and its reason: reference, converged, insufficient (nothing measured, or directions that the prior
@@ -81,7 +80,7 @@ class RigReport:
             return INSUFFICIENT, f"rests on the prior, since no edge tells: {', '.join(open_axes)}"
         C = self.at_sensor(name)
         if not Consumer(name, self.limits.tolerance_deg, self.limits.tolerance_m).is_served(C):
-            deg, m = _sigmas(C)
+            deg, m = worst_sigmas(C)
             return REFUSED, (
                 f"too uncertain: 1 sigma {deg:.2f} deg and {100 * m:.1f} cm, and {CONSUMERS_SIGMAS:g} of them must be within "
                 f"{self.limits.tolerance_deg:g} deg and {100 * self.limits.tolerance_m:g} cm; give more frames or a better prior"
@@ -99,7 +98,7 @@ class RigReport:
         """An unobservable direction at the sensor, in the reference's axes."""
         v = se3.parts_jacobian(self.solution.poses[name]) @ twist
         T, C = self.solution.prior[name]
-        sigma = np.sqrt(np.diag(se3.parts_jacobian(T) @ C @ se3.parts_jacobian(T).T))
+        sigma = np.sqrt(np.diag(at_sensor(T, C)))
         axis = int(np.argmax(np.abs(v) / sigma))
         own = float(np.sqrt(self.at_sensor(name)[axis, axis]))
         if axis < 3:
@@ -194,13 +193,13 @@ class RigReport:
         """Caption, column names and rows: sensors, edges, loops."""
         sensors, edges = [], []
         for name, T in self.solution.poses.items():
-            (status, reason), (deg, m) = self.status(name), _sigmas(self.at_sensor(name))
+            (status, reason), (deg, m) = self.status(name), worst_sigmas(self.at_sensor(name))
             x, y, z = T[:3, 3]
             known = self.truth.get(name)
             error = "" if known is None or name == self.solution.reference else _amounts(*se3.error(known, T))
             sensors.append([name, status, f"{x:.3f} {y:.3f} {z:.3f}", _amounts(deg, m), error, reason])
         for measured in self.measured:
-            sigma = "" if measured.edge is None else _amounts(*_sigmas(measured.edge.covariance))
+            sigma = "" if measured.edge is None else _amounts(*worst_sigmas(measured.edge.covariance))
             edges.append([measured.target, measured.source, measured.kind, self._fate(measured), sigma, measured.reason])
         priors = [e for e in self.solution.rejected if e.kind == PRIOR]
         edges += [[e.target, e.source, PRIOR, "rejected", "", "the edges contradict it"] for e in priors]
@@ -264,9 +263,10 @@ class RigReport:
         poses = self.solution.poses
         return {(self.frames[a], self.frames[b]): se3.inverse(poses[a]) @ poses[b] for a in names for b in names if a != b}
 
-    def write(self, path: str) -> None:
+    def write(self, path: str) -> str:
         """Write to a file of another tool, by its ending: the joints of a robot's description (.urdf, .xacro), whose origins
-        change where the file exists; Autoware's YAML; Kalibr's camera chain where the name begins with camchain."""
+        change where the file exists; Autoware's YAML; Kalibr's camera chain where the name begins with camchain. Returns which
+        sensors it has no place for, in a line; "" if none."""
         check_out(path)
         frames = sorted(self.frames.values())
         if len(set(frames)) < len(frames) or "" in frames:
@@ -279,11 +279,14 @@ class RigReport:
             cameras = {n: (c, self.solution.poses[n], self.description[n].topic) for n, c in self.cameras.items()}
             io.write_atomically(path, export.kalibr_camchain(cameras).encode())
         elif Path(path).suffix.lower() in export.DESCRIPTIONS:
-            export.write_joints(path, poses, edges)
+            joined = export.write_joints(path, poses, edges)
+            if missing := [name for name, frame in self.frames.items() if frame not in joined]:
+                return f"{path} has no joint for {', '.join(missing)}, which are not written; add joints of their frames"
         else:
             if Path(path).is_file():
                 io.write_atomically(path + export.FORMER, Path(path).read_bytes())
             io.write_atomically(path, export.autoware_yaml(*poses).encode())
+        return ""
 
 
 def loop_dict(loop: Loop) -> dict[str, Any]:
@@ -336,12 +339,6 @@ def check_out(path: str) -> None:
     """BadInputError, before the work, for a file that `RigReport.write` has no format for."""
     if Path(path).suffix.lower() not in WRITABLE:
         raise BadInputError(f"--out {path}: the ending tells the format; give one of {', '.join(WRITABLE)}, or {CAMCHAIN}.yaml")
-
-
-def _sigmas(C: Covariance) -> tuple[float, float]:
-    """Standard deviations along the worst directions, deg and m."""
-    turn, shift = (float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0))) for block in (C[:3, :3], C[3:, 3:]))
-    return float(np.rad2deg(turn)), shift
 
 
 def _amounts(deg: float, m: float) -> str:

@@ -13,7 +13,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from calib_ros_msgs.msg import Rig, RigLoop, RigSensor
+from calib_ros_msgs.msg import Rig, RigEdge, RigLoop, RigSensor
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.msg import SetParametersResult
@@ -78,6 +78,7 @@ class RigInterface:
         self.load = LoadBudget(declared.config.online, purse=common.purse)  # of receiving messages
         decoded = {s.name: decoded_images() if s.kind == CAMERA else decoded_clouds() for s in self.description.sensors}
         self.pairs: dict[Pair, RosInterface] = {}
+        self._views: list[PairOfRig] = []  # of pairs that are estimated only if they share a view
         self.nodes: tuple[Node, ...] = ()
         for camera, lidar in wanted:
             pair = PairOfRig(*(camera, lidar, common, self._shared, self._topics(camera, lidar), decoded[camera], decoded[lidar]))
@@ -88,6 +89,7 @@ class RigInterface:
             self.pairs[camera, lidar] = made = make(own, pair)
             if self.description.pairs is None:
                 pair.unseen = lambda why, made=made: self._unseen(made, why)
+                self._views.append(pair)
         self._lock = threading.Lock()  # of state, active and what is published of them
         self._active = False
         self._told: list[PairState] = []  # what the newest solution rests on
@@ -216,6 +218,9 @@ class RigInterface:
             self.load.count_messages()
             self.tf.check()
             states, priors = [self._state_of(*names, pair) for names, pair in self.pairs.items()], self._priors()
+            for view in [own for own in self._views if own.T is None]:  # whose priors TF tells
+                if {view.camera, view.lidar} <= priors.keys() | {self.description.reference}:
+                    view.T = solve([], priors, self.description.reference).between(view.camera, view.lidar)[0]
             changed = len(states) != len(self._told) or not all(map(PairState.says_as, states, self._told))
             if changed or self.state is None or len(priors) + 1 != len(self.state.sensors):
                 self._told = states
@@ -288,7 +293,8 @@ class RigInterface:
             msg.loops.append(
                 RigLoop(sensors=list(loop.sensors), rotation_deg=deg, translation_m=m, p_value=loop.p_value, closes=loop.closes)
             )
-        msg.rejected, msg.doubted = ([e.name for e in edges] for edges in (state.solution.rejected, state.solution.doubted))
+        for told, edges in ((msg.rejected, state.solution.rejected), (msg.doubted, state.solution.doubted)):
+            told.extend(RigEdge(target=e.target, source=e.source, kind=e.kind) for e in edges)
         return msg
 
     def _diagnostics(self, priors: Mapping[str, Any]) -> DiagnosticArray:

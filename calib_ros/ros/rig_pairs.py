@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,16 @@ from rclpy.node import Node
 
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
+from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.messages import stamp_ns
-from calib_ros.online.common import Common, Newest
+from calib_ros.online.common import Common
 from calib_ros.rig.edges import SEEN, seen_share
 from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message
 from calib_ros.ros.subscriptions import AdaptiveSubscription, Form
 
+Guard = Callable[[], AbstractContextManager[None]]
 CLOUDS_KEPT, IMAGES_KEPT = 6, 2  # decoded messages: of clouds, those before a keyframe's are asked for as well
 UNSEEN_SCANS = 10  # one after the other without a point in view: a second
 CHECKED_AGAIN_S = 0.5  # everybody who listens checks once a second
@@ -35,17 +38,12 @@ class SharedTopics:
         self._topics: dict[str, _Topic] = {}
 
     def subscribe(
-        self,
-        forms: Sequence[Form],
-        topic: str,
-        callback: Callable[[int, Any], None],
-        preference: str,
-        latched: bool = False,
-        guard: Callable[[], AbstractContextManager[None]] = nullcontext,
+        self, forms: Sequence[Form], topic: str, callback: Callable[[int, Any], None], guard: Guard = nullcontext, **options: Any
     ) -> Listener:
-        """As an `AdaptiveSubscription`, which the first one makes."""
+        """As an `AdaptiveSubscription`, which the first one makes with its options."""
         if topic not in self._topics:
-            self._topics[topic] = _Topic(self.node, forms, topic, preference, latched, guard)
+            make = partial(AdaptiveSubscription, self.node, forms, topic, guard=guard, **options)
+            self._topics[topic] = _Topic(make)
         return Listener(self._topics[topic], callback, guard, self._leave)
 
     def _leave(self, topic: _Topic) -> None:
@@ -54,18 +52,10 @@ class SharedTopics:
 
 
 class _Topic:
-    def __init__(
-        self,
-        node: Node,
-        forms: Sequence[Form],
-        topic: str,
-        preference: str,
-        latched: bool,
-        guard: Callable[[], AbstractContextManager[None]],
-    ) -> None:
+    def __init__(self, make: Callable[..., AdaptiveSubscription]) -> None:
         self.listeners: list[Listener] = []
         self.checked, self.problem = 0.0, ""
-        self.subscription = AdaptiveSubscription(node, forms, topic, self._receive, preference, latched, guard)
+        self.subscription = make(callback=self._receive)
 
     def _receive(self, stamp: int, message: Any) -> None:
         for listener in list(self.listeners):
@@ -80,7 +70,7 @@ class Listener:
         self,
         topic: _Topic,
         callback: Callable[[int, Any], None],
-        guard: Callable[[], AbstractContextManager[None]],
+        guard: Guard,
         leave: Callable[[_Topic], None],
     ) -> None:
         self._topic, self.callback, self.guard, self._leave = topic, callback, guard, leave
@@ -110,10 +100,10 @@ class Decoded:
     """What the messages of one sensor hold, decoded once for all who ask."""
 
     def __init__(self, decode: Callable[[Serialized], Any], kept: int) -> None:
-        self._decode, self._newest = decode, Newest(kept)
+        self._decode, self._recent = decode, Recent(kept)
 
     def __call__(self, message: Serialized) -> Any:
-        return self._newest(message, lambda: self._decode(message))
+        return self._recent(message, lambda: self._decode(message))
 
 
 def decoded_clouds() -> Decoded:

@@ -173,8 +173,7 @@ def as_row(found: RigCheck) -> dict[str, Any]:
 
 
 def check_rig(measurer: RigMeasurer, tolerance: Tolerance) -> RigCheck:
-    """Check the extrinsics that are the measurer's priors. Deterministic. A pair whose frames cannot be
-    read is inconclusive."""
+    """Check the extrinsics that are the measurer's priors. Deterministic. A pair whose frames cannot be read is inconclusive."""
     known = measurer.solution([])
     pairs = [_between_lidars(known, m, tolerance) for m in _once(measurer.between_lidars())]
     listed = measurer.camera_pairs(known)

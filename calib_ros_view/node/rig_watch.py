@@ -24,6 +24,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.messages import decode_cloud
 from calib_ros.result import CONVERGED, INITIAL, MOVED, Result
 from calib_ros.rig.description import CAMERA, LIDAR
+from calib_ros.rig.graph import at_sensor, worst_sigmas
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import covariance_from_ros, matrix_from_transform
 from calib_ros_view.node.watch import LATCHED, Watch
@@ -37,7 +38,6 @@ from calib_ros_view.session.rig_shown import (
     RigShown,
     SensorShown,
     compared,
-    sigmas,
     usual_corners,
 )
 
@@ -204,16 +204,17 @@ class RigWatch:
     def _sensor(self, own: Any, kind: str) -> SensorShown:
         T, C = matrix_from_transform(own.transform.transform), covariance_from_ros(own.covariance)
         moved = (own.moved_deg, own.moved_m) if own.moved_deg or own.moved_m else None
-        return SensorShown(own.name, kind, T, own.status, own.reason, own.usable, None if C is None else sigmas(T, C), moved)
+        sigma = None if C is None else worst_sigmas(at_sensor(T, C))
+        return SensorShown(own.name, kind, T, own.status, own.reason, own.usable, sigma, moved)
 
     def _edge(self, pair: Pair, told: tuple[Result, bool] | None, rig: RigShown, message: Rig) -> EdgeShown:
         if told is None:
             return EdgeShown(*pair, KIND, INITIAL, LEVELS[INITIAL])
-        (result, usable), name = told, "-".join(pair)
+        result, usable = told
         fate, level = result.status, LEVELS.get(result.status, BAD)
         level = DOUBTFUL if fate == CONVERGED and not usable else level
-        for wrong, how, names in ((DOUBTED, DOUBTFUL, message.doubted), (REJECTED, BAD, message.rejected)):
-            if name in (own.partition(" ")[0] for own in names):
+        for wrong, how, edges in ((DOUBTED, DOUBTFUL, message.doubted), (REJECTED, BAD, message.rejected)):
+            if (*pair, KIND) in ((own.target, own.source, own.kind) for own in edges):
                 fate, level = wrong, how
         edge = EdgeShown(*pair, KIND, fate, level, result.reason)
         if result.covariance is None or result.status in (INITIAL, MOVED):

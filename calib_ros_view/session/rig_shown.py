@@ -15,7 +15,7 @@ from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.result import CONVERGED, INITIAL, MOVED, TENTATIVE
 from calib_ros.rig.description import CAMERA, RigDescription
-from calib_ros.rig.graph import PRIOR, SURE, RigSolution, root_information
+from calib_ros.rig.graph import PRIOR, SURE, RigSolution, at_sensor, root_information, worst_sigmas
 from calib_ros.rig.live import UNCHECKED
 from calib_ros.rig.report import REFERENCE, load
 from calib_ros_view.session.live import BAD, DOUBTFUL, GOOD, NEUTRAL
@@ -102,14 +102,6 @@ class RigShown:
         return sorted(found, key=lambda name: name != self.reference)
 
 
-def sigmas(T: Transform, C: Covariance) -> tuple[float, float]:
-    """Of a pose (4, 4) whose left twist has a covariance (6, 6): of turn and place along the worst directions, deg and m."""
-    J = se3.parts_jacobian(T)
-    own = J @ C @ J.T
-    turn, shift = (float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0))) for block in (own[:3, :3], own[3:, 3:]))
-    return float(np.rad2deg(turn)), shift
-
-
 def compared(edge: EdgeShown, T: Transform, C: Covariance, poses: Mapping[str, Transform]) -> EdgeShown:
     """The edge with what is left of T_target_source (4, 4), measured with a covariance, by the poses. One that is used, but lies
     far from them, is doubtful."""
@@ -126,7 +118,7 @@ def of_priors(description: RigDescription, solution: RigSolution) -> RigShown:
     sensors = tuple(
         SensorShown(
             *(own.name, own.kind, solution.poses[own.name], REFERENCE if own.name == solution.reference else PRIOR),
-            sigma=sigmas(solution.poses[own.name], solution.marginal(own.name)),
+            sigma=worst_sigmas(at_sensor(solution.poses[own.name], solution.marginal(own.name))),
         )
         for own in description.sensors
     )
@@ -152,7 +144,7 @@ def of_result(path: str | Path, description: RigDescription) -> RigShown:
                     str(own["reason"]),
                     own["status"] in (CONVERGED, REFERENCE),
                 ),
-                *(sigmas(T, solution.marginal(name)), moved.get(name)),
+                *(worst_sigmas(at_sensor(T, solution.marginal(name))), moved.get(name)),
             )
             for name, T in solution.poses.items()
             for own in (data["sensors"][name],)

@@ -53,9 +53,10 @@ def test_a_motion_is_found_once_whatever_is_known_of_the_cameras_clocks(monkeypa
 def test_edges_are_kept_of_the_newest_scans_and_of_one_configuration() -> None:
     scans, config = SharedScans(), LidarConfig()
     edges = scans.edges(config)
-    for stamp in range(common.SCANS_KEPT + 3):
-        edges[stamp] = (True, None)
-    assert list(edges) == list(range(3, common.SCANS_KEPT + 3))
+    keys = [(stamp, 1, b"") for stamp in range(common.SCANS_KEPT + 3)]
+    for key in keys:
+        edges[key] = (True, None)
+    assert list(edges) == keys[3:]
     assert scans.edges(LidarConfig()) is edges
     assert not scans.edges(LidarConfig(min_range=3.0))
     assert scans.edges(LidarConfig(accumulate_s=0.5)) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from two_halves import HALVES, TwoHalves
 from calib_ros import se3
 from calib_ros.cli.main import main
 from calib_ros.errors import BadInputError
-from calib_ros.registration.features import FeatureExtractor, ScanEdges
+from calib_ros.registration.features import FeatureExtractor, ScanEdges, ScanKey
 from calib_ros.rig import edges
 from calib_ros.rig.description import RigDescription, Sensor
 from calib_ros.rig.edges import RigMeasurer, box_of, priors_of, seen_share
@@ -61,6 +62,14 @@ def test_a_scan_is_searched_once_for_all_cameras(halves: TwoHalves, monkeypatch:
     for one, other in zip(alone, together, strict=True):
         assert np.array_equal(one.points.xyz, other.points.xyz)
         assert all(np.array_equal(a.maps, b.maps) for a, b in zip(one.levels, other.levels, strict=True))
+
+
+def test_scans_of_a_driver_that_does_not_stamp_are_told_apart(halves: TwoHalves) -> None:
+    pair, shared = halves.pair("left", "top"), dict[ScanKey, Any]()
+    frames = [replace(pair[k], cloud_stamp=0) for k in range(2)]
+    found = [FeatureExtractor(frames[0].camera, QUICK, shared)(frame).points.xyz for frame in frames]
+    assert not np.array_equal(*found)
+    assert len(shared) == 2
 
 
 def test_what_fails_is_told_and_the_rest_is_solved(halves: TwoHalves, description: RigDescription) -> None:

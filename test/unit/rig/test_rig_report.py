@@ -104,7 +104,7 @@ def test_a_description_of_a_robot_is_made_and_changed_in_place(report: RigReport
     turned = text.replace(links.format("l0_link", "c1_link"), links.format("c1_link", "l0_link"))
     wheel = '<joint name="wheel" type="fixed"><parent link="a"/><child link="b"/></joint>'
     path.write_text(turned.replace("</robot>", f"{wheel}</robot>"))
-    report.write(str(path))
+    assert report.write(str(path)) == ""
     after = {j.get("name"): j for j in ElementTree.parse(path).getroot().iter("joint")}
     origin = after["l0_link_to_c1_link"].find("origin")
     assert origin is not None
@@ -113,6 +113,9 @@ def test_a_description_of_a_robot_is_made_and_changed_in_place(report: RigReport
     np.testing.assert_allclose(np.array(origin.get("rpy", "").split(), float), expected.rpy)
     assert wheel in path.read_text()
     assert "l0_link_to_c1_link" in (tmp_path / "rig.urdf.former").read_text()
+    one = text[: text.index("<joint")] + text[text.index("<joint") : text.index("</joint>")] + "</joint></robot>"
+    path.write_text(one)
+    assert report.write(str(path)).endswith("has no joint for c1, c2, which are not written; add joints of their frames")
 
 
 def test_autoware_has_all_sensors_below_the_reference(report: RigReport, tmp_path: Path) -> None:
