@@ -66,7 +66,7 @@ def test_a_scan_is_searched_once_for_all_cameras(halves: TwoHalves, monkeypatch:
 
 def test_scans_of_a_driver_that_does_not_stamp_are_told_apart(halves: TwoHalves) -> None:
     pair, shared = halves.pair("left", "top"), dict[ScanKey, Any]()
-    frames = [replace(pair[k], cloud_stamp=0) for k in range(2)]
+    frames = [replace(pair[k], stamp=0, cloud_stamp=0) for k in range(2)]
     found = [FeatureExtractor(frames[0].camera, QUICK, shared)(frame).points.xyz for frame in frames]
     assert not np.array_equal(*found)
     assert len(shared) == 2

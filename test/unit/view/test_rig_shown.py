@@ -14,10 +14,10 @@ from calib_ros import se3
 from calib_ros.errors import BadInputError
 from calib_ros.rig.description import RigDescription, Sensor
 from calib_ros.rig.edges import Measurement
-from calib_ros.rig.graph import solve
+from calib_ros.rig.graph import at_sensor, solve, worst_sigmas
 from calib_ros.rig.report import RigReport
 from calib_ros_view.session.live import BAD, DOUBTFUL, GOOD, NEUTRAL
-from calib_ros_view.session.rig_shown import EdgeShown, RigShown, compared, of_priors, of_result, sigmas
+from calib_ros_view.session.rig_shown import EdgeShown, RigShown, compared, of_priors, of_result
 from calib_ros_view.web.rig_words import edges_html, graph_svg, loops_html, sensors_html
 
 POSES = rig(2, 3)
@@ -68,7 +68,7 @@ def test_priors_are_shown_with_their_spread_and_are_not_usable() -> None:
     assert {own.status for own in shown.sensors} == {"reference", "prior"}
     assert not any(own.usable for own in shown.sensors)
     own = shown.sensors[-1]
-    assert own.sigma == pytest.approx(sigmas(*known[own.name]))
+    assert own.sigma == pytest.approx(worst_sigmas(at_sensor(*known[own.name])))
     assert "nothing is estimated" in shown.text
 
 
