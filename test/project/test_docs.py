@@ -17,9 +17,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from paths import ROOT, module_at
 
-from calib_ros import se3
+from calib_ros import __version__, se3
 from calib_ros.cli.arguments import parser
 from calib_ros.config import Config, former_names
 from calib_ros.extensions import commands
@@ -171,6 +172,19 @@ def test_the_example_of_the_readme_calibrates() -> None:
 
 def test_the_readme_is_short_enough_to_scan() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= README_WORDS
+
+
+def test_the_citation_names_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == __version__
+    assert citation["license"] in (ROOT / "package.xml").read_text(encoding="utf-8")
+
+
+def test_issue_forms_ask_for_what_a_report_needs() -> None:
+    forms = {f.stem: yaml.safe_load(f.read_text(encoding="utf-8")) for f in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml")}
+    fields = {stem: {field.get("id") for field in form.get("body", [])} for stem, form in forms.items()}
+    assert fields["extrinsic"] >= {"seen", "sensors", "capture", "version"}
+    assert fields["defect"] >= {"steps", "version"}
 
 
 def test_every_page_is_in_the_navigation_of_the_site() -> None:
