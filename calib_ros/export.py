@@ -149,6 +149,15 @@ _OF_RESULT: dict[str, Callable[[Result, Camera | None], str]] = {
 FORMATS = (*_OF_POSE, *_OF_RESULT)
 
 
+def renamed(result: Result, camera_frame: str | None, lidar_frame: str | None) -> Result:
+    """A result with other names of its frames; None = as they are."""
+    return replace(
+        result,
+        camera_frame=result.camera_frame if camera_frame is None else camera_frame,
+        lidar_frame=result.lidar_frame if lidar_frame is None else lidar_frame,
+    )
+
+
 def export(
     result: Result,
     form: str,
@@ -164,11 +173,7 @@ def export(
     """
     if form not in FORMATS:
         raise BadInputError(f"format '{form}' is not known; choose one of {', '.join(FORMATS)}")
-    result = replace(
-        result,
-        camera_frame=result.camera_frame if camera_frame is None else camera_frame,
-        lidar_frame=result.lidar_frame if lidar_frame is None else lidar_frame,
-    )
+    result = renamed(result, camera_frame, lidar_frame)
     if form in _OF_POSE:
         return _OF_POSE[form](Pose.of(result, parent))
     if parent != "camera":
@@ -240,7 +245,7 @@ def write_joints(path: str, poses: Sequence[Pose], edges: Edges) -> set[str]:
     data = before
     ours = {n: _links(joint) for n, (joint, *more) in _joints(data, path).items() if not more and _links(joint) in edges}
     if not ours:
-        raise BadInputError(f"{path} has no joint between frames of the rig; {_no_edge(edges)}")
+        raise BadInputError(f"{path} has no joint between the sensors; {_no_edge(edges)}")
     for name in ours:
         data = _with_origin(data, path, name, edges)
     if data != before:

@@ -159,7 +159,9 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
         "--camera-frame", metavar="NAME", help="name of the camera's optical frame; default: the one in the file"
     )
     command.add_argument("--lidar-frame", metavar="NAME", help="name of the LiDAR frame; default: the one in the file")
-    command.add_argument("--out", metavar="FILE", help="output file (default: standard output)")
+    command.add_argument(
+        "--out", metavar="FILE", help="output file (default: standard output); of an existing .urdf or .xacro the joint changes"
+    )
 
     command = add("play", "publish a bag over ROS", source=False)
     command.add_argument("bag")

@@ -75,8 +75,11 @@ def calibrate(
     return result
 
 
-def advice(result: Result, source: Source, config: Config) -> str:
-    """What frames to add where those given leave a direction open, in a line; "" where that is not what is missing."""
+def advice(result: Result, source: Source, config: Config, initial: str = "") -> str:
+    """What to do about an estimate from `initial`, in a line: start where the recording says, or add frames where those given
+    leave a direction open; "" where neither is missing."""
+    if not result.converged and initial == "nominal" and source.reference is not None:
+        return "start from the extrinsic that the recording has: --initial reference"
     lacking = need(result, config) if result.refusal is RefusalCode.TOO_UNCERTAIN else None
     if lacking is None:
         return ""

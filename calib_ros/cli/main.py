@@ -103,7 +103,7 @@ def _calibrate(args: argparse.Namespace) -> int:
         *(source, args.frames, args.initial, args.yaw_deg, config),
         *(args.search_deg, args.search_m, args.overlay),
     )
-    print_or_save(result, summary(result, advice(result, source, config)), args.json)
+    print_or_save(result, summary(result, advice(result, source, config, args.initial)), args.json)
     if args.camera_info is not None:
         save_camera_info(result, args.camera_info)
     return OK if result.converged else NOT_CONVERGED
@@ -158,8 +158,10 @@ def _replay(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     """What is not an accepted estimate is exported with a note, since initial extrinsics are exported as well."""
+    from pathlib import Path
+
     from calib_ros.cli.output import note
-    from calib_ros.export import export
+    from calib_ros.export import DESCRIPTIONS, Pose, export, renamed, write_joints
     from calib_ros.io import write_atomically
     from calib_ros.online.state import read_state
 
@@ -173,6 +175,10 @@ def _export(args: argparse.Namespace) -> int:
         note("calib-ros: no P0 written, the camera has distortion; Tr holds for its rectified image, too")
     if args.out is None or args.out == "-":
         print(text, end="")
+    elif args.format == "urdf" and Path(args.out).suffix.lower() in DESCRIPTIONS and Path(args.out).exists():
+        poses = [Pose.of(renamed(result, args.camera_frame, args.lidar_frame), parent) for parent in ("camera", "lidar")]
+        write_joints(args.out, (), {(pose.parent, pose.child): pose.T for pose in poses})
+        print(f"changed the joint between the sensors in {args.out}")
     else:
         write_atomically(args.out, text.encode())
         print(f"wrote {args.out}")

@@ -65,7 +65,8 @@ def summary(result: Result, advice: str = "", scan_period_s: float = MotionConfi
         lines.append(result.reason)
     if advice:
         lines.append(f"advice: {advice}")
-    lines.append(f"T_{result.camera_frame}_{result.lidar_frame}  {pose(result.T_camera_lidar)}")
+    kept = "" if result.converged else ", the start"
+    lines.append(f"T_{result.camera_frame}_{result.lidar_frame}{kept}  {pose(result.T_camera_lidar)}")
     if result.covariance is not None:
         sigma = np.sqrt(np.diag(result.covariance))
         (rx, ry, rz), (x, y, z) = np.rad2deg(sigma[:3]), 100 * sigma[3:]
@@ -81,6 +82,8 @@ def summary(result: Result, advice: str = "", scan_period_s: float = MotionConfi
         deg, m = result.reference_error
         lines.append(f"against the source's reference: {deg:.3f} deg, {100 * m:.1f} cm")
     lines += _details(result)
+    if not result.converged:
+        return "\n".join(lines)  # nobody is to publish the start
     (x, y, z), (qx, qy, qz, qw) = result.T_camera_lidar[:3, 3], se3.quaternion_from_rotation(result.T_camera_lidar[:3, :3])
     lines.append(
         f"ros2 run tf2_ros static_transform_publisher --x {x:.6f} --y {y:.6f} --z {z:.6f} --qx {qx:.8f} --qy {qy:.8f} "

@@ -195,7 +195,7 @@ class StaticTransforms:
         return found
 
 
-def choose_image(bag: BagFile, requested: str | None, option: str = "image_topic") -> str:
+def choose_image(bag: BagFile, requested: str | None, option: str = "--image-topic") -> str:
     """The image topic: the requested one, or the only one. A raw image wins over its compressed transport. option: what to set,
     if it is not there."""
     candidates = _with_type(bag, IMAGE, COMPRESSED)
@@ -208,7 +208,7 @@ def choose_image(bag: BagFile, requested: str | None, option: str = "image_topic
     return _choose(bag, requested, candidates, "Image, CompressedImage or video", option)
 
 
-def choose_points(bag: BagFile, requested: str | None, option: str = "points_topic") -> str:
+def choose_points(bag: BagFile, requested: str | None, option: str = "--points-topic") -> str:
     """The cloud topic: the requested one, or the only one. option: what to set, if it is not there."""
     candidates = _with_type(bag, POINTS)
     if requested is not None or not candidates:
@@ -216,7 +216,7 @@ def choose_points(bag: BagFile, requested: str | None, option: str = "points_top
     return _choose(bag, requested, candidates, "PointCloud2", option)
 
 
-def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str, option: str = "camera_info_topic") -> str:
+def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str, option: str = "--camera-info-topic") -> str:
     """The requested CameraInfo topic, or the one beside the image (image_transport's rule), or the only one. option: what to set,
     if it is not there."""
     candidates = _with_type(bag, CAMERA_INFO)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -43,14 +44,38 @@ def text(value: Any, context: Context) -> str:
     return value.perform(context) if isinstance(value, Stand) else str(value)
 
 
-def started(file: str, **arguments: str) -> list[SimpleNamespace]:
-    """What `ros2 launch calib_ros FILE ARGUMENTS` gives to launch_ros's Node, for each node; substitutions are performed."""
+@contextmanager
+def stands_for_launch() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module, names in PLACES.items():
             patch.setitem(sys.modules, module, ModuleType(module))
             for name in names:
                 setattr(sys.modules[module], name, partial(Stand, name))
+        yield
+
+
+def started(file: str, **arguments: str) -> list[SimpleNamespace]:
+    """What `ros2 launch calib_ros FILE ARGUMENTS` gives to launch_ros's Node, for each node; substitutions are performed."""
+    with stands_for_launch():
         return list(visited(described(f"{ROOT}/launch/{file}"), dict(arguments)))
+
+
+def declared(file: str) -> set[str]:
+    """The arguments that `ros2 launch calib_ros FILE` takes, those of included files too."""
+    with stands_for_launch():
+        return set(_declared(described(f"{ROOT}/launch/{file}")))
+
+
+def _declared(entity: Stand) -> Iterator[str]:
+    inner: Any = ()
+    if entity.kind == "DeclareLaunchArgument":
+        yield entity.given[0]
+    elif entity.kind == "IncludeLaunchDescription":
+        inner = [described(text(entity.given[0].given[0], {}))]
+    elif entity.kind in ("LaunchDescription", "GroupAction"):
+        inner = entity.given[0]
+    for part in inner:
+        yield from _declared(part)
 
 
 def described(path: str) -> Any:

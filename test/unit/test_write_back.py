@@ -13,6 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.cli.main import main
 from calib_ros.errors import BadInputError
 from calib_ros.export import FORMER, has_changed, write_back
 from calib_ros.registration.initial_guess import nominal
@@ -99,6 +100,18 @@ def test_the_joint_of_a_description_changes_and_nothing_else(urdf: Path) -> None
     assert Path(f"{urdf}{FORMER}").read_text() == "older"  # the same again changes nothing
     write_back(str(urdf), replace(RESULT, T_camera_lidar=nominal()), {}, "camera")
     assert Path(f"{urdf}{FORMER}").read_bytes() == after  # only the last one is kept
+
+
+def test_export_changes_the_joint_of_a_file_that_exists(urdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    RESULT.save(tmp_path / "result.json")
+    command = ["export", str(tmp_path / "result.json"), "--format", "urdf", "--out", str(urdf)]
+    assert main(command) == 0
+    np.testing.assert_allclose(joint(urdf, "camera"), se3.inverse(T), atol=1e-12)
+    assert Path(f"{urdf}{FORMER}").read_bytes() == URDF
+    after = urdf.read_bytes()
+    assert main([*command, "--camera-frame", "other"]) == 2
+    assert "has no joint between the sensors" in capsys.readouterr().err
+    assert urdf.read_bytes() == after
 
 
 @pytest.mark.parametrize("origin", [b"", b'<origin rpy="0 0 0"/>', b"<origin/>", b"<origin></origin>"])

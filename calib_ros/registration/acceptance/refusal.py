@@ -72,7 +72,7 @@ def too_uncertain(directions: Sequence[Direction], tolerance_deg: float, toleran
     """The scenes do not determine the extrinsic to within the tolerance. directions: those they leave open."""
     text = (
         f"not known to within {tolerance_deg:g} deg / {100 * tolerance_m:g} cm: {', '.join(map(str, directions[:2]))} (standard "
-        "deviations); add frames of other scenes, or start from a known extrinsic and refine it"
+        "deviations); add frames of other scenes, widen the search if the start may be farther off, or refine a known extrinsic"
     )
     return _refusal(RefusalCode.TOO_UNCERTAIN, text, tolerance_deg=tolerance_deg, tolerance_m=tolerance_m)
 

@@ -432,6 +432,17 @@ def test_summary_says_which_scenes_show_what_is_not_known(drive: SyntheticDrive)
     line = "advice: not known well enough: roll; add frames that show edges at any distance towards the sides of the image"
     assert line in summary(refused, advice(refused, drive, Config())).splitlines()
     assert advice(replace(refused, refusal=RefusalCode.NOT_SIGNIFICANT), drive, Config()) == ""
+    assert "--initial reference" in advice(refused, drive, Config(), "nominal")
+    assert "--initial" not in advice(refused, drive, Config(), "start.yaml")
+    assert advice(replace(refused, status=CONVERGED, refusal=None), drive, Config(), "nominal") == ""
+
+
+def test_summary_gives_nobody_the_start_to_publish() -> None:
+    kept, found = (summary(Result(np.eye(4), status)) for status in (REFUSED, CONVERGED))
+    assert "T_camera_lidar, the start" in kept
+    assert "static_transform_publisher" not in kept
+    assert "the start" not in found
+    assert "static_transform_publisher" in found
 
 
 def test_summary_reports_deskewing(street: list) -> None:
