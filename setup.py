@@ -107,7 +107,7 @@ setup(
     python_requires=">=3.10",
     # What `import calib_ros`, a calibration and bags need. Only pip reads this list: `colcon build` takes the
     # libraries of the ROS install that package.xml names, among them the cv2 that cv_bridge needs, and the console scripts start
-    # without checking the list. rclpy and the messages always come from ROS.
+    # without checking the list. rclpy and the messages come from ROS, or by the extra `ros`.
     install_requires=["numpy", "scipy", "PyYAML", "tqdm", "opencv-python-headless", "rosbags"],
     extras_require=EXTRAS,
     zip_safe=False,

@@ -159,8 +159,11 @@ def test_alone_in_an_environment_it_calibrates_checks_a_bag_and_its_types_are_fo
     assert done.returncode == 0, done.stderr
     done = run("calib-ros", "check", "street", cwd=tmp_path)
     assert (done.returncode, done.stdout[:5]) == (0, "pass:"), done.stderr
-    done = run("calib-ros", "play", "street", cwd=tmp_path)
-    assert (done.returncode, "pip install 'calib_ros[ros]'" in done.stderr) == (2, True), done.stderr
+    for command in (["calib-ros", "play", "street"], ["calib_node"], ["calib_lifecycle_node"]):
+        done = run(*command, cwd=tmp_path)
+        assert done.returncode == 2, done.stderr
+        assert len(done.stderr.splitlines()) == 1
+        assert "pip install 'calib_ros[ros]'" in done.stderr
 
     script = tmp_path / "script.py"
     script.write_text(USER_SCRIPT)
