@@ -14,7 +14,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport PYTHONDONTWRITEBYTECODE
 export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 
-.PHONY: help env demo test test-all bench lint docs clean distclean
+.PHONY: help env demo test test-all bench lint docs dist clean distclean
 
 help:
 	@echo "make demo               drive, node and player on a synthetic street; before and after"
@@ -25,6 +25,7 @@ help:
 	@echo "make bench              speed of each stage"
 	@echo "make lint               ruff and mypy"
 	@echo "make docs               the documentation site in site/"
+	@echo "make dist               sdist and wheels in dist/"
 	@echo "make env                the environment in .venv; every target above brings it up to date first"
 	@echo "make test ROS=jazzy     any target with another distribution than Kilted, in .venv-jazzy"
 	@echo "make clean, distclean   what was built; and .venv too"
@@ -60,6 +61,9 @@ lint: env
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
+dist: env
+	$(VENV)/bin/python tools/build_wheels.py dist
+
 # The site's tools are no part of `make env`: they are installed here when they are missing or others.
 docs: env
 	@cmp -s requirements-docs.txt $(VENV)/stamps/docs || \
@@ -69,7 +73,7 @@ docs: env
 
 # Leaves .venv, which takes a download to make again; distclean does not.
 clean:
-	rm -rf build install log site demo_out steps_out evaluation_out .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf build dist install log site demo_out steps_out evaluation_out .mypy_cache .pytest_cache .ruff_cache *.egg-info
 	find calib_ros* benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean

@@ -15,27 +15,35 @@ HERE = Path(__file__).resolve().parent
 VERSION = re.search(r'^__version__ = "(.+?)"', (HERE / PACKAGE / "__init__.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
 
 EXTRAS = {
-    # ROS 2 bags as sources, `calib-ros convert` and `~/capture`, without a ROS install.
-    "bags": ["rosbags"],
     # PCD, PLY and LAS files of plain folders as sources; clouds of bags that Draco compressed.
     "clouds": ["DracoPy", "laspy", "lazrs", "pypcd4", "trimesh"],
     # Video topics of bags.
     "video": ["av"],
     # Classes of pixels and points, which help the search (the built-in network, classes by shape), and Segment Anything.
-    "models": ["onnxruntime"],
-    # The vehicle's motion from consecutive scans, where no odometry gives it.
+    "semantics": ["onnxruntime"],
+    # The vehicle's motion from consecutive scans, where no odometry gives it; LiDARs of a rig to each other.
     "motion": ["small_gicp"],
-    # `calib-ros check --report`: the page.
-    "report": ["Jinja2"],
-    # `calib-ros check` of a fleet: fleet.parquet.
+    # Pages of `calib-ros check`, of one recording or a fleet; fleet.parquet.
     "fleet": ["Jinja2", "pyarrow"],
     # `calib-ros view`: the page in the browser.
-    "web": ["nicegui"],
+    "view": ["nicegui"],
     # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
     "evaluation": ["Jinja2", "matplotlib"],
 }
 EXTRAS["all"] = sorted({library for libraries in EXTRAS.values() for library in libraries})
 EXTRAS |= {
+    # Where there is no ROS install, which it would shadow: ROS 2 Kilted from wheels. Pins of requirements.txt, since versions of
+    # two distributions install together, then crash.
+    "ros": [
+        "ros-rclpy[fastrtps]==9.1.2",
+        "ros-rmw-fastrtps-cpp==9.3.3",
+        "ros-diagnostic-msgs==5.5.1",
+        "ros-geometry-msgs==5.5.1",
+        "ros-sensor-msgs==5.5.1",
+        "ros-std-msgs==5.5.1",
+        "ros-std-srvs==5.5.1",
+        f"{PACKAGE}_msgs=={VERSION}",
+    ],
     # `--scheduler` of `calib-ros check` and `calib-ros evaluate`: a Dask cluster.
     "cluster": ["distributed"],
     # To train the image network, see training/README.md.
@@ -53,6 +61,7 @@ setup(
     author="calib_ros developers",
     author_email="maintainers@calib-ros.dev",
     license="Apache-2.0",
+    license_files=["LICENSE", f"{PACKAGE}_semantics/models/weights/LICENSE"],
     keywords=["calibration", "extrinsic", "camera", "lidar", "point cloud", "sensor fusion", "ros2", "kitti"],
     classifiers=[
         "Development Status :: 4 - Beta",
@@ -69,17 +78,19 @@ setup(
         "Topic :: Scientific/Engineering :: Image Recognition",
         "Typing :: Typed",
     ],
-    # The inner loops of the scores, called through ctypes: a C compiler builds them.
+    # The inner loops of the scores, called through ctypes, so that one build fits every Python: its wheel says so (abi3).
     ext_modules=[
         Extension(
             f"{module.replace('/', '.')}.kernel",
             [f"{module}/kernel.c"],
+            py_limited_api=True,
             # No fused operations: the same bits on processors with and without them. The last two let more loops become vector
             # instructions, and change no result.
             extra_compile_args=["-std=gnu99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"],
         )
         for module in (f"{PACKAGE}/registration/score", f"{PACKAGE}_thesis")
     ],
+    options={"bdist_wheel": {"py_limited_api": "cp310"}},
     packages=find_packages(include=[pattern for name in PACKAGES for pattern in (name, f"{name}.*")]),
     package_data={name: ["py.typed"] for name in PACKAGES}
     | {
@@ -94,10 +105,10 @@ setup(
         (f"share/{PACKAGE}/launch", glob("launch/*.launch.py")),
     ],
     python_requires=">=3.10",
-    # What `import calib_ros` and a calibration of the synthetic street need. Only pip reads this list: `colcon build` takes the
+    # What `import calib_ros`, a calibration and bags need. Only pip reads this list: `colcon build` takes the
     # libraries of the ROS install that package.xml names, among them the cv2 that cv_bridge needs, and the console scripts start
-    # without checking the list. rclpy and the messages always come from ROS.
-    install_requires=["numpy", "scipy", "PyYAML", "tqdm", "opencv-python-headless"],
+    # without checking the list. rclpy and the messages come from ROS, or by the extra `ros`.
+    install_requires=["numpy", "scipy", "PyYAML", "tqdm", "opencv-python-headless", "rosbags"],
     extras_require=EXTRAS,
     zip_safe=False,
     entry_points={

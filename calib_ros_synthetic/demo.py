@@ -57,7 +57,7 @@ def run(out: str, seed: int, preset: str = "") -> bool:
         from calib_ros.ros.distributions import on_this_machine_only
     except ImportError as error:
         raise MissingDependencyError(
-            f"the demo needs ROS 2 ({error.name} is missing); source your ROS install or run make env"
+            f"the demo needs ROS 2 ({error.name} is missing); source your ROS install or pip install 'calib_ros[ros]'"
         ) from None
     drive = SyntheticDrive(seed, FRAMES, stride=STRIDE)
     folder = _fresh_folder(Path(out))

@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-DISTRIBUTION = (sys.argv[1:] or ["kilted"])[0]
+DISTRIBUTION = sys.argv[1] if __name__ == "__main__" and sys.argv[1:] else "kilted"
 VENV = ROOT / (".venv" if DISTRIBUTION == "kilted" else f".venv-{DISTRIBUTION}")
 REQUIREMENTS = ["requirements.txt", "constraints.txt"] + [f"requirements-{DISTRIBUTION}.txt"] * (DISTRIBUTION != "kilted")
 PYTHON = VENV / "bin" / "python"

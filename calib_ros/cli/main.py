@@ -14,7 +14,7 @@ from calib_ros.extensions import commands
 
 OK, NOT_CONVERGED = 0, 1
 # Libraries that only some commands need, and how to get them.
-OPTIONAL = {"rosbags": "python3 -m pip install rosbags", "rclpy": "source your ROS install or run make env"}
+OPTIONAL = {"rosbags": "python3 -m pip install rosbags", "rclpy": "source your ROS install or pip install 'calib_ros[ros]'"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -192,7 +192,7 @@ def _play(args: argparse.Namespace) -> int:
         from calib_ros.ros.bags import PlayOptions, play
     except ImportError as error:
         raise CalibrationError(
-            f"playing needs ROS 2 ({error.name} is missing); source your ROS install or run make env"
+            f"playing needs ROS 2 ({error.name} is missing); source your ROS install or pip install 'calib_ros[ros]'"
         ) from None
     options = PlayOptions(args.rate, args.loop, args.clock, args.wait, follow=args.follow)
     with progress_bar("playing") as step:

@@ -48,7 +48,8 @@ def shift_evidence(shift: Matrix, covariance: Covariance, freedom: float) -> flo
 
     added = _MOVEMENTS[:, axes] / sigma**2
     S = correlation + added[:, None] * np.eye(len(axes))
-    squared = [float(x @ y) for y in np.linalg.solve(S, x[:, None])[..., 0]]
+    stack = np.broadcast_to(x[:, None], (len(S), len(x), 1))  # numpy 1 would take (6, 1) for a stack of vectors
+    squared = [float(x @ y) for y in np.linalg.solve(S, stack)[..., 0]]
     densities = [log_student(*own, len(axes), freedom) for own in zip(squared, np.linalg.slogdet(S)[1].tolist(), strict=True)]
     return float(logsumexp(densities[1:]) - np.log(len(_MOVEMENTS) - 1) - densities[0])
 

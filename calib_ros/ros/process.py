@@ -54,6 +54,9 @@ def _run(name: str, module: str, node: str, args: list[str] | None) -> int:
     except CalibrationError as error:  # the compiled kernel is missing
         print(f"{name}: {error}", file=sys.stderr)
         return 2
+    except ModuleNotFoundError as error:
+        print(f"{name}: {error.name} is missing: source your ROS install or pip install 'calib_ros[ros]'", file=sys.stderr)
+        return 2
     return run(name, make, args)
 
 

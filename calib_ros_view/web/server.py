@@ -201,7 +201,7 @@ def require_nicegui() -> None:
     try:
         import nicegui  # noqa: F401
     except ImportError as error:
-        raise MissingDependencyError(f"pages need {error.name}: python3 -m pip install 'calib_ros[web]'") from None
+        raise MissingDependencyError(f"pages need {error.name}: python3 -m pip install 'calib_ros[view]'") from None
 
 
 def serve(

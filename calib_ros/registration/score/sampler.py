@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 from contextlib import suppress
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import numpy as np
@@ -45,16 +44,15 @@ class _View(ctypes.Structure):
 def load_library(source: Path, size_function: str, struct: type[ctypes.Structure]) -> ctypes.CDLL:
     """The library made of a C file; its size_function gives the size of the struct that both sides know. Raises
     MissingDependencyError where it was not built from these sources."""
-    path = next((path for suffix in EXTENSION_SUFFIXES if (path := source.with_suffix(suffix)).exists()), None)
+    path = source.with_suffix(".abi3.so")
     library = None
-    with suppress(OSError, AttributeError):  # built for another machine, or something else
-        library = ctypes.CDLL(str(path)) if path else None
-        if library is not None:
-            library[size_function].restype = ctypes.c_ssize_t
-            if library[size_function]() != ctypes.sizeof(struct):
-                library = None
+    with suppress(OSError, AttributeError):  # absent, built for another machine, or something else
+        library = ctypes.CDLL(str(path))
+        library[size_function].restype = ctypes.c_ssize_t
+        if library[size_function]() != ctypes.sizeof(struct):
+            library = None
     if library is None:
-        state = "was not built" if path is None else f"({path}) was built from other sources or for another machine"
+        state = f"({path}) was built from other sources or for another machine" if path.exists() else "was not built"
         raise MissingDependencyError(
             f"the compiled kernel of calib_ros {state}: install gcc, then `pip install .` or `colcon build` in the sources"
         )

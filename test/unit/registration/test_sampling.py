@@ -124,6 +124,6 @@ def test_without_a_kernel_of_these_sources_it_is_said_how_to_build_one(monkeypat
     monkeypatch.setattr(sampling, "__file__", str(tmp_path / "sampler.py"))
     with pytest.raises(MissingDependencyError, match=r"was not built: install gcc, then `pip install \.` or `colcon build`"):
         load_kernel()
-    (tmp_path / f"kernel{sampling.EXTENSION_SUFFIXES[0]}").write_bytes(b"\x7fELF, but not for us")
+    (tmp_path / "kernel.abi3.so").write_bytes(b"\x7fELF, but not for us")
     with pytest.raises(MissingDependencyError, match="was built from other sources or for another machine"):
         load_kernel()
