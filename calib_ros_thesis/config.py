@@ -11,7 +11,6 @@ from calib_ros.errors import ConfigError
 from calib_ros_thesis.completion import check_completion
 
 THESIS_ORDER = (
-    ("canny_low", "canny_high"),
     ("min_depth", "max_depth"),
     ("min_height", "max_height"),
     ("min_reflectivity", "max_reflectivity"),
@@ -25,8 +24,9 @@ class ThesisConfig(Stage):
     """The thesis's own objective, eq. 3.12 (refine.objective: thesis)."""
 
     operator: str = option("mix", "edge operator of images and dense maps, algorithm 5", choices=("sobel", "canny", "mix"))
-    canny_low: float = option(0.3, "Canny: lower threshold, share of a full edge", low=0.0, high=1.0)
-    canny_high: float = option(0.6, "Canny: upper threshold, share of a full edge", low=0.0, high=1.0)
+    # Canny's thresholds, shares of a full edge, which is that of each picture itself.
+    canny_low: ClassVar[float] = 0.3
+    canny_high: ClassVar[float] = 0.6
     smoothing: tuple[float, ...] = option(
         (4.0, 1.5),
         "Gaussian smoothing of the image's edge map (figure 3.10), px at 720 px focal length; one optimisation "

@@ -20,7 +20,8 @@ _FIELDS = {  # by stage
     ),
     "thesis": (
         "class_edge_share ground_tilt_deg ground_share cluster_voxel depth_step reflectivity_step max_discontinuity "
-        "first_step_deg ground_distance ground_iterations cluster_eps cluster_min_points cluster_max_depth closing"
+        "first_step_deg ground_distance ground_iterations cluster_eps cluster_min_points cluster_max_depth closing "
+        "canny_low canny_high"
     ),
     "refine": "check_intrinsics iterations max_rotation_deg max_translation_m min_peak_ratio min_distinctness",
     "monitor": "false_alarm_rate window blind_contrast blind_returns",

@@ -55,7 +55,6 @@ def test_values_that_contradict_each_other_are_refused():
     for values, text in (
         ({"online": {"min_keyframes": 21}}, "min_keyframes = 21 is more than online.buffer_size = 20"),
         ({"online": {"min_keyframes": 2, "buffer_size": 1}}, "no estimate"),
-        ({"thesis": {"canny_low": 0.6}}, "thesis.canny_low = 0.6 must be less than thesis.canny_high = 0.6"),
         ({"thesis": {"min_depth": 8, "max_depth": 7}}, "thesis.min_depth = 8 must be less than thesis.max_depth = 7"),
         ({"thesis": {"smoothing": []}}, "thesis.smoothing has 0 levels; give 1 to 8"),
         ({"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}}, "levenberg_marquardt needs a gradient"),
@@ -67,7 +66,6 @@ def test_values_that_contradict_each_other_are_refused():
 
 def test_unusual_but_consistent_values_are_accepted():
     for values in (
-        {"thesis": {"canny_low": 0.59, "canny_high": 0.6}},
         {"thesis": {"smoothing": [0]}},
         {"thesis": {"smoothing": [1.5, 4.0, 0.0]}},
         {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}},
