@@ -35,10 +35,12 @@ _FIELDS = {  # by stage
     "tracker": "max_step_deg max_step_m gate",
 }
 REMOVED = frozenset(f"{stage}.{name}" for stage, names in _FIELDS.items() for name in names.split())
+INSTEAD = {"semantics.first_guess": "initial.method: semantic", "motion.exposure_s": "motion.time_offset_s: minus half of it"}
 
 
 def notices(names: Iterable[str]) -> list[str]:
     """A line that names all options (``stage.field``) that have been removed; none where there are none."""
     gone = [name for name in names if name in REMOVED]
     has, it = ("has", "it") if len(gone) == 1 else ("have", "them")
-    return [f"{', '.join(gone)} {has} no effect any more; remove {it}"] if gone else []
+    others = "".join(f"; in place of {name} there is {INSTEAD[name]}" for name in gone if name in INSTEAD)
+    return [f"{', '.join(gone)} {has} no effect any more; remove {it}{others}"] if gone else []

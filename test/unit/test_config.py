@@ -183,6 +183,8 @@ def test_removed_options_are_ignored_with_one_warning(read, form):
     with pytest.warns(FutureWarning, match=r"^lidar\.jump_min has no effect any more; remove it$") as caught:
         assert read(form.format(stage="lidar", name="jump_min", value="[a]")) == Config()
     assert len(caught) == 1
+    with pytest.warns(FutureWarning, match=r"; in place of semantics\.first_guess there is initial\.method: semantic$"):
+        Config.from_dict({"semantics": {"first_guess": True, "witness": False}})
 
 
 def test_all_removed_options_at_once_make_one_warning_a_stage():
