@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from calib_ros.config import Config
 from calib_ros.config.options import Stage, option
@@ -10,11 +11,9 @@ from calib_ros.errors import ConfigError
 from calib_ros_thesis.completion import check_completion
 
 THESIS_ORDER = (
-    ("canny_low", "canny_high"),
     ("min_depth", "max_depth"),
     ("min_height", "max_height"),
     ("min_reflectivity", "max_reflectivity"),
-    ("min_depth", "cluster_max_depth"),
 )  # of each pair the first must be less
 MORPHOLOGICAL = "morphological"
 MAX_SMOOTHINGS = 8  # each keeps a map per frame
@@ -25,8 +24,9 @@ class ThesisConfig(Stage):
     """The thesis's own objective, eq. 3.12 (refine.objective: thesis)."""
 
     operator: str = option("mix", "edge operator of images and dense maps, algorithm 5", choices=("sobel", "canny", "mix"))
-    canny_low: float = option(0.3, "Canny: lower threshold, share of a full edge", low=0.0, high=1.0)
-    canny_high: float = option(0.6, "Canny: upper threshold, share of a full edge", low=0.0, high=1.0)
+    # Canny's thresholds, shares of a full edge, which is that of each picture itself.
+    canny_low: ClassVar[float] = 0.3
+    canny_high: ClassVar[float] = 0.6
     smoothing: tuple[float, ...] = option(
         (4.0, 1.5),
         "Gaussian smoothing of the image's edge map (figure 3.10), px at 720 px focal length; one optimisation "
@@ -47,11 +47,14 @@ class ThesisConfig(Stage):
         0.0, "centre of the azimuth range kept, counter-clockwise from the LiDAR's +x, deg", low=-180.0, high=180.0
     )
     azimuth_half_width_deg: float = option(180.0, "half width of the azimuth range kept, deg; 180 = all", low=1.0, high=180.0)
-    ground_distance: float = option(0.2, "points closer to the ground plane than this are ground, m", low=0.01, high=2.0)
-    ground_iterations: int = option(128, "planes tried by RANSAC (algorithm 1)", low=1, high=10000)
-    cluster_eps: float = option(0.7, "DBSCAN (algorithm 2): radius of the neighbourhood, m", low=0.01, high=10.0)
-    cluster_min_points: int = option(10, "DBSCAN: points in the neighbourhood that make it dense", low=1, high=10000)
-    cluster_max_depth: float = option(40.0, "DBSCAN: points farther than this belong to no object, m", low=1.0, high=300.0)
+    # Algorithm 1, RANSAC: points this close to the plane are ground, m, and planes that are tried.
+    ground_distance: ClassVar[float] = 0.2
+    ground_iterations: ClassVar[int] = 128
+    # Algorithm 2, DBSCAN: radius of a neighbourhood, m, points that make it dense, depth, m, beyond which they are too sparse.
+    cluster_eps: ClassVar[float] = 0.7
+    cluster_min_points: ClassVar[int] = 10
+    cluster_max_depth: ClassVar[float] = 40.0
+    closing: ClassVar[int] = 9  # of the object map, px: joins the points of an object
     low_reflectivity: float = option(
         0.3, "lower values of the dense reflectivity map are set to 0, share of full scale", low=0.0, high=1.0
     )
@@ -60,7 +63,6 @@ class ThesisConfig(Stage):
         "how the sparse depth map becomes dense: morphological = eq. 3.11, network = the completion network of this package, or "
         "the ONNX file of another one (sparse depth, image -> depth)",
     )
-    closing: int = option(9, "size of the morphological closing of the object map, px", low=1, high=63)
     normalize: bool = option(
         True, "divide J of eq. 3.12 by the number of LiDAR edges in the image, since a plain sum grows with it"
     )

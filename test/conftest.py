@@ -28,11 +28,13 @@ from pathlib import Path
 from typing import IO
 
 import pytest
-from scenes import RENDERINGS, RenderedDrive, Scene, render_once
+from paths import ROOT
+from scenes import RENDERINGS, RenderedDrive, Scene, picture_once, render_once, scan_once
 
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.frame import Frame
 from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_synthetic.rig import SyntheticRig
 
 LABORATORY = ("evaluation", "benchmarks", "training")  # folders of tests that do not guard the product
 LONGEST_FIRST = ("integration", "evaluation", "unit")  # so that no long file begins when the others are done
@@ -116,6 +118,8 @@ def rendered_once() -> Iterator[None]:
     """Sources named `synthetic:` are rendered once per session, also in commands that run in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SyntheticDrive, "_render", render_once)
+        patch.setattr(SyntheticRig, "_scan", scan_once)
+        patch.setattr(SyntheticRig, "_picture", picture_once)
         yield
 
 

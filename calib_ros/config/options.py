@@ -62,7 +62,7 @@ def current_names(stage: type, values: Mapping[str, Any]) -> dict[str, Any]:
     of each former name (FutureWarning). ConfigError if a field is given under both names."""
     prefix = stage_name(stage)
     out = {name: value for name, value in values.items() if f"{prefix}.{name}" not in REMOVED}
-    for notice in notices({f"{prefix}.{name}": value for name, value in values.items() if name not in out}):
+    for notice in notices(f"{prefix}.{name}" for name in values):
         warnings.warn(notice, FutureWarning, stacklevel=4)
     for f in dataclasses.fields(stage):
         former = f.metadata["formerly"]

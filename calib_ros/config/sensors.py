@@ -185,13 +185,6 @@ class MotionConfig(Stage):
         low=-0.2,
         high=0.2,
     )
-    exposure_s: float = option(
-        0.0,
-        "exposure time of cameras whose images are stamped when the exposure of the first row begins, s; 0 = stamped at "
-        "the middle",
-        low=0.0,
-        high=0.2,
-    )
     stamping: str = option(
         "auto",
         "how the scanner turns and what its stamps refer to, for clouds without times per point: auto = found where the "

@@ -67,7 +67,7 @@ def image_times(
     time: (n,) s after the cloud's stamp, if its points have times. pose: of the scanner, whose azimuth tells the times of points
     without. Raises BadTimesError for times more than MAX_TIME away.
     """
-    between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s - mid_exposure(config)
+    between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s
     if frame.compensated:
         tau = np.full(len(xyz), between)
     else:
@@ -80,11 +80,6 @@ def image_times(
             "cloud's time field and both sensors' stamps, or set motion.deskew: off"
         )
     return tau
-
-
-def mid_exposure(config: MotionConfig) -> float:
-    """The moment of an image, s after its stamp: the middle of the exposure of its middle row."""
-    return (config.exposure_s + abs(config.readout_s)) / 2 if config.exposure_s else 0.0
 
 
 def has_times(cloud: PointCloud) -> bool:

@@ -235,8 +235,8 @@ def misspelt(given: Mapping[str, Any], declared: Iterable[str], former_is: str =
     given: name -> value. former_is: what becomes of a value given under a former name.
     """
     known, former = sorted(declared), former_names()
-    lines = notices({name: _plain(value) for name, value in given.items() if name in REMOVED})
-    for name in sorted(set(given) - set(known) - set(REMOVED)):
+    lines = notices(given)
+    for name in sorted(set(given) - REMOVED.union(known)):
         if name.startswith(OF_EVERY_NODE):
             continue
         if name in former:

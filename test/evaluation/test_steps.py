@@ -68,7 +68,7 @@ def test_the_page_shows_exactly_the_pictures_that_exist(made: Path) -> None:
     text = (made / "index.html").read_text()
     for number, (heading, _) in SECTIONS.items():
         assert f"<span>{number}</span>{heading}" in text
-    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "ground_distance: 0.2", "prefers-color-scheme"):
+    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "min_depth: 2.0", "prefers-color-scheme"):
         assert fact in text
 
 

@@ -40,7 +40,7 @@ def cases(short: int, long: int) -> pytest.MarkDecorator:
     )
 
 
-@cases(300, 3000)
+@cases(300, 1500)
 def test_mutated_messages(count):
     report = fuzz("messages", count)
     assert total(report, "cloud", "image", "compressed", "camera_info") == count
@@ -51,7 +51,7 @@ def test_mutated_messages(count):
 
 
 @compression
-@cases(200, 3000)
+@cases(200, 1500)
 def test_mutated_videos_and_compressed_clouds(count):
     report = fuzz("packed", count)
     assert report["most"][0] < 100, "MiB for a message of at most 200 kB"
@@ -75,7 +75,7 @@ def test_mutated_texts(count):
 
 
 @compression
-@cases(200, 900)
+@cases(200, 600)
 def test_mutated_bags_and_folders(count):
     report = fuzz("folders", count)
     kinds = ("bag_mcap", "bag_sqlite3", "bag_ros1", "bag_compressed", "raw", "odometry", "object", "nuscenes")
@@ -85,7 +85,7 @@ def test_mutated_bags_and_folders(count):
 
 
 @compression
-@cases(30, 300)
+@cases(30, 150)
 def test_mutated_files_through_the_command_line(count):
     report = fuzz("cli", count)
     assert sum(report["outcomes"][f"code {code}"] for code in (0, 1, 2)) == count

@@ -7,6 +7,7 @@ import itertools
 import os
 import pickle
 import tempfile
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.result import CONVERGED, REFUSED, Result
 from calib_ros_synthetic.drive import Labels, SyntheticDrive
+from calib_ros_synthetic.rig import SyntheticRig
 
 SIZE = {"width": 640, "height": 240, "rings": 64, "speed": 0, "stride": 30}
 NEAR, FAR = ([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]), ([4, -3, 5], [0.3, -0.2, 0.25])  # 1 deg / 10 cm, 7 deg / 44 cm
@@ -33,27 +35,40 @@ QUICK = Config(search=QUICK_SEARCH, semantics=SemanticsConfig(segmentation="none
 RENDERINGS = "CALIB_ROS_TEST_RENDERINGS"  # environment variable: folder of this run, for all of its processes
 
 
-_render = SyntheticDrive._render
+_render, _scan, _picture = SyntheticDrive._render, SyntheticRig._scan, SyntheticRig._picture
+
+
+def made_once(key: object, make: Callable[[], Any]) -> Any:
+    """What is made by whatever test, file and process of a run needs it first; key: all that it depends on."""
+    folder = os.environ.get(RENDERINGS)
+    if folder is None:
+        return make()
+    path = Path(folder) / hashlib.sha256(repr(key).encode()).hexdigest()
+    if not path.exists():
+        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+            pickle.dump(make(), file)
+        Path(file.name).rename(path)
+    return pickle.loads(path.read_bytes())
 
 
 def render_once(drive: SyntheticDrive, index: int, T_camera_lidar: np.ndarray, age_s: float = 0.0) -> tuple[Frame, Labels]:
-    """In place of SyntheticDrive._render: a frame is rendered once in a run of the tests, whatever file and process needs it
-    first. Not for tests of the renderer, nor for a drive with an empty stretch."""
-    folder = os.environ.get(RENDERINGS)
-    if folder is None:
-        return _render(drive, index, T_camera_lidar, age_s)
+    """In place of SyntheticDrive._render. Not for tests of the renderer, nor for a drive with an empty stretch."""
     options = {name: value for name, value in drive._parameters.items() if name != "frames"}  # no frame depends on their number
     camera = drive.camera
     lens = (camera.K.tolist(), camera.width, camera.height, camera.model, np.asarray(camera.D).tolist())
-    key = repr((sorted(options.items()), lens, index, np.asarray(T_camera_lidar).tolist(), age_s))
-    path = Path(folder) / hashlib.sha256(key.encode()).hexdigest()
-    if not path.exists():
-        made = _render(drive, index, T_camera_lidar, age_s)
-        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-            pickle.dump(made, file)
-        Path(file.name).rename(path)
-    frame, labels = pickle.loads(path.read_bytes())
+    key = (sorted(options.items()), lens, index, np.asarray(T_camera_lidar).tolist(), age_s)
+    frame, labels = made_once(key, lambda: _render(drive, index, T_camera_lidar, age_s))
     return replace(frame, camera=camera, reference=T_camera_lidar), labels
+
+
+def scan_once(rig: SyntheticRig, lidar: str, index: int) -> Any:
+    """In place of SyntheticRig._scan."""
+    return made_once((rig.name, lidar, index), lambda: _scan(rig, lidar, index))
+
+
+def picture_once(rig: SyntheticRig, camera: str, index: int) -> Any:
+    """In place of SyntheticRig._picture."""
+    return made_once((rig.name, camera, index), lambda: _picture(rig, camera, index))
 
 
 class RenderedDrive(SyntheticDrive):

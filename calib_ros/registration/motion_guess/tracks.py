@@ -15,7 +15,7 @@ from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.image.enhance import to_gray
-from calib_ros.lidar.deskew import has_times, mid_exposure
+from calib_ros.lidar.deskew import has_times
 from calib_ros.lidar.ego_motion import MAX_GAP_S, estimate_motion
 from calib_ros.registration.features import FeatureExtractor
 
@@ -108,8 +108,7 @@ def _between(before: Frame, frame: Frame, config: MotionConfig, start: Matrix | 
 
 def _run(frames: Sequence[Frame], first: int, twists: Matrix, origin: int, config: MotionConfig) -> Run:
     times = np.array([(f.moment_of_cloud - origin) / NANOSECONDS for f in frames])
-    late = config.time_offset_s - mid_exposure(config)
-    images = np.array([(f.stamp - origin) / NANOSECONDS - late for f in frames])
+    images = np.array([(f.stamp - origin) / NANOSECONDS - config.time_offset_s for f in frames])
     poses = [np.eye(4)]
     for twist, gap in zip(twists, np.diff(times), strict=True):
         poses.append(poses[-1] @ se3.exp(twist * gap))

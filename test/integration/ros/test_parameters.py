@@ -34,8 +34,7 @@ def test_misspelt_names_are_answered_with_the_nearest():
         "parameter 'serch.rotation_deg' is unknown and has no effect; did you mean 'search.rotation_deg'?",
         "parameter 'zzz' is unknown and has no effect; config/calib_ros.yaml lists all there are",
     ]
-    (changed,) = parameters.misspelt({"search.distinct": 80}, [])
-    assert changed == "search.distinct has no effect any more, 20 is used; remove it"
+    assert parameters.misspelt({"search.distinct": 80}, []) == ["search.distinct has no effect any more; remove it"]
 
 
 def test_misspelt_former_and_removed_names_are_logged_once_at_the_start(capfd):
@@ -61,13 +60,13 @@ def test_misspelt_former_and_removed_names_are_logged_once_at_the_start(capfd):
 
 
 def test_a_preset_holds_where_no_parameter_says_otherwise(capfd):
-    with Peer(preset="thesis", thesis__cluster_eps=0.5, use_sim_time=False) as peer:
+    with Peer(preset="thesis", thesis__max_depth=50.0, use_sim_time=False) as peer:
         config = peer.calibration.parameters.config
-        whole = update(preset("thesis"), {"thesis": {"cluster_eps": 0.5}})
+        whole = update(preset("thesis"), {"thesis": {"max_depth": 50.0}})
         assert (config.refine, config.others, config.initial) == (whole.refine, whole.others, whole.initial)
         assert peer.node.get_parameter("refine.objective").value == "thesis"
     (line,) = [line for line in capfd.readouterr().err.splitlines() if "the preset thesis is changed by the parameters" in line]
-    assert line.endswith(", thesis.cluster_eps")  # beside those that every test of the node sets
+    assert line.endswith(", thesis.max_depth")  # beside those that every test of the node sets
     with pytest.raises(ConfigError, match="there is no preset 'thesys'; there are thesis, thesis-literal"):
         Peer(preset="thesys")
 

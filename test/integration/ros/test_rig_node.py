@@ -34,6 +34,7 @@ from calib_ros.online.common import Common
 from calib_ros.registration import features
 from calib_ros.ros import conversions
 from calib_ros.ros.lifecycle_node import CalibLifecycleNode
+from calib_ros.ros.node import interface
 from calib_ros.ros.rig_pairs import UNSEEN_SCANS, PairOfRig
 from calib_ros.ros.tf import LATCHED
 from calib_ros_synthetic.rig import SyntheticRig
@@ -45,7 +46,7 @@ SETTINGS = {"seed": 3, "frames": 4, "width": 320, "clocks": 0.0, "speed": 4.0}
 
 
 @pytest.fixture(scope="module")
-def rig() -> SyntheticRig:
+def rig(rendered_once) -> SyntheticRig:
     return SyntheticRig("six_cameras_one_lidar", **SETTINGS)
 
 
@@ -142,7 +143,7 @@ def test_a_dead_driver_is_named_and_the_other_pair_stays(driven) -> None:
 def test_a_knocked_camera_is_named_with_its_size_and_found_again(rig, driven) -> None:
     peer = driven.peer
     knocked = SyntheticRig("six_cameras_one_lidar", **SETTINGS, knock=LEFT, knock_at=0.0, knock_deg=2.0, knock_m=0.08)
-    pictures = iter(item for item in measured(knocked, (LEFT,), SECONDS) if item[1] == LEFT)
+    pictures = ((stamp, LEFT, value) for stamp, value in knocked.pictures(LEFT))
     items = [next(pictures) if item[1] == LEFT else item for item in driven.items]
     driven.at += SECONDS + PAUSE_S
     before = len(peer.rigs)
@@ -212,12 +213,26 @@ def test_a_managed_node_makes_its_pairs_and_leaves_none_behind(rig, tmp_path) ->
         ("reference: a\nsensors: {a: {kind: lidar}, b: {kind: camera, topc: /b}}", "do you mean topic?"),
     ],
 )
-def test_a_wrong_rig_file_ends_the_node_with_one_line(tmp_path, wrong, named) -> None:
+def test_a_wrong_rig_file_is_refused_by_what_is_wrong(tmp_path, wrong, named) -> None:
     file = tmp_path / "rig.yaml"
     file.write_text(wrong)
+    context = Context()
+    rclpy.init(context=context)
+    node = CalibLifecycleNode(context=context, parameter_overrides=[Parameter("rig_file", value=str(file))])
+    with pytest.raises(BadInputError) as caught:
+        interface(node)
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+    assert str(caught.value).startswith(str(file))
+    assert named in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_rig_file_ends_the_node_with_one_line(tmp_path) -> None:
+    file = tmp_path / "rig.yaml"
+    file.write_text("sensors: 3")
     command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args", "-p", f"rig_file:={file}"]
     ended = run(command, capture_output=True, text=True, timeout=240)
     assert ended.returncode == 2
-    assert named in ended.stderr
     assert ended.stderr.startswith(f"calib_node: {file}")
     assert ended.stderr.count("\n") == 1

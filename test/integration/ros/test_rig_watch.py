@@ -18,6 +18,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow]
 CAMERAS, TOP = ("back_left", "back_right"), "lidar_top"
 
 
+@pytest.mark.usefixtures("rendered_once")
 def test_sensors_edges_pictures_and_clouds_are_heard_and_that_the_node_ends(tmp_path) -> None:
     rig = SyntheticRig("six_cameras_one_lidar", seed=3, frames=4, width=320, clocks=0.0, speed=4.0)
     items, file = measured(rig, CAMERAS, 3.0), describe(rig, CAMERAS, tmp_path / "rig.yaml")

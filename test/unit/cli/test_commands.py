@@ -397,7 +397,7 @@ def test_the_search_box() -> None:
     assert inputs.search_box("x.json", config, (1.0, 2.0, 3.0), None).rotation_deg == (1.0, 2.0, 3.0)
 
 
-@pytest.mark.parametrize("yaw_deg", [180.0, *(pytest.param(side, marks=pytest.mark.slow) for side in (90.0, -90.0))])
+@pytest.mark.parametrize("yaw_deg", [180.0, pytest.param(90.0, marks=pytest.mark.slow)])
 def test_side_and_rear_cameras(yaw_deg: float) -> None:
     """The edge of the scan by time runs through the middle of a rear camera's picture."""
     T = se3.perturb(nominal(yaw_deg), [2, -3, 1.5], np.zeros(3))

@@ -24,7 +24,7 @@ from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.initial_guess import nominal
 from calib_ros_synthetic.rig import SyntheticRig
 
-TEXT = "synthetic:seed=3,frames=1,width=96,noise=0.0,rig=two_lidars_three_cameras"
+TEXT = "synthetic:seed=3,frames=1,stride=4,width=96,noise=0.0,rig=two_lidars_three_cameras"
 
 
 def described(reference: str, **sensors: dict[str, Any]) -> Any:
@@ -133,7 +133,7 @@ def test_a_synthetic_rig_under_other_names(rig: SyntheticRig) -> None:
     np.testing.assert_allclose(opened.reference("scanner"), T, atol=1e-12)
     np.testing.assert_allclose(opened.pair("eye", "scanner").reference, T, atol=1e-12)
     assert opened.frame_id("left") == "left_optical"
-    assert len(opened.scans("scanner")) == 20
+    assert len(opened.scans("scanner")) == 8
     with pytest.raises(BadInputError, match="has no camera roof; name by topic one that it has: front, left, right"):
         open_rig(TEXT, described("scanner", scanner=lidar("lidar_left"), roof=camera()))
 

@@ -152,11 +152,11 @@ def test_a_replay_puts_each_scan_in_once_whether_or_not_frames_are_skipped(drive
 
 @pytest.mark.slow
 def test_a_scanner_that_is_too_sparse_for_a_usual_lens_finds_the_extrinsic():
-    source = open_dataset("synthetic:rig=mid360_90,scene=street,width=480,frames=47,stride=1")
+    source = open_dataset("synthetic:rig=mid360_90,scene=street,width=480,frames=29,stride=1")
     config = update(Config(), {"semantics": {"image_classes": "", "cloud_classes": ""}, "lidar": {"accumulate_s": 1.0}})
     moving = WithMotion(source, config.motion, accumulate_s=1.0)
     start = se3.perturb(source.reference, np.array([1.5, -2.0, 1.0]), np.array([0.06, -0.05, 0.08]))
-    result = Calibrator(source.camera, config).calibrate([moving[k] for k in (10, 19, 28, 37, 46)], start, BOX)
+    result = Calibrator(source.camera, config).calibrate([moving[k] for k in (10, 19, 28)], start, BOX)
     assert result.status == "converged", result.reason
     assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.2
     assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.05

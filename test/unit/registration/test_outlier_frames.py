@@ -70,7 +70,6 @@ def estimate(
     ("what", "box"),
     [
         *((what, None) for what in ("another scene", "another moment", "black", "mirrored", "two")),
-        pytest.param("another scene", SearchBox(5, 0.3), marks=pytest.mark.slow),
         ("covered", SearchBox(5, 0.3)),
     ],
 )
@@ -118,10 +117,8 @@ def test_thesis_objective_leaves_out_outlier_frames(scene):
 @pytest.mark.parametrize(
     ("seed", "options"),
     [
-        pytest.param(7, {}, marks=pytest.mark.slow),
         (7, {"rings": 16}),
         pytest.param(8, {"rings": 32, "speed": 5.0}, marks=pytest.mark.slow),
-        pytest.param(9, {"noise": 3.0}, marks=pytest.mark.slow),
     ],
 )
 def test_no_frame_of_a_clean_drive_is_left_out(seed, options):

@@ -178,14 +178,13 @@ def test_rotations_that_fewer_pairs_agree_on_follow_for_the_maps_to_judge(street
     assert rotation_distance_deg(found[STARTS:-1], found[-1]).min() > SAME_DEG[0]
 
 
-@pytest.mark.parametrize(("yaw", "wrong"), [pytest.param(180.0, 0, marks=pytest.mark.slow), (25.0, 40)])
-def test_objects_are_enough(yaw: float, wrong: int) -> None:
+def test_objects_are_enough() -> None:
     """40 of 120 objects mislabelled in the image."""
-    T = mounted(yaw, 1)
-    assert_near(T, first_guess([balls(T, seed, wrong) for seed in range(3)])[0].T, 1.0, 0.3)
+    T = mounted(25.0, 1)
+    assert_near(T, first_guess([balls(T, seed, 40) for seed in range(3)])[0].T, 1.0, 0.3)
 
 
-@pytest.mark.parametrize("yaw", [*(pytest.param(yaw, marks=pytest.mark.slow) for yaw in (0.0, 90.0, 180.0)), -135.0])
+@pytest.mark.parametrize("yaw", [pytest.param(180.0, marks=pytest.mark.slow), -135.0])
 def test_a_street_is_recognised_from_any_yaw(street_views, yaw: float) -> None:
     views, T = street_views
     back = turned(views[0], yaw)[1]

@@ -119,10 +119,11 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments: list[str], message: st
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("rendered_once")
 def test_the_command_estimates_a_rig_with_two_lidars(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "rig.yaml").write_text(RIG + "  lidar_right: {kind: lidar}\n")
     out = {k: str(tmp_path / v) for k, v in {"--json": "rig.json", "--report": "rig.html", "--out": "rig.urdf"}.items()}
-    source = "synthetic:rig=two_lidars_three_cameras,frames=6,ride=weaving,seed=2"
+    source = "synthetic:rig=two_lidars_three_cameras,frames=6,stride=2,ride=weaving,seed=2,width=480"
     code = main(["rig", source, "--rig", str(tmp_path / "rig.yaml"), *(text for pair in out.items() for text in pair)])
     data = json.loads(Path(out["--json"]).read_text())
     assert {name for name, s in data["sensors"].items() if s["status"] == "converged"} >= {"front", "lidar_right"}, data

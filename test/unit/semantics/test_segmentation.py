@@ -505,8 +505,9 @@ SMALL = "synthetic:frames=1,rings=16,width=320,height=120"
 STREET = "synthetic:seed=31,frames=3,width=640,height=240,speed=0,stride=30"
 
 
-@pytest.mark.parametrize("initial", ["semantic", "centroids"])
-@pytest.mark.parametrize("command", ["calibrate", pytest.param("replay", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("command", "initial"), [("calibrate", "centroids"), pytest.param("replay", "semantic", marks=pytest.mark.slow)]
+)
 def test_calibrate_and_replay_from_a_semantic_start(tmp_path, capsys, command, initial):
     quick = {"search": {"rounds": 2, "starts": 64}, "online": {"min_keyframes": 3}, "semantics": SOURCE}
     (tmp_path / "classes.yaml").write_text(yaml.safe_dump(quick))

@@ -48,9 +48,9 @@ def test_the_file_reads_as_a_table_of_contents():
 
 def test_options_hold_before_a_file_and_a_file_before_the_preset(tmp_path):
     path = tmp_path / "own.yaml"
-    path.write_text("thesis: {cluster_eps: 0.5}\nsearch: {seed: 3}\n")
+    path.write_text("thesis: {max_depth: 50.0}\nsearch: {seed: 3}\n")
     config = configuration(str(path), seed=4, preset_name="thesis")
-    assert config == update(preset("thesis"), {"thesis": {"cluster_eps": 0.5}, "search": {"seed": 4}})
+    assert config == update(preset("thesis"), {"thesis": {"max_depth": 50.0}, "search": {"seed": 4}})
     with_edges = {"refine": {"objective": "fast", "optimizer": "auto"}}
     path.write_text("refine: {optimizer: auto}\n")
     assert configuration(str(path), objective="fast", preset_name="thesis") == update(preset("thesis"), with_edges)

@@ -216,16 +216,16 @@ def test_clusters_are_those_of_dbscan(min_points, voxel):
 
 
 def test_more_objects_than_labels_start_again_at_one():
-    # 300 objects of 3 points, 10 m apart, the first of them larger.
-    x = 10.0 * np.repeat(np.arange(300), 3)
-    xyz = np.column_stack([x, np.tile([0, 0.1, 0.2], 300), np.zeros(900)]).astype(np.float32)
+    # 300 objects of 10 points, 10 m apart, the first of them larger.
+    n = ThesisConfig.cluster_min_points
+    x = 10.0 * np.repeat(np.arange(300), n)
+    xyz = np.column_stack([x, np.tile(0.05 * np.arange(n), 300), np.zeros(300 * n)]).astype(np.float32)
     xyz = np.vstack([xyz, points((0, 0.3, 0))])
-    config = ThesisConfig(cluster_min_points=3, cluster_max_depth=300.0)
-    label = object_labels(xyz, np.full(901, 5.0, np.float32), np.zeros(901, bool), config)
+    label = object_labels(xyz, np.full(len(xyz), 5.0, np.float32), np.zeros(len(xyz), bool), CONFIG)
     assert label[0] == label[-1] == 1
-    assert label[3 * 253] == 254
-    assert label[3 * 254] == 1
-    assert label[3 * 299] == 46
+    assert label[n * 253] == 254
+    assert label[n * 254] == 1
+    assert label[n * 299] == 46
     assert label.min() == 1
 
 
@@ -306,10 +306,9 @@ def test_ground_and_objects_are_separated(scene):
     assert (found.label[on_wall & (found.depth < 39)] > 0).mean() > 0.99
     assert found.reflectivity[on_big] == pytest.approx(np.full(on_big.sum(), 0.5))
     assert found.reflectivity[on_wall] == pytest.approx(np.full(on_wall.sum(), 0.9))
-    near = attributes(scene, dataclasses.replace(CONFIG, cluster_max_depth=15.0))
-    assert not near.label[near.ground | (near.depth > 15)].any()
-    assert set(near.label) == {NO_OBJECT, 1, 2}
-    assert near.depth[near.label > 0].max() > 12
+    assert not found.label[found.ground | (found.depth > 40)].any()
+    assert found.depth[found.label > 0].max() > 39
+    assert found.depth.max() > 41
 
 
 def test_far_points_come_first_and_no_attribute_loses_its_point(scene):

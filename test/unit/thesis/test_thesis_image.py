@@ -213,10 +213,10 @@ def test_rounding_step_is_not_scaled_to_a_full_edge():
 
 
 @pytest.mark.parametrize(("high", "there"), [(0.44, [True, True]), (0.46, [True, False]), (1.0, [False, False])])
-def test_the_thresholds_of_canny_are_the_configured_ones(high, there):
+def test_nothing_is_an_edge_to_canny_below_its_thresholds(high, there, monkeypatch):
     """Nothing is stronger than a full edge."""
-    config = ThesisConfig(operator="canny", canny_low=0.2, canny_high=high)
-    found = gradient_edges(two_steps(100, 45), config, 100.0)
+    monkeypatch.setattr(ThesisConfig, "canny_high", high)
+    found = gradient_edges(two_steps(100, 45), ThesisConfig(operator="canny"), 100.0)
     assert [bool(found[:, c : c + 2].any()) for c in (19, 39)] == there
 
 

@@ -158,7 +158,7 @@ def test_levels_are_centimetres_and_thousandths():
 
 def test_depth_is_inverted_about_the_farthest_that_passes():
     for max_depth, level in ((60.0, 6000), (5.0, 500), (300.0, FAR_LEVEL)):
-        assert far_level(ThesisConfig(max_depth=max_depth, cluster_max_depth=4.0)) == level
+        assert far_level(ThesisConfig(max_depth=max_depth)) == level
     assert low_level(ThesisConfig(low_reflectivity=0.3)) == 300
     for level in (1, 2, 5999, FAR):  # and inverted back at both ends
         assert set(np.unique(complete_depth(single((61, 61), (30, 30, level)), FAR))) == {0, level}
@@ -307,9 +307,7 @@ def test_the_fast_form_gives_the_same_edges_to_the_bit(operator):
 
 
 SETTINGS = [
-    *({"closing": size} for size in (63, 62, 10, 2, 1)),
     *({"low_reflectivity": 0.0}, {"low_reflectivity": 1.0}),
-    *({"canny_low": 0.0, "canny_high": 0.01}, {"canny_low": 0.9, "canny_high": 1.0}),
     {"max_depth": 300.0},
 ]
 

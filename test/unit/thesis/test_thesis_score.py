@@ -291,13 +291,9 @@ def test_the_models_that_run_without_doubt_are_those_that_the_objective_uses(sce
     assert calibrator.classes_in_doubt_only == (not kinds)
 
 
-@pytest.mark.parametrize(
-    "optimizer",
-    ["auto", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nelder_mead", "barzilai_borwein"))],
-)
-def test_repeated_optimum_is_not_refused(scene, optimizer):
+def test_repeated_optimum_is_not_refused(scene):
     """Edges attached anew score a hair less or more: a vehicle that goes on driving must not lose what it has."""
-    calibrator = calibrator_of(scene.camera, "attached", refine={"optimizer": optimizer})
+    calibrator = calibrator_of(scene.camera, "attached")
     T, scores = off(scene.truth, 1, 0.3, 0.02), []
     for _ in range(2):
         result = calibrator.estimate(scene.features, T)
