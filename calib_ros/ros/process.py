@@ -66,11 +66,12 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
     import cv2
     import rclpy
     from rclpy.clock import Clock, ClockType
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.executors import ExternalShutdownException
     from rclpy.signals import SignalHandlerOptions
 
     from calib_ros.ros import parameters
     from calib_ros.ros.dds import use_large_message_profile
+    from calib_ros.ros.executor import MainExecutor
 
     use_large_message_profile()
     return_freed_memory()
@@ -85,7 +86,7 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
     except Exception as error:  # rcl's message names what is wrong with the arguments or the parameter file
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    executor = SingleThreadedExecutor()
+    executor = MainExecutor()
     node: Any = None
     try:
         node = make()

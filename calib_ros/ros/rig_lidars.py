@@ -23,7 +23,7 @@ from calib_ros.ros.conversions import Serialized
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.rig_pairs import Decoded, Listener, SharedTopics
-from calib_ros.ros.subscriptions import SILENT_S, livox_forms, serialized
+from calib_ros.ros.subscriptions import livox_forms, serialized
 
 SCANS_KEPT = 8  # messages of a LiDAR, among them the first one of a beat and that before it, while the other one is late
 Stamped = tuple[int, Serialized]
@@ -77,8 +77,9 @@ class LidarsOfRig:
         return self._worker.stop()
 
     def silent(self) -> str:
-        """Which of both sends nothing, for a person; "" if both do."""
-        told = [(name, own) for name, own in self._listeners.items() if own.silent_s > SILENT_S]
+        """Which of both has sent nothing for max_data_age_s, for a person; "" if both have."""
+        most = self._parameters()["max_data_age_s"]
+        told = [(name, own) for name, own in self._listeners.items() if own.silent_s > most]
         return ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told)
 
     def state(self) -> PairState:
