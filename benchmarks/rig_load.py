@@ -82,7 +82,7 @@ def play(node: Any, publishers: dict[str, Any], messages: list[Recorded], second
 
 def said(heard: list[tuple[float, Rig]], began: float) -> str:
     """What was said of the rig, a line for every change: seconds, the text, and sensors that are not usable or not converged."""
-    lines, before = [], []
+    lines, before = list[str](), list[tuple[str, str, bool]]()
     for at, rig in heard:
         wrong = [s for s in rig.sensors if not s.usable or s.status not in ("converged", "reference")]
         now = [(s.name, s.status, s.usable) for s in wrong]
