@@ -57,7 +57,7 @@ class LidarPair:
         except TooFewFeaturesError as error:
             self._failures += 1
             lost = self._edge is not None and self._failures >= FAILED
-            self._tell(SUSPECT if lost else self.extrinsic.result.status, str(error))
+            self.say(SUSPECT if lost else self.extrinsic.result.status, str(error))
 
     def _take(self, new: Registration) -> None:
         self._failures, status = 0, CONVERGED
@@ -76,7 +76,7 @@ class LidarPair:
         if status != SUSPECT and len(self._found) >= LEAST:
             self._edge = fused(self.target, self.source, self._found, self._clock_sigma_s)
         reason = f"the newest scans of {self.target} and {self.source} match elsewhere" if status in (SUSPECT, MOVED) else ""
-        self._tell(INITIAL if self._edge is None else status, reason or "too few registrations yet" * (self._edge is None))
+        self.say(INITIAL if self._edge is None else status, reason or "too few registrations yet" * (self._edge is None))
 
     def _fits(self, new: Registration, edge: Edge, scale: float) -> bool:
         """Whether a registration may be of the transform of the edge, the clocks being off by what the edge says."""
@@ -104,7 +104,8 @@ class LidarPair:
         xi = se3.log(a @ se3.inverse(b))
         return bool(f.sf(float(xi @ np.linalg.solve(C, xi)) / 6, 6, 6 * max(n - 1, 1)) > SIGNIFICANCE)
 
-    def _tell(self, status: str, reason: str) -> None:
+    def say(self, status: str, reason: str) -> None:
+        """Another status of what is known, and why, for a person."""
         edge, result = None if self._edge is None else self._edge[0], Result(np.eye(4), status, reason)
         if edge is not None:
             result = replace(result, T_camera_lidar=edge.T, covariance=edge.covariance, frames_used=edge.samples)

@@ -16,6 +16,7 @@ from calib_ros.lidar.ego_motion import MAX_GAP_S
 from calib_ros.online.common import Common
 from calib_ros.online.pacing import LoadBudget, Work, is_due
 from calib_ros.online.worker import Worker
+from calib_ros.result import INITIAL
 from calib_ros.rig.lidar_pair import QUICK_S, LidarPair
 from calib_ros.rig.lidars import SCANS_KIND, LidarScans
 from calib_ros.rig.live import PairState
@@ -53,7 +54,8 @@ class LidarsOfRig:
         self.load = LoadBudget(parameters().config.online, purse=common.purse)
         self.missing = ""  # why nothing is registered, for a person
         self._recent: dict[str, deque[Stamped]] = {name: deque(maxlen=SCANS_KEPT) for name in names}
-        self._beat: int | None = None  # stamp of the newest scan that was looked at, ns
+        self.stamp = 0  # of the newest scans that were registered, ns
+        self._beat: int | None = None  # the same of those that were looked at
         self.urgent = False  # a displacement is suspected, whatever this pair has seen
         self._listeners: dict[str, Listener] = {}
         self._worker: Worker[Moment] = Worker("calib_lidars", self._register, self._failed)
@@ -126,11 +128,13 @@ class LidarsOfRig:
             ]
             if T is not None:
                 self.pair.add(scans[0], scans[1], T)
+                self.stamp = min(int(own.stamps[-1]) for own in scans)
 
     def _failed(self, error: Exception) -> None:
         who = " and ".join(self.names)
         if isinstance(error, MissingDependencyError):
             self.missing = f"{who} are not registered to each other, their priors are used: {error}"
+            self.pair.say(INITIAL, self.missing)
             self._health.error(self.missing, "registration of LiDARs")
         elif isinstance(error, CalibrationError):
             self._health.error(f"{who}: {error}", f"scans of {who}")

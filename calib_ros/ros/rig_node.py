@@ -35,7 +35,7 @@ from calib_ros.result import MOVED, SUSPECT
 from calib_ros.rig.description import CAMERA, RigDescription, Sensor, prior_covariance, read_rig
 from calib_ros.rig.edges import box_of
 from calib_ros.rig.graph import solve
-from calib_ros.rig.live import LiveRig, Pair, PairState, RigState
+from calib_ros.rig.live import KIND, LiveRig, Pair, PairState, RigState
 from calib_ros.ros import parameters
 from calib_ros.ros.conversions import covariance_for_ros, time_message, transform_message
 from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
@@ -306,7 +306,9 @@ class RigInterface:
 
     def _stamp(self, name: str = "") -> int:
         """Of the newest data of a sensor's pairs, ns; of all pairs without a name."""
-        return max((p.extrinsic.stamp for names, p in self.pairs.items() if not name or name in names), default=0)
+        stamps = [(names, pair.extrinsic.stamp) for names, pair in self.pairs.items()]
+        stamps += [(lidars.names, lidars.stamp) for lidars in self.lidars]
+        return max((stamp for names, stamp in stamps if not name or name in names), default=0)
 
     def _message(self, state: RigState, usable: bool = True) -> Rig:
         now, reference = self._node.get_clock().now().nanoseconds, self._frame(state.solution.reference)
@@ -349,6 +351,8 @@ class RigInterface:
             good = all(s.usable for s in state.sensors) and not missing and not state.solution.rejected
             status.level = ERROR if state.moved else OK if good else WARN
             values |= {s.name: ": ".join(filter(None, [s.status, s.reason])) for s in state.sensors}
+            of_lidars = [own for own in state.pairs if own.kind != KIND]
+            values |= {" with ".join(own.pair): own.status if own.usable else f"{own.status}: {own.reason}" for own in of_lidars}
         values |= {"errors": str(self.health.errors), "last error": self.health.last_error[0]}
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         message = DiagnosticArray(status=[status])

@@ -18,6 +18,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.time import Time
 from rig_peer import RigPeer, again, describe, measured, poses
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -194,6 +195,9 @@ def test_two_lidars_are_registered_to_each_other(two) -> None:
         assert deg < 0.1
         assert m < 0.03
     assert 0 < edge.covariance[0] < 0.02**2
+    assert Time.from_msg(peer.sensor("lidar_right").transform.header.stamp).nanoseconds > two.items[0][0]
+    values = {v.key: v.value for v in peer.until(lambda: peer.statuses.get("calib_ros: rig")).values}
+    assert values["lidar_right with lidar_left"] == "converged"
     assert edge.rotation_deg < 0.1
     load = peer.calibration.lidars[0].load
     assert load._purse is peer.pair("front").pipeline.load._purse
@@ -237,6 +241,7 @@ def test_without_the_library_lidars_keep_their_priors_and_one_line_says_so(two, 
     assert "lidar_right and lidar_left are not registered to each other" in own._health.last_error[0]
     assert "pip install small_gicp" in own._health.last_error[0]
     assert (alone.state().status, alone.state().edge()) == ("initial", None)
+    assert "pip install small_gicp" in alone.state().reason
     assert alone.stop()
 
 
