@@ -103,6 +103,8 @@ def test_each_cloud_is_decoded_once_and_each_scan_aligned_once(driven) -> None:
     assert 0 < driven.counts["motions"] <= clouds
     assert driven.counts["scans"] < first.recalibrator.keyframes_seen + second.recalibrator.keyframes_seen
     assert first.load._purse is second.load._purse
+    adaptive = [driven.peer.pair(c).sensors.adaptive for c in (LEFT, RIGHT)]
+    assert [[own.tells for own in of_pair] for of_pair in adaptive] == [[True, True, True], [True, False, True]]  # losses once
 
 
 def test_tf_is_one_tree_from_the_reference(rig, driven) -> None:
