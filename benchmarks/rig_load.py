@@ -1,8 +1,10 @@
 """What the node of a rig costs, by its number of cameras: CPU time of its process and memory, relative to one camera.
 
-    python -m benchmarks.rig_load [SOURCE] [--cameras 1 2 6] [--seconds 60] [--out FOLDER] [-p NAME:=VALUE ...]
+    python -m benchmarks.rig_load [SOURCE] [--cameras 1 2 6] [--lidars 1] [--seconds 60] [--dies front 60 90] [--out FOLDER]
+        [-p NAME:=VALUE ...]
 
-SOURCE: a synthetic rig. Its sensors are published at their own rates, but at most at 10 Hz, to the node in another process.
+SOURCE: a synthetic rig. Its sensors are published at their own rates, but at most at 10 Hz, to the node in another process. What
+the node says of the rig is printed with times. --dies: a sensor that sends nothing from and to so many seconds.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from calib_ros.ros.bags import message_class
 from calib_ros.ros.tf import LATCHED
 from calib_ros_synthetic.rig import SyntheticRig
 
-DRIVE = "synthetic:rig=six_cameras_one_lidar,seed=3,frames=4,width=480,clocks=0,speed=4"
+DRIVE = "synthetic:rig=six_cameras_two_lidars,seed=3,frames=4,width=480,clocks=0,speed=4"
 SPACING_NS, LEAD_NS = 90_000_000, 250_000_000
 HEAD = """\
 | cameras | share of a core, thirds of the run | at the end for messages, intake, keyframes, classes, estimates | MB \
@@ -56,7 +58,10 @@ def thinned(bag: Path, topics: list[str]) -> list[Recorded]:
     return sorted((m for m in kept if m.stamp >= begin or m.topic.endswith("points")), key=lambda message: message.stamp)
 
 
-def play(node: Any, publishers: dict[str, Any], messages: list[Recorded], seconds: float) -> Iterator[float]:
+Silence = tuple[str, float, float]  # name of a sensor that sends nothing from and to so many seconds
+
+
+def play(node: Any, publishers: dict[str, Any], messages: list[Recorded], seconds: float, dies: Silence) -> Iterator[float]:
     """Publish in real time; yields the time so far, s, once a second."""
     began, first, told = time.monotonic(), messages[0].stamp, 0
     lap_ns, before, offset = messages[-1].stamp - first + NANOSECONDS, 0, 0
@@ -66,7 +71,8 @@ def play(node: Any, publishers: dict[str, Any], messages: list[Recorded], second
         due = began + (message.stamp - first + offset) / NANOSECONDS
         while (rest := due - time.monotonic()) > 0:
             rclpy.spin_once(node, timeout_sec=rest)
-        publishers[message.topic].publish(bytes(message.data))
+        if not (message.topic.startswith(f"/{dies[0]}/") and dies[1] <= time.monotonic() - began < dies[2]):
+            publishers[message.topic].publish(bytes(message.data))
         if (now := time.monotonic() - began) >= told + 1:
             told += 1
             yield now
@@ -74,11 +80,27 @@ def play(node: Any, publishers: dict[str, Any], messages: list[Recorded], second
             return
 
 
-def measure(bag: Path, folder: Path, cameras: int, seconds: float, given: list[str]) -> str:
-    """A row of the table."""
+def said(heard: list[tuple[float, Rig]], began: float) -> str:
+    """What was said of the rig, a line for every change: seconds, the text, and sensors that are not usable or not converged."""
+    lines, before = list[str](), list[tuple[str, str, bool]]()
+    for at, rig in heard:
+        wrong = [s for s in rig.sensors if not s.usable or s.status not in ("converged", "reference")]
+        now = [(s.name, s.status, s.usable) for s in wrong]
+        if now != before:
+            before = now
+            names = (f"{s.name} {s.status}{f' ({s.reason})' * (s.status in ('unchecked', 'moved'))}" for s in wrong)
+            lines.append(f"{at - began:6.1f} s: {rig.text}; {', '.join(names) or 'all converged'}")
+    return "\n".join(lines)
+
+
+def measure(
+    bag: Path, folder: Path, cameras: int, lidars: int, seconds: float, given: list[str], dies: Silence
+) -> tuple[str, str]:
+    """A row of the table, and what was said of the rig."""
     whole = yaml.safe_load(Path(f"{bag}{DESCRIPTION}").read_text())
-    names = [n for n, s in whole["sensors"].items() if s["kind"] == "camera"][:cameras]
-    sensors = {n: s for n, s in whole["sensors"].items() if s["kind"] != "camera" or n in names}
+    most = {"camera": cameras, "lidar": lidars}
+    names = [n for kind, k in most.items() for n in [n for n, s in whole["sensors"].items() if s["kind"] == kind][:k]]
+    sensors = {n: s for n, s in whole["sensors"].items() if n in names}
     file = folder / f"rig_{cameras}.yaml"
     file.write_text(yaml.safe_dump({"reference": whole["reference"], "sensors": sensors}))
     topics = [t for s in sensors.values() for t in (s["topic"], s.get("camera_info")) if t]
@@ -86,10 +108,10 @@ def measure(bag: Path, folder: Path, cameras: int, seconds: float, given: list[s
     command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args", "-p", f"rig_file:={file}"]
     command += [word for value in given for word in ("-p", value)]
     rclpy.init()
-    node, statuses, rigs = rclpy.create_node("player"), dict[str, Any](), list[Rig]()
+    node, statuses, heard = rclpy.create_node("player"), dict[str, Any](), list[tuple[float, Rig]]()
     publishers = {t: node.create_publisher(message_class(kind), t, QoSProfile(depth=20)) for t, kind in kinds.items()}
     node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: statuses.update({s.name: s for s in m.status}), 50)
-    node.create_subscription(Rig, "/calib_ros/rig", rigs.append, LATCHED)
+    node.create_subscription(Rig, "/calib_ros/rig", lambda m: heard.append((time.monotonic(), m)), LATCHED)
     with (folder / f"node_{cameras}.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
     try:
@@ -97,7 +119,8 @@ def measure(bag: Path, folder: Path, cameras: int, seconds: float, given: list[s
             rclpy.spin_once(node, timeout_sec=0.1)
             if process.poll() is not None:
                 raise SystemExit(f"the node ended; see {log.name}")
-        moments = [(now, cpu_s(process.pid), memory_mb(process.pid)) for now in play(node, publishers, messages, seconds)]
+        began, playing = time.monotonic(), play(node, publishers, messages, seconds, dies)
+        moments = [(now, cpu_s(process.pid), memory_mb(process.pid)) for now in playing]
     finally:
         process.send_signal(signal.SIGINT)
         process.wait(30)
@@ -107,16 +130,19 @@ def measure(bag: Path, folder: Path, cameras: int, seconds: float, given: list[s
     told = [{v.key: v.value for v in s.values} for name, s in statuses.items() if name.endswith(": extrinsic")]
     sums = [sum(int(v[key]) for v in told) for key in ("keyframes so far", "estimates accepted", "pairs")]
     dropped = sum(int(v["pairs dropped by a busy worker"]) for v in told)
-    usable = f"{sum(s.usable for s in rigs[-1].sensors)} of {len(sensors)}" if rigs else "none"
+    usable = f"{sum(s.usable for s in heard[-1][1].sensors)} of {len(sensors)}" if heard else "none"
     work = [sum(float(v[f"CPU for {kind.value}"]) for v in told) for kind in list(Work)[:5]]
     cpu, of_work, counts = " ".join(f"{h:.2f}" for h in thirds), " ".join(f"{w:.2f}" for w in work), ", ".join(map(str, sums))
-    return f"| {cameras} | {cpu} | {of_work} | {moments[-1][2]:.0f} | {counts} | {dropped} | {usable} |"
+    row = f"| {cameras} | {cpu} | {of_work} | {moments[-1][2]:.0f} | {counts} | {dropped} | {usable} |"
+    return row, said(heard, began)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", nargs="?", default=DRIVE)
     parser.add_argument("--cameras", nargs="+", type=int, default=[1, 2, 6])
+    parser.add_argument("--lidars", type=int, default=1)
+    parser.add_argument("--dies", nargs=3, default=("", "0", "0"), metavar=("NAME", "FROM", "TO"))
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--out", default="rig_load_out")
     parser.add_argument("-p", action="append", default=[], dest="given")
@@ -127,9 +153,14 @@ def main() -> None:
     bag = folder / "bag"
     if not bag.exists():
         write_rig_bag(SyntheticRig.from_text(args.source), bag)
+    dies = args.dies[0], float(args.dies[1]), float(args.dies[2])
     print(HEAD)
+    told = []
     for cameras in args.cameras:
-        print(measure(bag, folder, cameras, args.seconds, args.given), flush=True)
+        row, lines = measure(bag, folder, cameras, args.lidars, args.seconds, args.given, dies)
+        print(row, flush=True)
+        told.append(f"{cameras} cameras\n{lines}")
+    print("\n".join(told))
 
 
 if __name__ == "__main__":

@@ -63,18 +63,23 @@ def displacement(centre: ArrayLike, rotation_deg: ArrayLike, shift_m: ArrayLike)
     return se3.from_parts(R, centre + np.asarray(shift_m, float) - R @ centre)
 
 
+RING = {
+    "lidar_top": MountedSensor(Mount(-0.1, 0.0, 1.95), "pandar64"),
+    "front": MountedSensor(Mount(0.62, 0.02, 1.58, pitch=2.0), WINDSHIELD, 30.0, 2.0),
+    "front_left": MountedSensor(Mount(0.45, 0.52, 1.60, yaw=55.0, pitch=3.0), NUSCENES, 15.0, -3.0),
+    "front_right": MountedSensor(Mount(0.45, -0.52, 1.60, yaw=-55.0, pitch=3.0), NUSCENES, 15.0, 4.0),
+    "back_left": MountedSensor(Mount(-0.85, 0.76, 1.74, yaw=112.0, pitch=4.0), SIDE, 10.0, 1.0),
+    "back_right": MountedSensor(Mount(-0.85, -0.76, 1.74, yaw=-112.0, pitch=4.0), SIDE, 10.0, -2.0),
+    "back": MountedSensor(Mount(-1.75, 0.03, 1.55, yaw=180.0, pitch=5.0), SIDE, 10.0, 5.0),
+}
+
 MULTI_RIGS: dict[str, MultiRig] = {
     "six_cameras_one_lidar": MultiRig(
-        "Robotaxis: a ring of six cameras around 64 rings on the roof, which all of them share",
-        {
-            "lidar_top": MountedSensor(Mount(-0.1, 0.0, 1.95), "pandar64"),
-            "front": MountedSensor(Mount(0.62, 0.02, 1.58, pitch=2.0), WINDSHIELD, 30.0, 2.0),
-            "front_left": MountedSensor(Mount(0.45, 0.52, 1.60, yaw=55.0, pitch=3.0), NUSCENES, 15.0, -3.0),
-            "front_right": MountedSensor(Mount(0.45, -0.52, 1.60, yaw=-55.0, pitch=3.0), NUSCENES, 15.0, 4.0),
-            "back_left": MountedSensor(Mount(-0.85, 0.76, 1.74, yaw=112.0, pitch=4.0), SIDE, 10.0, 1.0),
-            "back_right": MountedSensor(Mount(-0.85, -0.76, 1.74, yaw=-112.0, pitch=4.0), SIDE, 10.0, -2.0),
-            "back": MountedSensor(Mount(-1.75, 0.03, 1.55, yaw=180.0, pitch=5.0), SIDE, 10.0, 5.0),
-        },
+        "Robotaxi: a ring of six cameras around 64 rings on the roof, which all of them share", RING
+    ),
+    "six_cameras_two_lidars": MultiRig(
+        "The same with a second scanner at the roof's rear, tilted down, for what the first one does not see behind the vehicle",
+        {**RING, "lidar_rear": MountedSensor(Mount(-1.7, 0.0, 1.75, yaw=180.0, pitch=8.0), "os1_64", 10.0, -3.0)},
     ),
     "two_lidars_three_cameras": MultiRig(
         "Two scanners on the roof's edges, tilted outwards, which share the front camera's view; side cameras have one each",

@@ -19,9 +19,10 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import Frame
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH, blurred_levels, oriented_edges
 from calib_ros.lidar.deskew import image_times, moved, used_twist
+from calib_ros.online.pacing import is_due
 
 # Between looks, s of the data's stamps, for a knock is to be told within a second: at 10 Hz every fourth frame, at rest every
 # sixth.
@@ -42,9 +43,10 @@ Map = NDArray[np.float32]
 
 
 class Glance:
-    """Looks at frames, and tells those that are worth a test. Not thread-safe."""
+    """Looks at frames, and tells those that are worth a test. in_step: with others, see `is_due`. Not thread-safe."""
 
-    def __init__(self) -> None:
+    def __init__(self, in_step: bool = False) -> None:
+        self._in_step = in_step
         self.reset()
 
     def reset(self) -> None:
@@ -54,8 +56,7 @@ class Glance:
 
     def is_due(self, stamp: int, at_rest: bool = False) -> bool:
         """Whether the last look is long enough ago."""
-        every_s = REST_EVERY_S if at_rest else EVERY_S
-        return self._looked_at is None or not 0 <= (stamp - self._looked_at) / NANOSECONDS < every_s
+        return is_due(self._looked_at, stamp, REST_EVERY_S if at_rest else EVERY_S, self._in_step)
 
     def put_off(self, stamp: int) -> None:
         """A keyframe tells more than a look."""
@@ -63,7 +64,6 @@ class Glance:
 
     def strikes(self, frame: Frame, T: Transform, config: Config) -> bool:
         """Look at a frame at T_camera_lidar (4, 4): True if it matches worse than all others that were looked at."""
-        self._looked_at = frame.stamp
         try:
             loss = match_loss(frame, T, config)
         except CalibrationError:

@@ -22,6 +22,7 @@ from calib_ros.errors import BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.accumulation import Accumulator, Stamped
 from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
+from calib_ros.online.pacing import is_due
 from calib_ros.registration.features import FrameFeatures
 
 INTERVAL_S = 1.0  # without a keyframe, after which any image that has changed becomes one
@@ -38,11 +39,12 @@ Permit = Callable[[], bool]
 class KeyframeSelector:
     """Algorithm 6, one image at a time, with a minimum rate of keyframes where too few images differ enough.
 
-    config may be replaced at any time. last_similarity: of the newest image with the last keyframe, eq. 3.15.
+    config may be replaced at any time. last_similarity: of the newest image with the last keyframe, eq. 3.15. in_step: with other
+    cameras, so that keyframes come of the same scans where pictures allow it, see `is_due`.
     """
 
-    def __init__(self, config: OnlineConfig) -> None:
-        self.config = config
+    def __init__(self, config: OnlineConfig, in_step: bool = False) -> None:
+        self.config, self._in_step = config, in_step
         self.last_similarity = 0.0
         self._histogram: Histogram | None = None
         self._stamp = 0
@@ -62,7 +64,7 @@ class KeyframeSelector:
         return self.select_histogram(histogram(image), stamp, permit)
 
     def _is_too_early(self, stamp: int, spacing_s: float = 0.0) -> bool:
-        return 0 <= (stamp - self._stamp) / NANOSECONDS < max(self.config.keyframe_spacing_s, spacing_s)
+        return not is_due(self._stamp, stamp, max(self.config.keyframe_spacing_s, spacing_s), self._in_step)
 
     def select_histogram(self, new: Histogram, stamp: int, permit: Permit = lambda: True) -> bool:
         """The same for the histogram of an image."""
@@ -71,8 +73,7 @@ class KeyframeSelector:
             if self._is_too_early(stamp):
                 return False
             self.last_similarity = similarity(last, new)
-            elapsed = (stamp - self._stamp) / NANOSECONDS
-            overdue = elapsed >= INTERVAL_S or elapsed < 0  # the clock was set back
+            overdue = is_due(self._stamp, stamp, INTERVAL_S, self._in_step)
             changed = self.last_similarity < STATIC_SIMILARITY
             if not (changed and (overdue or self.last_similarity < self.config.similarity_threshold)):
                 return False

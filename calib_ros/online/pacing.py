@@ -32,6 +32,19 @@ LONGEST_REST_S, KEYFRAMES_PER_REST, REST_SPACING_S = 60.0, 6, (2.0, 5.0)
 CLASSES_RESERVE = 0.5  # share of what can be saved up that must be there for classes: keyframes and estimates have the rest
 
 
+def is_due(last: int | None, stamp: int, every_s: float, in_step: bool = False) -> bool:
+    """Whether what was done at a stamp, ns, is to be done again at another one; where a clock was set back, at once.
+
+    in_step: with all others that do it as often, at the first stamp of every interval of the clock.
+    """
+    if last is None or stamp < last:
+        return True
+    elapsed, period = stamp - last, round(every_s * NANOSECONDS)
+    if not in_step or elapsed >= 1.5 * period:
+        return elapsed >= period
+    return 2 * elapsed >= period and stamp // period > last // period
+
+
 class Work(Enum):
     """What the CPU time goes into. The values are names for people."""
 

@@ -120,7 +120,9 @@ class Pipeline:
         return self._pairing.clocks.describe()
 
     def _hand_over(self, found: list[Intake], stamp: int | None = None) -> None:
-        """With the lock held: to the ingest worker, unless it needs none of this stamp, ns."""
+        """With the lock held: to the ingest worker, unless it needs none of this stamp, ns, or of that of the scan in a rig."""
+        if found and self._scans is not None and stamp is not None:
+            stamp = found[-1].cloud_stamp or stamp
         if found and stamp is not None and self.recalibrator is not None and not self.recalibrator.wants(stamp):
             self.rested_pairs += len(found)
             return

@@ -93,11 +93,11 @@ class Recalibrator:
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
-        self.glance = Glance()
+        self._scans, self._models = scans, models
+        in_step = scans is not None
+        self.glance, self.selector = Glance(in_step), KeyframeSelector(self.config.online, in_step)
         self.segmentation = segmentation or models(self.config.semantics)
         self.segmenter = KeyframeSegmenter()
-        self.selector = KeyframeSelector(self.config.online)
-        self._scans, self._models = scans, models
         self.motion = EgoMotion(
             self.config.motion, self.config.lidar.accumulate_s, estimate_motion if scans is None else scans.motion
         )
@@ -205,7 +205,7 @@ class Recalibrator:
     # ---- frames -------------------------------------------------------------------------------------------------------
 
     def wants(self, stamp: int) -> bool:
-        """False if a frame of this stamp, ns, need not even be decoded: at rest, between two looks, and without any doubt."""
+        """False if a frame of this `_moment`, ns, need not even be decoded: at rest, between two looks, and without any doubt."""
         if not self.at_rest or self.config.lidar.accumulate_s > 0:
             return True
         return self._test_wanted or self.monitor.in_doubt or self.sensors.faulty_frames > 0 or self.glance.is_due(stamp, True)
@@ -227,12 +227,12 @@ class Recalibrator:
             self.first_guess.add(frame)
         self.schedule.add_frame(frame.stamp)
         self.rest.add_frame(frame.stamp, self.tracker.steady)
-        spacing_s = self.rest.keyframes_s if self.at_rest else 0.0
+        spacing_s, moment = self.rest.keyframes_s if self.at_rest else 0.0, self._moment(frame)
         if problem is not None or not self.speed_gate.allows(frame):
             return False
-        is_keyframe = self.selector.select(frame.image, frame.stamp, permit, spacing_s)
+        is_keyframe = self.selector.select(frame.image, moment, permit, spacing_s)
         if is_keyframe:
-            self.glance.put_off(frame.stamp)
+            self.glance.put_off(moment)
         elif not (self._worth_a_test(frame) and permit()):
             return False
         generation = self.keyframes.generation
@@ -258,13 +258,18 @@ class Recalibrator:
             self._monitor_extrinsic(None if is_keyframe else features)
         return is_keyframe
 
+    def _moment(self, frame: Frame) -> int:
+        """What looks and keyframes are timed by, ns: the cameras of a rig by the scan, so that they choose the same."""
+        return frame.stamp if self._scans is None else frame.moment_of_cloud
+
     def _worth_a_test(self, frame: Frame) -> bool:
         """Whether a frame that is no keyframe is to be tested by the monitor: it matches worse than others, or there is doubt."""
-        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(frame.stamp, self.at_rest)):
+        moment = self._moment(frame)
+        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(moment, self.at_rest)):
             return False
+        self.glance.put_off(moment)
         if self._test_wanted or self.monitor.in_doubt or self.tracker.suspect:
-            self.glance.put_off(frame.stamp)  # no need to look, nor to get used to what may be a knock
-            return True
+            return True  # no need to look, nor to get used to what may be a knock
         self._test_wanted = self.glance.strikes(frame, self.tracker.T, self.config)
         return self._test_wanted
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from calib_ros.registration.objective import ObjectiveKind
 
 Map = NDArray[np.float32]
+KEY_STEP = 61  # of points that tell a scan from others, a few thousand
 WIDE_DEG = 125.0  # field from left to right border above which a pinhole cuts images down
 
 
@@ -68,16 +69,15 @@ class FrameFeatures:
 
 
 # What does not depend on a camera: whether a scan has reflectivities, and its edges as measured, by `scan_key`.
-ScanKey = tuple[int, int, bytes]
+ScanKey = tuple[int, bytes]
 ScanEdges = MutableMapping[ScanKey, tuple[bool, EdgePoints]]
 
 
 def scan_key(frame: Frame) -> ScanKey | None:
-    """What tells the scan of a frame from others, also of drivers that do not stamp; None of one that is not to be shared."""
+    """What tells the scan of a frame from others: points of it, since drivers may not stamp, and cameras have their own clocks.
+    None of one that is not to be shared."""
     cloud = frame.cloud
-    if frame.cloud_stamp is None or cloud.label is not None or not len(cloud):
-        return None
-    return frame.cloud_stamp, len(cloud), cloud.xyz[len(cloud) // 2].tobytes()
+    return None if cloud.label is not None or not len(cloud) else (len(cloud), cloud.xyz[::KEY_STEP].tobytes())
 
 
 class FeatureExtractor:

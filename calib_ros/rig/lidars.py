@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,12 +16,22 @@ from calib_ros.config import MotionConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros.lidar.deskew import has_times, moved
-from calib_ros.lidar.ego_motion import MAX_GAP_S, MIN_CURVATURE, MIN_MATCHED, MIN_POINTS, align, estimate_motion, thinned
+from calib_ros.lidar.ego_motion import (
+    MAX_GAP_S,
+    MIN_CURVATURE,
+    MIN_MATCHED,
+    MIN_POINTS,
+    Motion,
+    align,
+    estimate_motion,
+    thinned,
+)  # fmt: skip
 from calib_ros.registration.motion_guess.guess import FLOOR_DEG
 from calib_ros.registration.motion_guess.hand_eye import CONVERGED_RAD, OVERLAP
 from calib_ros.registration.motion_guess.tracks import Run, picture_pairs
 from calib_ros.rig.graph import Edge
 
+SCANS_KIND = "scans"  # of edges
 SCANS = 20  # that are registered: what more of them show is much the same
 VOXEL_M = 0.4  # half of the odometry's, since both scanners see the same at once
 # Of matches: the prior's error at 30 m and more; that which MIN_MATCHED is about; and what the scans in place need.
@@ -41,10 +51,16 @@ Stamped = tuple[int, PointCloud]
 
 class LidarScans:
     """The scans of a LiDAR in the order of their stamps, and its motion between them, estimated when it is asked for. window: of
-    stamps, ns, first and last, whose scans are registered; None = all."""
+    stamps, ns, first and last, whose scans are registered; None = all. estimate: `estimate_motion`, or one that remembers."""
 
-    def __init__(self, scans: Sequence[Stamped], config: MotionConfig, window: tuple[int, int] | None = None) -> None:
-        self.scans, self.config = scans, config
+    def __init__(
+        self,
+        scans: Sequence[Stamped],
+        config: MotionConfig,
+        window: tuple[int, int] | None = None,
+        estimate: Callable[..., Motion] = estimate_motion,
+    ) -> None:
+        self.scans, self.config, self._estimate = scans, config, estimate
         stamps = getattr(scans, "stamps", None)
         self.stamps = np.array([stamp for stamp, _ in scans] if stamps is None else stamps, np.int64)
         first, last = window or (self.stamps[:1].sum(), self.stamps[-1:].sum())
@@ -68,7 +84,7 @@ class LidarScans:
                 self._motions[k] = None
             else:
                 before, after = self.scans[k][1], self.scans[k + 1][1]
-                self._motions[k] = estimate_motion(before, after, gap_s, self._times(before), self._motions.get(k - 1)).twist
+                self._motions[k] = self._estimate(before, after, gap_s, self._times(before), self._motions.get(k - 1)).twist
         return self._motions[k]
 
     def _times(self, cloud: PointCloud) -> MotionConfig:
@@ -121,7 +137,11 @@ def shared_view(a: LidarScans, b: LidarScans, T: Transform) -> float:
     if not len(a.used) or not len(b.used):
         return 0.0
     k = int(b.used[len(b.used) // 2])
-    A, B = a.still(a.nearest(int(b.stamps[k])))[0], se3.transform(T, b.still(k)[0])
+    return shared_share(a.still(a.nearest(int(b.stamps[k])))[0], se3.transform(T, b.still(k)[0]))
+
+
+def shared_share(A: Matrix, B: Matrix) -> float:
+    """The same for points (n, 3) of both in one frame."""
     if min(len(A), len(B)) < MIN_POINTS:
         return 0.0
     near = [np.isfinite(cKDTree(one).query(other, distance_upper_bound=SHARED_M)[0]).mean() for one, other in ((A, B), (B, A))]
@@ -129,14 +149,10 @@ def shared_view(a: LidarScans, b: LidarScans, T: Transform) -> float:
 
 
 def scan_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], T: Transform) -> Edge:
-    """Edge from scans of the same moments, registered from T_target_source (4, 4) on by GICP, each corrected for its scanner's
-    motion.
-
-    Of every pair of scans the Hessian tells how its directions compare, and the spread over pairs how large errors are; an offset
-    of the clocks is estimated along, as far as the speeds tell it. Raises TooFewFeaturesError.
-    """
+    """Edge from scans of the same moments, registered from T_target_source (4, 4) on, each corrected for its scanner's motion.
+    Raises TooFewFeaturesError."""
     (name_a, a), (name_b, b) = target, source
-    found: list[tuple[Transform, Matrix, Matrix]] = []  # T, information of a left twist but for its scale, velocity
+    found: list[Registration] = []
     reason = "no two of their scans are of the same moment"
     for k in b.chosen(SCANS):
         j = a.nearest(int(b.stamps[k]))
@@ -144,45 +160,67 @@ def scan_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], T:
         if abs(late_s) > MAX_GAP_S:
             continue
         (A, twist), (B, _) = a.still(j), b.still(k)
-        if min(len(A), len(B)) < MIN_POINTS or (twist is None and late_s):
-            reason = f"too few points in their scans, or the motion of {name_a} is unknown"
-            continue
-        between = se3.exp(np.zeros(6) if twist is None else twist * late_s)
-        guess = between @ T
-        # The narrower scanner's points are looked for among the wider one's.
-        turned = len(B) > len(A)
-        inliers: list[int] = []
-        for reach in REACHES_M:
-            if not np.isfinite(guess).all():
-                break
-            if turned:
-                result = align(B, A, se3.inverse(guess), reach)
-                guess = se3.inverse(np.asarray(result.T_target_source, float))
-            else:
-                result = align(A, B, guess, reach)
-                guess = np.asarray(result.T_target_source, float)
-            inliers.append(result.num_inliers)
-        # Of what both see, since either sees other things, too.
-        matched, H = inliers[1] / max(inliers[0], 1) if len(inliers) > 1 else 0.0, np.asarray(result.H, float)
-        curvature = float(np.linalg.eigvalsh(H[3:, 3:])[0]) / max(result.num_inliers, 1)
-        if not result.converged or not np.isfinite(guess).all() or matched < MIN_MATCHED or curvature < MIN_CURVATURE:
-            slides = " but slide along each other" if matched >= MIN_MATCHED else f", {MIN_MATCHED:.0%} are needed"
-            reason = f"their scans match at {matched:.0%} of the points that both see{slides}"
-            continue
-        # From a right twist of what was aligned to a left one of T_target_source.
-        to_right = -np.eye(6) if turned else se3.adjoint(se3.inverse(guess))
-        back = se3.adjoint(between)
-        found.append((
-            se3.inverse(between) @ guess, back.T @ to_right.T @ H @ to_right @ back, np.zeros(6) if twist is None else twist
-        ))  # fmt: skip
+        try:
+            found.append(register(A, B, T, twist, late_s))
+        except TooFewFeaturesError as error:
+            reason = str(error)
     if len(found) < 2:
         raise TooFewFeaturesError(f"{name_a} and {name_b}: {reason}; give scans of more moments, or a better prior")
-    return _fused(name_a, name_b, found, b.config.time_offset_sigma_s)
+    return fused(name_a, name_b, found, b.config.time_offset_sigma_s)[0]
 
 
-def _fused(target: str, source: str, found: Sequence[tuple[Transform, Matrix, Matrix]], clock_sigma_s: float) -> Edge:
-    """The weighted mean of registrations with the offset of the clocks, and its covariance by their spread."""
-    Ts, Hs, twists = (list(part) for part in zip(*found, strict=True))
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Of two scans of the same moment. T: T_target_source (4, 4). information: (6, 6) of a left twist, but for its scale. twist:
+    (6,) velocity of the target, rad/s and m/s in its own frame."""
+
+    T: Transform
+    information: Matrix
+    twist: Matrix
+
+
+def register(A: Matrix, B: Matrix, T: Transform, twist: Matrix | None, late_s: float) -> Registration:
+    """Registration by GICP from T_target_source (4, 4) on.
+
+    A, B: points (n, 3) of target and source, thinned, each as at its stamp. twist: velocity (6,) of the target, None = unknown.
+    late_s: by which the source's stamp is later. Raises TooFewFeaturesError.
+    """
+    if min(len(A), len(B)) < MIN_POINTS or (twist is None and late_s):
+        raise TooFewFeaturesError("too few points in their scans, or their motion is unknown")
+    between = se3.exp(np.zeros(6) if twist is None else twist * late_s)
+    guess = between @ T
+    # The narrower scanner's points are looked for among the wider one's.
+    turned = len(B) > len(A)
+    inliers: list[int] = []
+    for reach in REACHES_M:
+        if not np.isfinite(guess).all():
+            break
+        if turned:
+            result = align(B, A, se3.inverse(guess), reach)
+            guess = se3.inverse(np.asarray(result.T_target_source, float))
+        else:
+            result = align(A, B, guess, reach)
+            guess = np.asarray(result.T_target_source, float)
+        inliers.append(result.num_inliers)
+    # Of what both see, since either sees other things, too.
+    matched, H = inliers[1] / max(inliers[0], 1) if len(inliers) > 1 else 0.0, np.asarray(result.H, float)
+    curvature = float(np.linalg.eigvalsh(H[3:, 3:])[0]) / max(result.num_inliers, 1)
+    if not result.converged or not np.isfinite(guess).all() or matched < MIN_MATCHED or curvature < MIN_CURVATURE:
+        slides = " but slide along each other" if matched >= MIN_MATCHED else f", {MIN_MATCHED:.0%} are needed"
+        raise TooFewFeaturesError(f"their scans match at {matched:.0%} of the points that both see{slides}")
+    # From a right twist of what was aligned to a left one of T_target_source.
+    to_right = -np.eye(6) if turned else se3.adjoint(se3.inverse(guess))
+    back = to_right @ se3.adjoint(between)
+    return Registration(se3.inverse(between) @ guess, back.T @ H @ back, np.zeros(6) if twist is None else twist)
+
+
+def fused(target: str, source: str, found: Sequence[Registration], clock_sigma_s: float) -> tuple[Edge, float]:
+    """The weighted mean of registrations, and by what their information is to be divided.
+
+    The Hessian of each tells how its directions compare, and the spread over all how large errors are; an offset of the clocks is
+    estimated along, as far as the speeds tell it.
+    """
+    Ts, Hs, twists = [f.T for f in found], [f.information for f in found], [f.twist for f in found]
     n, T, offset = len(Ts), Ts[len(Ts) // 2], 0.0
     weights, J = np.ones(n), [np.c_[np.eye(6), twist] for twist in twists]
     # At first no registration is known to be right: the one nearest to all.
@@ -207,10 +245,8 @@ def _fused(target: str, source: str, found: Sequence[tuple[Transform, Matrix, Ma
     common = np.diag(np.repeat([COMMON_RAD**2, COMMON_M**2], 3))
     total = 0.5 * (covariance + sandwich + np.abs(np.diag(np.diag(covariance - sandwich))))
     sigma = float(np.sqrt(total[6, 6]))
-    return Edge(
-        target, source, T, _symmetric(total[:6, :6] + common), "scans", offset, sigma,
-        np.asarray(se3.adjoint(se3.inverse(T)) @ np.mean(twists, axis=0)), n,
-    )  # fmt: skip
+    twist = np.asarray(se3.adjoint(se3.inverse(T)) @ np.mean(twists, axis=0))
+    return Edge(target, source, T, _symmetric(total[:6, :6] + common), SCANS_KIND, offset, sigma, twist, n), scale
 
 
 def _squared(x: Matrix, H: Matrix) -> float:

@@ -10,31 +10,32 @@ from calib_ros.config import RefineConfig
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
 from calib_ros.rig.description import RigDescription
 from calib_ros.rig.edges import Measurement
-from calib_ros.rig.graph import Edge, RigSolution, solve
+from calib_ros.rig.graph import PRIOR, Edge, RigSolution, solve
 from calib_ros.rig.moved import MOVED as KNOCKED
 from calib_ros.rig.moved import hypotheses, verdict
 from calib_ros.rig.report import RigReport
 
 UNCHECKED = "unchecked"  # status of a sensor whose pairs get no data
 KIND = "registration"
-Pair = tuple[str, str]  # camera, LiDAR
+Pair = tuple[str, str]  # camera and LiDAR, or two LiDARs: target, source
 
 
 @dataclass(frozen=True, eq=False)
 class PairState:
-    """What a pair says of itself. extrinsic: None before its first messages. usable: to be relied on now. unchecked: why it is
-    not looked at any more, naming the silent sensor; "" = it is."""
+    """What a pair says of itself. extrinsic: None before its first messages; of two LiDARs, T_target_source. usable: to be relied
+    on now. unchecked: why it is not looked at any more, naming the silent sensor; "" = it is. kind: of the edge."""
 
-    camera: str
-    lidar: str
+    target: str
+    source: str
     extrinsic: Extrinsic | None = None
     usable: bool = False
     unchecked: str = ""
+    kind: str = KIND
 
     @property
     def pair(self) -> Pair:
-        """Camera, LiDAR."""
-        return self.camera, self.lidar
+        """Target, source."""
+        return self.target, self.source
 
     @property
     def status(self) -> str:
@@ -45,7 +46,7 @@ class PairState:
     def reason(self) -> str:
         """Why not to rely on it, for a person."""
         own = "" if self.extrinsic is None else self.extrinsic.result.reason
-        return self.unchecked or f"{self.camera} with {self.lidar}: {own or self.status}"
+        return self.unchecked or f"{self.target} with {self.source}: {own or self.status}"
 
     def edge(self) -> Edge | None:
         """What it has measured; None while it has not, or what it had does not hold any more."""
@@ -56,7 +57,7 @@ class PairState:
         if r.covariance is None:
             return None
         offset = (r.time_offset_s, r.time_offset_sigma_s)
-        return Edge(self.camera, self.lidar, r.T_camera_lidar, r.covariance, KIND, *offset, samples=r.frames_used)
+        return Edge(*self.pair, r.T_camera_lidar, r.covariance, self.kind, *offset, samples=r.frames_used)
 
     def says_as(self, other: PairState) -> bool:
         """Whether nothing has changed from another state of the pair."""
@@ -78,12 +79,14 @@ class SensorState:
 
 @dataclass(frozen=True, eq=False)
 class RigState:
-    """moved: sensors that have been displaced and are not found again. text: what is known of the last displacement."""
+    """moved: sensors that have been displaced and are not found again. text: what is known of the last displacement. pairs: what
+    it follows from."""
 
     solution: RigSolution
     sensors: tuple[SensorState, ...]
     moved: tuple[str, ...] = ()
     text: str = ""
+    pairs: tuple[PairState, ...] = ()
 
     def __str__(self) -> str:
         used = [s.name for s in self.sensors if s.usable]
@@ -117,12 +120,12 @@ class LiveRig:
         if not self._lost and not any(p.status == SUSPECT for p in known):
             confirmed = [edges[p.pair] for p in known if p.pair in edges and p.status != TENTATIVE]
             self._before = solution if len(confirmed) == len(edges) else solve(confirmed, priors, reference)
-        measured = [Measurement(*p.pair, KIND, edges.get(p.pair), p.reason) for p in known]
+        measured = [Measurement(*p.pair, p.kind, edges.get(p.pair), p.reason) for p in known]
         report = RigReport(self._description, solution, measured, {}, {}, limits=self._limits)
-        rejected = {(e.target, e.source) for e in (*solution.rejected, *solution.doubted) if e.kind == KIND}
+        rejected = {(e.target, e.source) for e in (*solution.rejected, *solution.doubted) if e.kind != PRIOR}
         joined = _joined(reference, [p.pair for p in known if p.usable and p.pair in edges and p.pair not in rejected])
         sensors = tuple(self._sensor(name, report, joined, moved, known) for name in solution.poses)
-        return RigState(solution, sensors, moved, self._told)
+        return RigState(solution, sensors, moved, self._told, tuple(pairs))
 
     def _sensor(
         self, name: str, report: RigReport, joined: set[str], moved: Sequence[str], pairs: Sequence[PairState]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -67,10 +67,10 @@ class Health:
         """Something that is well again, in one line."""
         self.log.add(kind, text, lambda line: self._logger.info(line))
 
-    def set_losses(self, losses: dict[str, str]) -> None:
-        """The topics whose messages get lost at present, each with one line for a person."""
-        for topic, text in losses.items():
-            self.error(text, f"losses on {topic}")
+    def set_losses(self, losses: dict[str, str], told: Container[str]) -> None:
+        """The topics whose messages get lost at present, each with one line for a person. told: those that are to be logged."""
+        for topic in filter(told.__contains__, losses):
+            self.error(losses[topic], f"losses on {topic}")
         self.losses = losses
 
     def unexpected(self, error: BaseException) -> str:

@@ -9,7 +9,8 @@ import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import product
+from functools import partial
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,15 +31,17 @@ from calib_ros.online.common import Common
 from calib_ros.online.pacing import LoadBudget
 from calib_ros.online.worker import Worker
 from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.result import MOVED, SUSPECT
 from calib_ros.rig.description import CAMERA, RigDescription, Sensor, prior_covariance, read_rig
 from calib_ros.rig.edges import box_of
 from calib_ros.rig.graph import solve
-from calib_ros.rig.live import LiveRig, Pair, PairState, RigState
+from calib_ros.rig.live import KIND, LiveRig, Pair, PairState, RigState
 from calib_ros.ros import parameters
 from calib_ros.ros.conversions import covariance_for_ros, time_message, transform_message
 from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import VALID_PERIODS
+from calib_ros.ros.rig_lidars import LidarsOfRig
 from calib_ros.ros.rig_pairs import PairOfRig, SharedTopics, decoded_clouds, decoded_images
 from calib_ros.ros.tf import LATCHED, StaticTf
 
@@ -50,6 +53,7 @@ TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")  # of the name of a node
 OF_RIG = {"rig_file", "publish_tf", "tf_parent", "tf_child", "export.on_converged", "export.joint"}
 OF_PAIR = {"camera_frame", "lidar_frame", "initial_translation_m", "initial_quaternion_xyzw", "state_file", "capture_dir"}
 USED = {"rig_file", "publish_tf", "state_file", "capture_dir"}  # of these, by the rig as well
+TF_CURE = "take what says otherwise out of the robot's description, or write the rig to its joints with calib-ros rig --out"
 Priors = dict[str, tuple[Transform, Covariance]]
 
 
@@ -73,7 +77,8 @@ class RigInterface:
         others = [s for s in self.description.sensors if s.name != self.description.reference]
         self._priors_given = {s.name: (s.prior, _covariance(s)) for s in others if s.prior is not None}
         self._live = LiveRig(self.description, declared.config.refine)
-        self.tf = StaticTf(node, declared["initial_from_tf"], declared["publish_tf"], self.health.error)
+        wanted_tf = declared["initial_from_tf"], declared["publish_tf"]
+        self.tf = StaticTf(node, *wanted_tf, self.health.error, (TF_CURE, TF_CURE))
         common, self._shared = Common(declared.config.online), SharedTopics(node)
         self.load = LoadBudget(declared.config.online, purse=common.purse)  # of receiving messages
         decoded = {s.name: decoded_images() if s.kind == CAMERA else decoded_clouds() for s in self.description.sensors}
@@ -90,8 +95,15 @@ class RigInterface:
             if self.description.pairs is None:
                 pair.unseen = lambda why, made=made: self._unseen(made, why)
                 self._views.append(pair)
+        topics = {name: self._topics(name, name)[1] for name in self.description.lidars}
+        given = (lambda: self.parameters, self.health)
+        self.lidars = [
+            LidarsOfRig(pair, topics, decoded, common, *given, partial(self._start_of, *pair))
+            for pair in _lidar_pairs(self.description)
+        ]
         self._lock = threading.Lock()  # of state, active and what is published of them
         self._active = False
+        self._priors_now: Priors = dict(self._priors_given)
         self._told: list[PairState] = []  # what the newest solution rests on
         self._text = ""
         self._edges: list[TransformStamped] = []  # of the newest solution
@@ -110,6 +122,8 @@ class RigInterface:
         self._active = True
         for pair in self.pairs.values():
             pair.activate()
+        for lidars in self.lidars:
+            lidars.activate(self._shared)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers = [
             self._node.create_timer(1.0, self._every_second, clock=steady),
@@ -125,6 +139,8 @@ class RigInterface:
         self._timers = []
         for pair in self.pairs.values():
             pair.deactivate()
+        for lidars in self.lidars:
+            lidars.deactivate()
         with self._lock:
             self._active = False
             self._forget()
@@ -134,7 +150,7 @@ class RigInterface:
         if self._ended is None:
             with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
                 ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
-            self._ended = all([*ended, self._solver.stop()])
+            self._ended = all([*ended, *(lidars.stop() for lidars in self.lidars), self._solver.stop()])
         return self._ended
 
     def destroy(self) -> bool:
@@ -218,6 +234,12 @@ class RigInterface:
             self.load.count_messages()
             self.tf.check()
             states, priors = [self._state_of(*names, pair) for names, pair in self.pairs.items()], self._priors()
+            self._priors_now = priors
+            doubt = any(own.status in (SUSPECT, MOVED) for own in states)
+            for lidars in self.lidars:
+                lidars.urgent = doubt
+                lidars.check()
+                states.append(lidars.state())
             for view in [own for own in self._views if own.T is None]:  # whose priors TF tells
                 if {view.camera, view.lidar} <= priors.keys() | {self.description.reference}:
                     view.T = solve([], priors, self.description.reference).between(view.camera, view.lidar)[0]
@@ -237,6 +259,14 @@ class RigInterface:
         validity = pair.extrinsic.validity(extrinsic)
         unchecked = "" if validity.usable or not extrinsic.usable else pair.sensors.silent() or validity.reason
         return PairState(camera, lidar, extrinsic, validity.usable, unchecked)
+
+    def _start_of(self, target: str, source: str) -> Transform | None:
+        """T_target_source (4, 4) by what is known so far; None before there is a prior of both."""
+        state, priors = self.state, self._priors_now
+        if not {target, source} <= priors.keys() | {self.description.reference}:
+            return None
+        solution = solve([], priors, self.description.reference) if state is None else state.solution
+        return solution.between(target, source)[0] if {target, source} <= solution.poses.keys() else None
 
     def _solve(self, item: tuple[list[PairState], Priors]) -> None:
         """On a thread of its own."""
@@ -276,7 +306,9 @@ class RigInterface:
 
     def _stamp(self, name: str = "") -> int:
         """Of the newest data of a sensor's pairs, ns; of all pairs without a name."""
-        return max((p.extrinsic.stamp for names, p in self.pairs.items() if not name or name in names), default=0)
+        stamps = [(names, pair.extrinsic.stamp) for names, pair in self.pairs.items()]
+        stamps += [(lidars.names, lidars.stamp) for lidars in self.lidars]
+        return max((stamp for names, stamp in stamps if not name or name in names), default=0)
 
     def _message(self, state: RigState, usable: bool = True) -> Rig:
         now, reference = self._node.get_clock().now().nanoseconds, self._frame(state.solution.reference)
@@ -293,9 +325,20 @@ class RigInterface:
             msg.loops.append(
                 RigLoop(sensors=list(loop.sensors), rotation_deg=deg, translation_m=m, p_value=loop.p_value, closes=loop.closes)
             )
+        msg.edges = [self._edge(own, state) for own in state.pairs]
         for told, edges in ((msg.rejected, state.solution.rejected), (msg.doubted, state.solution.doubted)):
             told.extend(RigEdge(target=e.target, source=e.source, kind=e.kind) for e in edges)
         return msg
+
+    def _edge(self, own: PairState, state: RigState) -> RigEdge:
+        edge, poses = own.edge(), state.solution.poses
+        said = RigEdge(target=own.target, source=own.source, kind=own.kind, status=own.status, usable=own.usable)
+        said.reason = "" if own.usable else own.reason
+        said.covariance = covariance_for_ros(None if edge is None else edge.covariance)
+        if edge is not None and {*own.pair} <= poses.keys():
+            said.transform = transform_message(edge.T, "", "", 0).transform
+            said.rotation_deg, said.translation_m = se3.error(se3.inverse(poses[own.target]) @ poses[own.source], edge.T)
+        return said
 
     def _diagnostics(self, priors: Mapping[str, Any]) -> DiagnosticArray:
         state = self.state
@@ -308,6 +351,8 @@ class RigInterface:
             good = all(s.usable for s in state.sensors) and not missing and not state.solution.rejected
             status.level = ERROR if state.moved else OK if good else WARN
             values |= {s.name: ": ".join(filter(None, [s.status, s.reason])) for s in state.sensors}
+            of_lidars = [own for own in state.pairs if own.kind != KIND]
+            values |= {" with ".join(own.pair): own.status if own.usable else f"{own.status}: {own.reason}" for own in of_lidars}
         values |= {"errors": str(self.health.errors), "last error": self.health.last_error[0]}
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         message = DiagnosticArray(status=[status])
@@ -349,6 +394,13 @@ def _pairs(description: RigDescription, path: str) -> list[Pair]:
     if not found:
         raise BadInputError(f"{path}: pairs holds no camera with a LiDAR, which the node estimates; add one")
     return found
+
+
+def _lidar_pairs(description: RigDescription) -> list[Pair]:
+    """Two LiDARs to be registered to each other."""
+    if description.pairs is None:
+        return list(combinations(description.lidars, 2))
+    return [(a, b) for a, b in description.pairs if description[a].kind != CAMERA]
 
 
 def _node_of(node: Node, camera: str, lidar: str, overrides: list[Parameter]) -> Node:

@@ -80,6 +80,11 @@ class Listener:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._topic.subscription, name)
 
+    @property
+    def tells(self) -> bool:
+        """See `AdaptiveSubscription`: of those who share it, the first one."""
+        return self._topic.listeners[:1] == [self]
+
     def check(self) -> str:
         """See `AdaptiveSubscription`."""
         own, now = self._topic, time.monotonic()

@@ -140,10 +140,10 @@ class SensorSubscriptions:
         for subscription in self.adaptive:
             subscription.preference = parameters["reliability"]
             problem = subscription.check()
-            if problem:
+            if problem and subscription.tells:
                 self._health.error(problem, f"publishers of {subscription.topic}")
         self._health.silence = {name: own.silence for name, own in zip(("image", "points"), self.adaptive, strict=False)}
-        self._health.set_losses(self._losses())
+        self._health.set_losses(self._losses(), {own.topic for own in self.adaptive if own.tells})
         if parameters["image_is_rectified"] != self._rectified:
             self._rectified = parameters["image_is_rectified"]
             if self.camera_info is not None:
@@ -199,9 +199,11 @@ class AdaptiveSubscription:
     it may be replaced at any time and holds from the next check() on. latched: receive what was published before as well, where
     all publishers keep it. guard: context that callbacks run in. forms: types that are received, one at a time, the first that
     somebody publishes. largest: bytes of data in the largest message so far. reliability_offered: by all publishers, when check()
-    was called last. silence: why nothing comes on the topic, where nothing does. To be used on the executor's thread. No message
-    is lost or received twice in a change of reliability.
+    was called last. silence: why nothing comes on the topic, where nothing does. tells: its user is to report problems, and not
+    another one who shares it. To be used on the executor's thread. No message is lost or received twice when reliability changes.
     """
+
+    tells = True
 
     def __init__(
         self,

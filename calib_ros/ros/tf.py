@@ -27,6 +27,11 @@ WAIT_S = 2.0  # static transforms are latched: discovery of their publishers tak
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+CURES = (
+    "take the other one as tf_parent",
+    "give an edge between camera and LiDAR as tf_parent and tf_child, and it is corrected",
+)
+
 
 def _tf_message() -> Any:
     try:
@@ -39,12 +44,14 @@ def _tf_message() -> Any:
 class StaticTf:
     """Reads the static tree for an initial extrinsic, and publishes the extrinsic to it.
 
-    error: takes one line for a person, and its kind for the log. MissingDependencyError if `publish` is asked for without
-    tf2_msgs.
+    error: takes one line for a person, and its kind for the log. cures: what to do about a loop, and about a second parent.
+    MissingDependencyError if `publish` is asked for without tf2_msgs.
     """
 
-    def __init__(self, node: Node, listen: bool, publish: bool, error: Callable[[str, str], None]) -> None:
-        self._node, self._error = node, error
+    def __init__(
+        self, node: Node, listen: bool, publish: bool, error: Callable[[str, str], None], cures: tuple[str, str] = CURES
+    ) -> None:
+        self._node, self._error, self._cures = node, error, cures
         self._tree = StaticTransforms()  # of everybody but this node
         self._since = time.monotonic()
         self._type = _tf_message()
@@ -199,13 +206,13 @@ class StaticTf:
         if above == child:
             return (
                 f"publish_tf: {child} is above {parent} in /tf_static already, an edge {parent} -> {child} would close a loop: "
-                "nothing is published; take the other one as tf_parent"
+                f"nothing is published; {self._cures[0]}"
             )
         if other in (None, parent):
             return ""
         return (
             f"publish_tf: {child} already has the parent {other} in /tf_static, a second one ({parent}) would take the tree "
-            "apart: nothing is published; give an edge between camera and LiDAR as tf_parent and tf_child, and it is corrected"
+            f"apart: nothing is published; {self._cures[1]}"
         )
 
     def _edge_between(self, T_camera_lidar: Transform, camera: str, lidar: str, parent: str, child: str) -> Transform:

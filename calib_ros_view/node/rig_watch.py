@@ -199,6 +199,7 @@ class RigWatch:
         rig = RigShown(message.reference, sensors, (), loops, message.text)
         with self._lock:
             edges = tuple(self._edge(pair, told, rig, message) for pair, told in self._pairs.items())
+        edges += tuple(self._edge_of_lidars(own, rig) for own in message.edges if own.kind != KIND)
         self.rig, self.version = replace(rig, edges=edges), self.version + 1
 
     def _sensor(self, own: Any, kind: str) -> SensorShown:
@@ -206,6 +207,11 @@ class RigWatch:
         moved = (own.moved_deg, own.moved_m) if own.moved_deg or own.moved_m else None
         sigma = None if C is None else worst_sigmas(at_sensor(T, C))
         return SensorShown(own.name, kind, T, own.status, own.reason, own.usable, sigma, moved)
+
+    def _edge_of_lidars(self, own: Any, rig: RigShown) -> EdgeShown:
+        edge = EdgeShown(own.target, own.source, own.kind, own.status, LEVELS.get(own.status, BAD), own.reason)
+        C = covariance_from_ros(own.covariance)
+        return edge if C is None else compared(edge, matrix_from_transform(own.transform), C, rig.poses)
 
     def _edge(self, pair: Pair, told: tuple[Result, bool] | None, rig: RigShown, message: Rig) -> EdgeShown:
         if told is None:

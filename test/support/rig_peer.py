@@ -34,26 +34,28 @@ Measured = tuple[int, str, Any]  # stamp, sensor, image or cloud
 NO_CLOUD = PointCloud(np.zeros((0, 3), np.float32))
 
 
-def measured(rig: SyntheticRig, cameras: Sequence[str], until_s: float) -> list[Measured]:
-    """What the first LiDAR and some cameras measure, in the order of time."""
+def measured(rig: SyntheticRig, cameras: Sequence[str], until_s: float, lidars: int = 1, hz: float = np.inf) -> list[Measured]:
+    """What the first LiDARs and some cameras measure, in the order of time. hz: of none more often."""
     found: list[Measured] = []
-    for name in (*cameras, rig.lidars[0]):
+    for name in (*cameras, *rig.lidars[:lidars]):
         own = rig.pictures(name) if name in cameras else rig.scans(name)
-        first = int(own.stamps[0])
-        found += [(stamp, name, value) for stamp, value in own[: sum(own.stamps - first <= until_s * NANOSECONDS)]]
+        last = -np.inf
+        for k, stamp in enumerate(own.stamps - own.stamps[0]):
+            if stamp <= until_s * NANOSECONDS and stamp - last > 0.9 * NANOSECONDS / hz:
+                last = stamp
+                found.append((own[k][0], name, own[k][1]))
     return sorted(found, key=lambda item: item[:2])
 
 
-def describe(rig: SyntheticRig, cameras: Sequence[str], path: Path, **changed: Any) -> Path:
-    """rig.yaml of the first LiDAR and some cameras, with the priors of the source."""
-    lidar = rig.lidars[0]
-    sensors: dict[str, Any] = {lidar: {"kind": "lidar", "topic": f"/{lidar}/points", "frame": lidar}}
-    for name in cameras:
+def describe(rig: SyntheticRig, cameras: Sequence[str], path: Path, lidars: int = 1, **changed: Any) -> Path:
+    """rig.yaml of the first LiDARs and some cameras, with the priors of the source."""
+    sensors: dict[str, Any] = {}
+    for name in (*rig.lidars[:lidars], *cameras):
+        kind, topic = ("camera", "image") if name in cameras else ("lidar", "points")
         T = rig.prior(name)
         prior = {"translation_m": T[:3, 3].tolist(), "quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist()}
-        own = {"kind": "camera", "topic": f"/{name}/image", "frame": rig.frame_id(name), "prior": prior}
-        sensors[name] = own
-    path.write_text(yaml.safe_dump({"reference": lidar, "sensors": sensors} | changed))
+        sensors[name] = {"kind": kind, "topic": f"/{name}/{topic}", "frame": rig.frame_id(name), "prior": prior}
+    path.write_text(yaml.safe_dump({"reference": rig.lidars[0], "sensors": sensors} | changed))
     return path
 
 
@@ -63,9 +65,10 @@ def again(items: Iterable[Measured], after_s: float) -> list[Measured]:
 
 
 class RigPeer:
-    """The node under test, its pairs and a peer, each on an executor's thread. parameters: as of `Peer`."""
+    """The node under test, its pairs and a peer, each on an executor's thread. parameters: as of `Peer`. lidars: how many of the
+    rig's; the cameras are paired with the first one."""
 
-    def __init__(self, rig: SyntheticRig, cameras: Sequence[str], rig_file: Path, **parameters: Any) -> None:
+    def __init__(self, rig: SyntheticRig, cameras: Sequence[str], rig_file: Path, lidars: int = 1, **parameters: Any) -> None:
         values = {**QUICK, "semantics__segmentation": "none", "online__rest_period_s": 0.0, "online__max_load": 1.0}
         values |= {"max_data_age_s": 3600.0, "initial_from_tf": False, "publish_period_s": 0.2, **parameters}
         self.rig, self.cameras, self.lidar = rig, tuple(cameras), rig.lidars[0]
@@ -76,7 +79,7 @@ class RigPeer:
         self.peer = rclpy.create_node("peer", context=self.context)
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         topics = [(CameraInfo, f"/{c}/camera_info") for c in cameras] + [(Image, f"/{c}/image") for c in cameras]
-        topics += [(PointCloud2, f"/{self.lidar}/points")]
+        topics += [(PointCloud2, f"/{lidar}/points") for lidar in rig.lidars[:lidars]]
         self.publishers = {topic: self.peer.create_publisher(kind, topic, reliable) for kind, topic in topics}
         self.rigs: list[Rig] = []
         self._sent: dict[tuple[str, str], int] = defaultdict(int)
@@ -112,9 +115,12 @@ class RigPeer:
         for stamp, name, value in items:
             if name in without:
                 continue
-            if name == self.lidar:
+            if name in self.rig.lidars:
                 self.publishers[f"/{name}/points"].publish(cloud_message(value, stamp, frame_id=name))
-                pairs, stream = self.cameras, "clouds"
+                pairs, stream = self.cameras if name == self.lidar else (), "clouds"
+                for own in self.calibration.lidars:
+                    self.until(lambda o=own, n=name, s=stamp: o._recent[n] and o._recent[n][-1][0] == s, f"a scan of {name}")
+                    assert own._worker.wait_idle(LIMIT_S)
             else:
                 image = value[0] if isinstance(value, tuple) else value
                 frame = Frame(image, NO_CLOUD, self.rig.camera(name), stamp)

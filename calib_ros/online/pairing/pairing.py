@@ -21,11 +21,13 @@ CLOUDS_KEPT = 6
 
 @dataclass(frozen=True, eq=False)
 class Intake:
-    """An image and a cloud to be looked at. paired: they belong together; else any two, before it is known which do."""
+    """An image and a cloud to be looked at. paired: they belong together; else any two, before it is known which do.
+    cloud_stamp: ns, by the clock of the images; None = not known any more."""
 
     image: Any
     cloud: Any
     paired: bool = True
+    cloud_stamp: int | None = None
 
 
 class Pairing:
@@ -87,7 +89,8 @@ class Pairing:
 
     def _to_take_in(self, pairs: list[tuple[Any, Any]]) -> list[Intake]:
         """The pairs, or, while nothing is known of the sweep, what is to be looked at."""
-        found = [Intake(*pair) for pair in pairs]
+        stamps = {id(message): stamp for stamp, message in self._clouds}
+        found = [Intake(image, cloud, True, stamps.get(id(cloud))) for image, cloud in pairs]
         if self.sweep.ns is not None:
             self._newest_image = self._newest_cloud = None
         elif not pairs and self._newest_image is not None and self._newest_cloud is not None:

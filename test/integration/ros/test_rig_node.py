@@ -1,4 +1,4 @@
-"""The node with a rig of two cameras and a LiDAR over real DDS: topics, one solution, a dead driver, a knock, wrong files."""
+"""The node with a rig of two cameras and a LiDAR, or two, over real DDS: one solution, a dead driver, knocks, wrong files."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.time import Time
 from rig_peer import RigPeer, again, describe, measured, poses
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -31,17 +32,20 @@ from calib_ros.lidar.ego_motion import estimate_motion
 from calib_ros.messages import decode_cloud
 from calib_ros.online import common
 from calib_ros.online.common import Common
+from calib_ros.online.pacing import Work
 from calib_ros.registration import features
 from calib_ros.ros import conversions
+from calib_ros.ros.conversions import matrix_from_transform
 from calib_ros.ros.lifecycle_node import CalibLifecycleNode
 from calib_ros.ros.node import interface
+from calib_ros.ros.rig_lidars import LidarsOfRig
 from calib_ros.ros.rig_pairs import UNSEEN_SCANS, PairOfRig
 from calib_ros.ros.tf import LATCHED
 from calib_ros_synthetic.rig import SyntheticRig
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 LEFT, RIGHT, TOP = "back_left", "back_right", "lidar_top"
-SECONDS, PAUSE_S = 3.0, 1.0  # of the drive, and before it begins again: too long for a motion from scan to scan
+SECONDS, TWO_S, PAUSE_S = 3.0, 4.0, 1.0  # of the drive, and before it begins again: too long for a motion from scan to scan
 SETTINGS = {"seed": 3, "frames": 4, "width": 320, "clocks": 0.0, "speed": 4.0}
 
 
@@ -100,6 +104,8 @@ def test_each_cloud_is_decoded_once_and_each_scan_aligned_once(driven) -> None:
     assert 0 < driven.counts["motions"] <= clouds
     assert driven.counts["scans"] < first.recalibrator.keyframes_seen + second.recalibrator.keyframes_seen
     assert first.load._purse is second.load._purse
+    adaptive = [driven.peer.pair(c).sensors.adaptive for c in (LEFT, RIGHT)]
+    assert [[own.tells for own in of_pair] for of_pair in adaptive] == [[True, True, True], [True, False, True]]  # losses once
 
 
 def test_tf_is_one_tree_from_the_reference(rig, driven) -> None:
@@ -161,6 +167,85 @@ def test_a_knocked_camera_is_named_with_its_size_and_found_again(rig, driven) ->
     assert f"{LEFT} moved by" in peer.rigs[-1].text
     stamp = driven.items[-1][0]
     assert is_near(rig, peer, (LEFT,), lambda name: knocked.reference_at(name, stamp))
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory, ros_in_this_process) -> Iterator[Any]:
+    """A peer whose node has a camera with one of two LiDARs, and what was driven; the other one has no camera."""
+    rig = SyntheticRig("two_lidars_three_cameras", **SETTINGS | {"frames": 5})
+    items, file = measured(rig, ("front",), TWO_S, 2, 10.0), tmp_path_factory.mktemp("two") / "rig.yaml"
+    describe(rig, ("front",), file, 2, pairs=[["front", "lidar_left"], ["lidar_right", "lidar_left"]])
+    with RigPeer(rig, ("front",), file, 2) as peer:
+        peer.drive(items)
+        yield SimpleNamespace(peer=peer, items=items, rig=rig)
+
+
+def test_two_lidars_are_registered_to_each_other(two) -> None:
+    peer, all_three = two.peer, {"lidar_left", "lidar_right", "front"}
+    peer.until(lambda: peer.usable() == all_three, "all sensors")
+    (edge,) = [own for own in peer.rigs[-1].edges if own.kind == "scans"]
+    assert (edge.target, edge.source, edge.status, edge.reason, edge.usable) == (
+        "lidar_right",
+        "lidar_left",
+        "converged",
+        "",
+        True,
+    )
+    truth = two.rig.reference("lidar_right")
+    told = se3.inverse(matrix_from_transform(edge.transform))
+    for T in (told, dict(poses(peer.rigs[-1]))["lidar_right"]):
+        deg, m = se3.error(truth, T)
+        assert deg < 0.1
+        assert m < 0.03
+    assert 0 < edge.covariance[0] < 0.02**2
+    assert Time.from_msg(peer.sensor("lidar_right").transform.header.stamp).nanoseconds > two.items[0][0]
+    values = {v.key: v.value for v in peer.until(lambda: peer.statuses.get("calib_ros: rig")).values}
+    assert values["lidar_right with lidar_left"] == "converged"
+    assert edge.rotation_deg < 0.1
+    load = peer.calibration.lidars[0].load
+    assert load._purse is peer.pair("front").pipeline.load._purse
+    assert load.counts().seconds[Work.ESTIMATES] > 0
+
+
+@pytest.mark.slow
+def test_a_displaced_lidar_is_named_with_its_size_and_found_again(two) -> None:
+    peer, before = two.peer, len(two.peer.rigs)
+    settings = SETTINGS | {"frames": 5}
+    knock = {"knock": "lidar_right", "knock_at": 0.0, "knock_deg": 1.5, "knock_m": 0.06}
+    knocked = SyntheticRig("two_lidars_three_cameras", **settings, **knock)
+    scans = iter(item for item in measured(knocked, (), TWO_S, 2, 10.0) if item[1] == "lidar_right")
+    items = [next(scans) if item[1] == "lidar_right" else item for item in two.items]
+    for item in again(items, TWO_S + PAUSE_S):
+        peer.drive([item])
+        pause()
+        if "lidar_right moved by" in peer.rigs[-1].text:
+            break
+    right = peer.until(lambda: "lidar_right" in peer.usable() and peer.sensor("lidar_right"), "that it is found again")
+    assert (right.moved_deg, right.moved_m) == (pytest.approx(1.5, abs=0.15), pytest.approx(0.06, abs=0.03))
+    assert ["lidar_right"] in [list(rig.moved) for rig in peer.rigs[before:]]
+    assert doubted(peer, before, "front", "lidar_left") == []
+    deg, m = se3.error(knocked.reference_at("lidar_right", items[-1][0]), dict(poses(peer.rigs[-1]))["lidar_right"])
+    assert deg < 0.1
+    assert m < 0.03
+
+
+def test_without_the_library_lidars_keep_their_priors_and_one_line_says_so(two, monkeypatch) -> None:
+    own = two.peer.calibration.lidars[0]
+    alone = LidarsOfRig(own.names, {}, own._decoded, Common(OnlineConfig()), own._parameters, own._health, own._start)
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    errors = own._health.errors
+    for name in own.names:
+        alone._recent[name].extend(own._recent[name])
+    for name, recent in own._recent.items():
+        for stamp, message in list(recent) * 2:
+            alone._add(name, stamp, message)
+            assert alone._worker.wait_idle(240)
+    assert own._health.errors == errors + 1
+    assert "lidar_right and lidar_left are not registered to each other" in own._health.last_error[0]
+    assert "pip install small_gicp" in own._health.last_error[0]
+    assert (alone.state().status, alone.state().edge()) == ("initial", None)
+    assert "pip install small_gicp" in alone.state().reason
+    assert alone.stop()
 
 
 @pytest.mark.parametrize("given", [True, False])

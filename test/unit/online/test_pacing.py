@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 
 from calib_ros.config import OnlineConfig
-from calib_ros.online.pacing import CLASSES_EVERY_S, ESTIMATE_EVERY_S, KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work
+from calib_ros.online.pacing import CLASSES_EVERY_S, ESTIMATE_EVERY_S, KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work, is_due
 
 INTAKE, KEYFRAME, ESTIMATE = 0.005, 0.22, 0.4  # s of CPU time; as on KITTI
 STEP = 0.1  # s between pairs
@@ -168,3 +169,24 @@ def test_a_meter_books_cpu_time_under_one_work_after_the_other() -> None:
     assert seconds[Work.KEYFRAMES] > 3 * seconds[Work.INTAKE] > 0
     assert seconds[Work.CLASSES] > 0
     assert seconds[Work.ESTIMATES] == 0
+
+
+@pytest.mark.parametrize("in_step", [True, False])
+def test_what_is_done_in_step_falls_on_the_same_stamps_wherever_it_began(in_step: bool) -> None:
+    """Scans at 10 Hz with jitter, every 0.55 s."""
+    rng, every_s = np.random.default_rng(0), 0.55
+    stamps = np.sort(10**18 + np.arange(200) * 100_000_000 + rng.integers(-9_000_000, 9_000_000, 200)).tolist()
+    chosen = []
+    for first in (0, 2, 3):
+        last, done = stamps[first], []
+        for stamp in stamps[first + 1 :]:
+            if is_due(last, stamp, every_s, in_step):
+                last = stamp
+                done.append(stamp)
+        gaps = np.diff(done) / 1e9
+        assert 0.4 < gaps.min() < gaps.max() < 0.8
+        chosen.append(done)
+    late = [[stamp for stamp in done if stamp > stamps[20]] for done in chosen]
+    assert (late[0] == late[1] == late[2]) == in_step
+    assert is_due(stamps[9], stamps[3], every_s, in_step)  # the clock was set back
+    assert is_due(None, stamps[0], every_s, in_step)

@@ -84,6 +84,18 @@ MISTAKES = {
     GOOD + "pairs: [[front, rear]]": "pairs[0] is front and rear; pair a camera with a LiDAR, or two LiDARs",
     GOOD + "pairs: [[front, top], [top, front]]": "pairs[1] lists top and front again; leave it out",
     GOOD + "pairs: [[front, tip]]": "pairs[0] names 'tip', which is no sensor here; do you mean top?",
+    "reference: a\nsensors: [a, b]": "sensors must be a mapping such as front: {kind: camera, topic: /front/image}",
+    "reference: a\nsensors: {a: lidar, b: {kind: camera}}": "sensors.a must be a mapping such as {kind: camera",
+    "reference: 3\nsensors: {a: {kind: lidar}, b: {kind: camera}}": "reference names 3, which is no sensor here",
+    GOOD.replace("frame: top}", "frame: top, camera_info: /top/info}"): "sensors.top.camera_info is of cameras; leave it out",
+    GOOD.replace("frame: top}", "frame: front_optical}"): "is front_optical, as of top; give each its own",
+    GOOD.replace("frame: top}", "prior: {translation_m: [1, 0, 0], quaternion_xyzw: [0, 0, 0, 1]}}"): "of the reference itself",
+    GOOD.replace("{kind: camera}", "{kind: camera, prior: ''}"): "sensors.rear.prior is empty; give tf, a result file, or",
+    GOOD.replace("{kind: camera}", "{kind: camera, prior: 3}"): "sensors.rear.prior must be a mapping such as {translation_m",
+    GOOD.replace("[1, 0, -0.2]", "[1, 0, .nan]"): "sensors.front.prior",
+    GOOD.replace("sigma_m: 0.1", "sigma_m: far"): "sensors.front.sigma_m = 'far' is no standard deviation",
+    GOOD + "pairs: []": "pairs must be a list such as [[front, lidar_top]]; leave it out for all that share a view",
+    GOOD + "pairs: [[top, top]]": "pairs[0] is top and top; pair a camera with a LiDAR, or two LiDARs",
     "reference: a\nsensors: {a: {kind: camera}, b: {kind: camera}}": "sensors must hold two or more, one of them of kind: lidar",
 }
 

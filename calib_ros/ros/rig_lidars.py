@@ -1,0 +1,142 @@
+"""Two LiDARs of a rig whose scans are registered to each other: from their messages to what the rig knows of the pair."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from sensor_msgs.msg import PointCloud2
+
+from calib_ros.arrays import Transform
+from calib_ros.errors import CalibrationError, MissingDependencyError
+from calib_ros.frame import NANOSECONDS
+from calib_ros.lidar.ego_motion import MAX_GAP_S
+from calib_ros.online.common import Common
+from calib_ros.online.pacing import LoadBudget, Work, is_due
+from calib_ros.online.worker import Worker
+from calib_ros.result import INITIAL
+from calib_ros.rig.lidar_pair import QUICK_S, LidarPair
+from calib_ros.rig.lidars import SCANS_KIND, LidarScans
+from calib_ros.rig.live import PairState
+from calib_ros.ros.conversions import Serialized
+from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.rig_pairs import Decoded, Listener, SharedTopics
+from calib_ros.ros.subscriptions import livox_forms, serialized
+
+SCANS_KEPT = 8  # messages of a LiDAR, among them the first one of a beat and that before it, while the other one is late
+Stamped = tuple[int, Serialized]
+Moment = Mapping[str, list[Stamped]]  # of each LiDAR a scan and the one before it
+
+
+class LidarsOfRig:
+    """Registers the scans of two LiDARs, those that cameras look at as well, on a thread of its own and within the load budget.
+
+    names: target and source, their topics and decoders by name. start: T_target_source (4, 4) to begin with, None = unknown yet.
+    To be used on the executor's thread.
+    """
+
+    def __init__(
+        self,
+        names: tuple[str, str],
+        topics: Mapping[str, str],
+        decoded: Mapping[str, Decoded],
+        common: Common,
+        parameters: Callable[[], Parameters],
+        health: Health,
+        start: Callable[[], Transform | None],
+    ) -> None:
+        self.names, self._topics, self._decoded, self._common = names, topics, decoded, common
+        self._parameters, self._health, self._start = parameters, health, start
+        self.pair = LidarPair(*names, parameters().config.motion.time_offset_sigma_s)
+        self.load = LoadBudget(parameters().config.online, purse=common.purse)
+        self.missing = ""  # why nothing is registered, for a person
+        self._recent: dict[str, deque[Stamped]] = {name: deque(maxlen=SCANS_KEPT) for name in names}
+        self.stamp = 0  # of the newest scans that were registered, ns
+        self._beat: int | None = None  # the same of those that were looked at
+        self.urgent = False  # a displacement is suspected, whatever this pair has seen
+        self._listeners: dict[str, Listener] = {}
+        self._worker: Worker[Moment] = Worker("calib_lidars", self._register, self._failed)
+
+    def activate(self, shared: SharedTopics) -> None:
+        """Receive scans."""
+        subscribe = partial(shared.subscribe, preference=self._parameters()["reliability"], guard=self._health.guard)
+        forms = [serialized(PointCloud2), *livox_forms()]
+        self._listeners = {name: subscribe(forms, self._topics[name], partial(self._add, name)) for name in self.names}
+
+    def deactivate(self) -> None:
+        """Receive nothing any more."""
+        for listener in self._listeners.values():
+            listener.destroy()
+        self._listeners = {}
+        for recent in self._recent.values():
+            recent.clear()
+
+    def stop(self) -> bool:
+        """End the thread; True if it ended."""
+        return self._worker.stop()
+
+    def silent(self) -> str:
+        """Which of both has sent nothing for max_data_age_s, for a person; "" if both have."""
+        most = self._parameters()["max_data_age_s"]
+        told = [(name, own) for name, own in self._listeners.items() if own.silent_s > most]
+        return ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told)
+
+    def state(self) -> PairState:
+        """What it says of itself now."""
+        extrinsic, silent = self.pair.extrinsic, self.silent()
+        return PairState(*self.names, extrinsic, extrinsic.usable and not silent, silent, SCANS_KIND)
+
+    def check(self) -> None:
+        """Follow the publishers and the parameters; to be called about once a second."""
+        self.load.config = self._parameters().config.online
+        for listener in self._listeners.values():
+            listener.check()
+
+    def _add(self, name: str, stamp: int, message: Any) -> None:
+        own, every_s = self._recent[name], QUICK_S if self.urgent else self.pair.every_s
+        if own and stamp < own[-1][0]:  # a clock was set back
+            for recent in self._recent.values():
+                recent.clear()
+            self._beat = None
+        own.append((stamp, message))
+        reached = min((recent[-1][0] for recent in self._recent.values() if recent), default=0)
+        if self.missing or not all(self._recent.values()) or not is_due(self._beat, reached, every_s, in_step=True):
+            return
+        moment, beat = {}, reached - reached % round(every_s * NANOSECONDS)
+        for one, recent in self._recent.items():
+            at = next((k for k, (s, _) in enumerate(recent) if k and s >= beat), None)
+            if at is None:
+                return
+            moment[one] = [recent[at - 1], recent[at]]
+        if self._worker.busy or not self.load.allows_estimate(True):
+            return
+        self._beat = reached
+        stamps = [scans[1][0] for scans in moment.values()]
+        if max(stamps) - min(stamps) <= MAX_GAP_S * NANOSECONDS and self._start() is not None:
+            self._worker.put(moment)
+
+    def _register(self, moment: Moment) -> None:
+        T, motion = self._start(), self._parameters().config.motion
+        with self._common.estimates.mine(self._worker.check_cancelled), self.load.counting(Work.ESTIMATES):
+            self.load.start_estimate()
+            scans = [
+                LidarScans([(s, self._decoded[name](m)) for s, m in own], motion, estimate=self._common.scans(name).motion)
+                for name, own in moment.items()
+            ]
+            if T is not None:
+                self.pair.add(scans[0], scans[1], T)
+                self.stamp = min(int(own.stamps[-1]) for own in scans)
+
+    def _failed(self, error: Exception) -> None:
+        who = " and ".join(self.names)
+        if isinstance(error, MissingDependencyError):
+            self.missing = f"{who} are not registered to each other, their priors are used: {error}"
+            self.pair.say(INITIAL, self.missing)
+            self._health.error(self.missing, "registration of LiDARs")
+        elif isinstance(error, CalibrationError):
+            self._health.error(f"{who}: {error}", f"scans of {who}")
+        else:
+            self._health.unexpected(error)
