@@ -249,7 +249,7 @@ def judged(line: Line, is_shown: bool) -> Line:
     beside = 1.0 if measure.kind == "ratio" else 0.0
     if change.change == beside and change.low == change.high:
         verdict = IDENTICAL
-    elif not is_shown or (measure.column == "cpu_s" and abs(math.log(change.change)) < math.log(CPU_RESOLUTION)):
+    elif not is_shown or (measure.column == "cpu_s" and change.low <= CPU_RESOLUTION and change.high >= 1 / CPU_RESOLUTION):
         verdict = SAME
     else:
         verdict = BETTER if (change.change > beside) == (measure.sign > 0) else WORSE
