@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -99,10 +100,12 @@ def _named(groups: Sequence[Sequence[Claim]]) -> list[Claim]:
     """Each calibration by its recording, or the folder that has all of its recordings, and its camera."""
     paths = [[Path(claim.recording.path).absolute() for claim in group] for group in groups]
     root = os.path.commonpath([path.parent for group in paths for path in group])
+    uses = Counter(path for own in paths for path in own)
     names = []
     for group, own in zip(groups, paths, strict=True):
         is_folder = len(own) > 1 and len({path.parent for path in own}) == 1
-        name = os.path.relpath(own[0].parent if is_folder else own[0], root)
+        telling = min(own, key=lambda path: uses[path])  # the recording that has the fewest other calibrations
+        name = os.path.relpath(telling.parent if is_folder else telling, root)
         name = Path(root).name if name == "." else name
         more = "" if is_folder or len(own) == 1 else f" and {len(own) - 1} more"
         names.append(f"{name}{more}, camera {group[0].camera}" if group[0].camera else f"{name}{more}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -142,9 +143,7 @@ def test_drives_of_a_day_share_a_calibration_and_frames_may_have_their_own(tmp_p
         sample_sources.kitti(day / name, "raw")
     sample_sources.kitti(tmp_path / "object/training", "object")
     own = tmp_path / "object/training/calib/000001.txt"
-    own.write_text(
-        own.read_text().replace("e+02", "e+01", 1) if "e+02" in own.read_text() else own.read_text().replace("P2: ", "P2: 1", 1)
-    )
+    own.write_text(own.read_text().replace("P2: ", "P2: 1", 1))
     claims = find_claims([str(tmp_path)], CheckOptions())
     assert [(c.recording.vehicle, c.recording.name, c.camera, c.frames) for c in claims] == [
         ("2011_09_26, camera 2", "first_sync", "2", ""),
@@ -154,6 +153,19 @@ def test_drives_of_a_day_share_a_calibration_and_frames_may_have_their_own(tmp_p
     ]
     assert [c.frames for c in find_claims([str(day)], CheckOptions(), 1)] == ["1", "1"]
     assert [c.camera for c in find_claims([str(day)], CheckOptions(camera="2"))] == ["", ""]
+
+
+def test_a_calibration_is_named_by_the_recording_that_has_no_other(tmp_path: Path) -> None:
+    sample_sources.kitti(tmp_path / "object/training", "object")
+    shutil.copytree(tmp_path / "object/training", tmp_path / "other/training")
+    changed = tmp_path / "object/training/calib/000001.txt"
+    changed.write_text(changed.read_text().replace("P2: ", "P2: 1", 1))
+    claims = find_claims([str(tmp_path)], CheckOptions())
+    assert [(Path(c.recording.path).parent.name, c.frames, c.recording.vehicle) for c in claims] == [
+        ("object", "0", "other/training and 1 more, camera 2"),
+        ("other", "", "other/training and 1 more, camera 2"),
+        ("object", "1", "object/training, camera 2"),
+    ]
 
 
 def test_scenes_and_cameras_of_nuscenes_are_claims(tmp_path: Path) -> None:
