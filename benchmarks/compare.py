@@ -33,7 +33,7 @@ import numpy as np
 from scipy.stats import chi2, false_discovery_control, permutation_test
 from tqdm import tqdm
 
-from benchmarks.compare_sets import SETS, PairedTrial, Recording, prepared, spent_sets
+from benchmarks.compare_sets import ROOT, SETS, PairedTrial, Recording, prepared, spent_sets
 from benchmarks.records import markdown
 from benchmarks.study_runner import NEAR
 from calib_ros import se3
@@ -41,7 +41,6 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.result import CONVERGED
 from calib_ros_evaluation.compare import BETTER, SAME, WORSE, Measure, PairedChange, paired_change
 
-ROOT = Path(__file__).resolve().parents[1]
 BUILT = ROOT / "build" / "compare"
 WORKING_TREE = ""
 NOTICED_S = 5.0  # after a displacement, in which it is to be told

@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CONSTANTS = ROOT / "docs" / "figures" / "constants.csv"
 SINGLE, SEVERAL = (5.0, 0.3), (10.0, 0.5)  # deg, m per axis that a start is off, of one frame and of several
 SET, MOST_SINGLE = 5, 8  # frames of a set of a recording, and single ones of it at most
-NEXT = 3  # deg, cm that the vehicle's start is off
+BESIDE_DEG, BESIDE_M = 0.3, 0.03  # per axis that a drive's start is off
 # Loops of 5 s at 5 Hz; the displacement comes when the extrinsic has been steady for a while.
 ONLINE_RIGS = (
     *("hdl64e_kitti", "hdl32e_front", "pandar40p_roof", "vlp32c_roof", "os1_128_windshield", "pandar64_roof"),
@@ -69,7 +69,7 @@ class PairedTrial:
 
 
 class Recording(NamedTuple):
-    """text: as `open_dataset` takes it, of the frames that all its trials use."""
+    """text: as `open_dataset` takes it. number: in its set, which seeds the starts."""
 
     set: str
     text: str
@@ -153,7 +153,7 @@ def laps(recording: Recording, frames: Sequence[Frame], number: int, before: Rec
     truth = frames[0].reference
     assert truth is not None
     rng = np.random.default_rng([number, recording.number, 1])
-    start = se3.perturb(truth, rng.uniform(-NEXT, NEXT, 3) / 10, rng.uniform(-NEXT, NEXT, 3) / 100)
+    start = se3.perturb(truth, rng.uniform(-BESIDE_DEG, BESIDE_DEG, 3), rng.uniform(-BESIDE_M, BESIDE_M, 3))
     turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     is_turned = (number + recording.number) % 2
     knock = se3.perturb(np.eye(4), KNOCK_DEG * is_turned * turn, KNOCK_M * (1 - is_turned) * shift)
