@@ -14,7 +14,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport PYTHONDONTWRITEBYTECODE
 export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 
-.PHONY: help env demo test test-all bench lint docs dist clean distclean
+.PHONY: help env demo test test-all bench compare lint docs dist clean distclean
 
 help:
 	@echo "make demo               drive, node and player on a synthetic street; before and after"
@@ -23,6 +23,7 @@ help:
 	@echo "make test PYTEST_ARGS='-k deskew -x'    further arguments of pytest"
 	@echo "make test-all           everything, with long scenarios and the laboratory"
 	@echo "make bench              speed of each stage"
+	@echo "make compare BASE=main  is the working tree better or worse than a commit? Paired, with intervals; SETS=, TRIALS=, TIP="
 	@echo "make lint               ruff and mypy"
 	@echo "make docs               the documentation site in site/"
 	@echo "make dist               sdist and wheels in dist/"
@@ -55,6 +56,13 @@ test-all: env
 
 bench: env
 	$(VENV)/bin/python -m benchmarks.bench
+
+SETS ?=
+TRIALS ?= 1
+TIP ?=
+compare: env
+	@$(VENV)/bin/python -m benchmarks.compare $(or $(BASE),$(error give the commit to compare with: make compare BASE=main)) \
+		--trials $(TRIALS) $(if $(TIP),--tip $(TIP)) $(if $(SETS),--sets $(SETS))
 
 lint: env
 	$(VENV)/bin/ruff check .

@@ -139,6 +139,7 @@ setup(
         ],
         "calib_ros.commands": [
             "check = calib_ros_check.commands:CHECK",
+            "certify = calib_ros_check.commands:CERTIFY",
             "demo = calib_ros_synthetic.commands:DEMO",
             "models = calib_ros_semantics.commands:MODEL_COMMAND",
             "view = calib_ros_view.commands:VIEW",

@@ -325,6 +325,7 @@ class Checker:
             T_checked=inputs.T,
             T_estimated=found.T,
             covariance=found.covariance,
+            shared_covariance=found.shared,
             causes=complete(found.causes, self.camera),
             time_offset_s=result.time_offset_s,
             time_offset_sigma_s=result.time_offset_sigma_s,

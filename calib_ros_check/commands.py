@@ -7,6 +7,23 @@ import argparse
 from calib_ros.cli.arguments import SOURCE, add_camera_and_topics
 
 
+def add_check_options(command: argparse.ArgumentParser) -> None:
+    """How each extrinsic is checked."""
+    for option, default, unit in (("--tolerance-deg", 0.5, "deg"), ("--tolerance-m", 0.1, "m")):
+        command.add_argument(
+            option, type=float, default=default, help=f"error up to which it is right, {unit} (default {default})"
+        )
+    command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
+
+
+def add_workers(group: argparse._ActionsContainer, out: str) -> None:
+    """Where the work is done, and what it leaves."""
+    group.add_argument("--out", default=out, help=f"folder for page, tables and journal (default {out})")
+    group.add_argument("--workers", type=int, metavar="N", help="processes (default one per core)")
+    group.add_argument("--scheduler", metavar="ADDRESS", help="of a running Dask cluster, as tcp://host:8786, to work there")
+    group.add_argument("--fresh", action="store_true", help="forget what the folder holds; default is to go on with it")
+
+
 class Check:
     """Is the extrinsic of a recording, or of a fleet's recordings, right?"""
 
@@ -25,20 +42,14 @@ class Check:
         command.add_argument(
             "--rig", metavar="YAML", help="several cameras and LiDARs, as for `calib-ros rig`; --extrinsic may be its JSON result"
         )
-        for option, default, unit in (("--tolerance-deg", 0.5, "deg"), ("--tolerance-m", 0.1, "m")):
-            command.add_argument(
-                option, type=float, default=default, help=f"error up to which it is right, {unit} (default {default})"
-            )
         command.add_argument("--frames", help="all, 0,4,8 or 0:100:5 (default: ten, evenly spread)")
-        command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
+        add_check_options(command)
         command.add_argument("--json", metavar="FILE", help="write the result as JSON; - = to standard output")
         command.add_argument("--report", metavar="HTML", help="write a page: size of the error, other causes, pictures")
         group = command.add_argument_group(
             "fleets", "Several recordings, or a folder of them: a table, a page, and which vehicles changed."
         )
-        group.add_argument("--out", default="check_out", help="folder for page, tables and journal (default check_out)")
-        group.add_argument("--workers", type=int, metavar="N", help="processes (default one per core)")
-        group.add_argument("--scheduler", metavar="ADDRESS", help="of a running Dask cluster, as tcp://host:8786, to work there")
+        add_workers(group, "check_out")
         group.add_argument(
             "--vehicle-pattern",
             metavar="REGEX",
@@ -51,7 +62,6 @@ class Check:
             metavar="RATE",
             help="changes reported per recording where there is none (default 0.001)",
         )
-        group.add_argument("--fresh", action="store_true", help="forget what the folder holds; default is to go on with it")
 
     def run(self, args: argparse.Namespace) -> int:
         """Check and tell; the exit code."""
@@ -70,4 +80,28 @@ class Check:
         return check_one(args.source[0], args)
 
 
-CHECK = Check()
+class Certify:
+    """Is every calibration of a data set right?"""
+
+    help = "is every calibration of a data set right? A page and a table; exit code as of check"
+
+    def add_arguments(self, command: argparse.ArgumentParser) -> None:
+        """See `calib-ros certify --help`."""
+        command.add_argument(
+            "source", nargs="+", help="folders of KITTI, KITTI-360, nuScenes, View of Delft, ONCE, plain recordings, bags"
+        )
+        command.add_argument("--camera", help="only this one, by its name or number (default: every camera of a recording)")
+        command.add_argument(
+            "--frames", type=int, default=10, metavar="N", help="of each calibration in a recording, evenly spread (default 10)"
+        )
+        add_check_options(command)
+        add_workers(command, "certify_out")
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Certify and tell; the exit code."""
+        from calib_ros_check.certify.cli import certify_many
+
+        return certify_many(args)
+
+
+CHECK, CERTIFY = Check(), Certify()

@@ -115,6 +115,8 @@ class CheckResult:
         T_camera_lidar that the scenes show, with any other cause mended; None where they show none.
     covariance : ndarray, shape (6, 6), or None
         Of a left perturbation (rx, ry, rz, tx, ty, tz) of it, rad and m.
+    shared_covariance : ndarray, shape (6, 6), or None
+        The part of it that intrinsics and clocks leave open: other recordings of the same sensors have it in common.
     p_within : float
         Probability that the extrinsic is within the tolerance; NaN where nothing is known.
     rotation, translation : Deviation
@@ -151,6 +153,7 @@ class CheckResult:
     translation: Deviation
     axes: tuple[Deviation, ...]
     causes: tuple[CauseFinding, ...] = ()
+    shared_covariance: Covariance | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     z_score: float = math.nan

@@ -75,14 +75,9 @@ def check_source(
     options = options or CheckOptions()
     if is_capture(folder := Path(path).expanduser()) and options.config == Config():
         options = replace(options, config=with_clocks(capture_config(folder), result.load(folder / RESULT)))
-    source = _opened(path, options)
-    T = extrinsic_of(source, path, options.extrinsic)
-    if options.frames:
-        positions = frame_positions(options.frames, len(source))
-    else:
-        those = getattr(source, "middles", None) or range(len(source))
-        positions = [those[k] for k in spread_positions(FRAMES, len(those))]
-    frames, notes = _read(source, positions, options.config, reading, warn)
+    source = opened(path, options)
+    frames, notes = read_frames(source, positions_of(source, options), options.config, reading, warn)
+    T = extrinsic_of(source, path, options.extrinsic, frames[0])
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
     found = replace(
@@ -94,14 +89,22 @@ def check_source(
     return Checked(found, frames, source.name, options.config)
 
 
-def extrinsic_of(source: Source, path: str, extrinsic: str) -> Transform:
-    """T_camera_lidar (4, 4) that is to be checked. BadInputError if there is none."""
+def positions_of(source: Source, options: CheckOptions) -> list[int]:
+    """Which frames are checked."""
+    if options.frames:
+        return frame_positions(options.frames, len(source))
+    those = getattr(source, "middles", None) or range(len(source))
+    return [those[k] for k in spread_positions(FRAMES, len(those))]
+
+
+def extrinsic_of(source: Source, path: str, extrinsic: str, frame: Frame | None = None) -> Transform:
+    """T_camera_lidar (4, 4) that is to be checked; of a frame, where each has its own. BadInputError if there is none."""
     if extrinsic == TF and not is_bag(Path(path).expanduser()):
         raise BadInputError(f"--extrinsic tf: {path} is no bag and has no /tf_static; give reference, or a result file")
     if extrinsic not in (REFERENCE, TF):
         return result.load(extrinsic).T_camera_lidar
     if source.reference is not None:
-        return source.reference
+        return source.reference if frame is None or frame.reference is None else frame.reference
     if is_bag(Path(path).expanduser()):
         raise BadInputError(
             f"{path}: no /tf_static connects {source.camera_frame or 'the camera'} and {source.lidar_frame or 'the LiDAR'}; give "
@@ -110,7 +113,7 @@ def extrinsic_of(source: Source, path: str, extrinsic: str) -> Transform:
     raise BadInputError(f"{path} has no extrinsic to check; give one by --extrinsic FILE")
 
 
-def _opened(path: str, options: CheckOptions) -> Source:
+def opened(path: str, options: CheckOptions) -> Source:
     """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
     names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     given: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name)}
@@ -123,13 +126,15 @@ def _opened(path: str, options: CheckOptions) -> Source:
     return open_dataset(path, camera=options.camera, **given)
 
 
-def _read(
+def read_frames(
     source: Source,
     positions: Sequence[int],
     config: Config,
     reading: Callable[[float], object],
     warn: Callable[[str], None] | None,
 ) -> tuple[list[Frame], list[str]]:
+    """Frames of one camera at positions, with the vehicle's motion, and notes on those that were left out. BadInputError if all
+    were."""
     moving = WithMotion(source, config.motion, warn, config.lidar.accumulate_s)
     frames: list[Frame] = []
     notes: list[str] = []

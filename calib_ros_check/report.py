@@ -10,14 +10,15 @@ import numpy as np
 import yaml
 
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.io import check_output, write_atomically
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.overlay import render
-from calib_ros_check.outcome import CheckResult, Deviation
+from calib_ros_check.outcome import CheckResult, Deviation, Tolerance
 from calib_ros_check.page import page_template
-from calib_ros_check.tolerance import amount, signed
+from calib_ros_check.tolerance import Judgement, amount, signed
 
 PICTURES = 3
 MAX_WIDTH = 1100  # px of a picture on the page
@@ -66,17 +67,8 @@ td.words { white-space: normal; min-width: 13rem; }
 }
 nav { display: none; }
 """
-TEMPLATE = (
-    f"{{% block style %}}\n{STYLE}{{% endblock %}}"
-    + """
-{% block contents %}{% endblock %}
-{% block main %}
-<p><span class="verdict {{ result.verdict.value }}">{{ result.verdict.value }}</span></p>
-<p class="said">{{ result.reason }}</p>
-<h2>Size of the error</h2>
-<p class="intro">The error of the extrinsic{{ " with what was found mended" if result.cause else "" }}, in the camera's axes:
-its median, and where it lies with 95 %. Green: the tolerance, {{ result.tolerance.deg }} deg and
-{{ "%g"|format(100 * result.tolerance.m) }} cm.</p>
+# Of `rows`, see `deviation_rows`.
+DEVIATIONS = """\
 <div class="sheet"><div class="scroll"><table>
 <tr><th>axis</th><th>verdict</th><th>error</th><th>95 %</th><th></th><th>in words</th></tr>
 {% for row in rows %}
@@ -90,7 +82,21 @@ its median, and where it lies with 95 %. Green: the tolerance, {{ result.toleran
 </svg>{% endif %}</td><td class="words">{{ row.words }}</td></tr>
 {% endfor %}
 </table></div></div>
-<h2>Other causes</h2>
+"""
+TEMPLATE = (
+    f"{{% block style %}}\n{STYLE}{{% endblock %}}"
+    + """
+{% block contents %}{% endblock %}
+{% block main %}
+<p><span class="verdict {{ result.verdict.value }}">{{ result.verdict.value }}</span></p>
+<p class="said">{{ result.reason }}</p>
+<h2>Size of the error</h2>
+<p class="intro">The error of the extrinsic{{ " with what was found mended" if result.cause else "" }}, in the camera's axes:
+its median, and where it lies with 95 %. Green: the tolerance, {{ result.tolerance.deg }} deg and
+{{ "%g"|format(100 * result.tolerance.m) }} cm.</p>
+"""
+    + DEVIATIONS
+    + """<h2>Other causes</h2>
 <p class="intro">What else than the mount could be wrong, and was tried.</p>
 <div class="sheet"><div class="scroll"><table>
 <tr><th>cause</th><th>found</th><th></th></tr>
@@ -137,9 +143,9 @@ def write_report(path: str | Path, result: CheckResult, frames: Sequence[Frame],
         facts=facts,
         configuration=yaml.safe_dump(config.to_dict(), sort_keys=False),
         result=result,
-        rows=[_row(own, result) for own in (result.rotation, *result.axes[:3], result.translation, *result.axes[3:])],
+        rows=deviation_rows(result, result.tolerance),
         causes=[(CAUSE_NAMES[f.cause.value], f.state.value, f.message) for f in result.causes],
-        pictures=[(frame.name, picture_of(frame, result, config)) for frame in _shown(frames)],
+        pictures=[(frame.name, picture_of(frame, result.T_checked, result.T_estimated, config)) for frame in _shown(frames)],
         both=result.T_estimated is not None,
     )
     write_atomically(path, page.encode())
@@ -151,9 +157,14 @@ def check_report(path: str | Path) -> None:
     check_output(path, "--report")
 
 
-def _row(own: Deviation, result: CheckResult) -> dict[str, object]:
+def deviation_rows(found: CheckResult | Judgement, tolerance: Tolerance) -> list[dict[str, object]]:
+    """What DEVIATIONS shows of the size of an error."""
+    return [_row(own, tolerance) for own in (found.rotation, *found.axes[:3], found.translation, *found.axes[3:])]
+
+
+def _row(own: Deviation, tolerance: Tolerance) -> dict[str, object]:
     is_angle = own.name in ("rotation", "rx", "ry", "rz")
-    limit = result.tolerance.deg if is_angle else result.tolerance.m
+    limit = tolerance.deg if is_angle else tolerance.m
     known, said = bool(np.isfinite(own.error)), amount if own.name in ("rotation", "translation") else signed
     return {
         "name": LONG_NAMES[own.name],
@@ -187,12 +198,12 @@ def _shown(frames: Sequence[Frame]) -> list[Frame]:
     return [frames[int((k + 0.5) * len(frames) / n)] for k in range(n)]
 
 
-def picture_of(frame: Frame, result: CheckResult, config: Config) -> bytes:
-    """JPEG of a frame under the extrinsic as given and as the scenes show it."""
-    found, shown = result.T_estimated, deskewed_frame(frame, config.motion)
-    error = "" if found is None else f"{se3.rotation_error_deg(found, result.T_checked):.2f} deg apart"
+def picture_of(frame: Frame, T_checked: Transform, T_found: Transform | None, config: Config) -> bytes:
+    """JPEG of a frame under the extrinsic (4, 4) as given and as the scenes show it."""
+    shown = deskewed_frame(frame, config.motion)
+    error = "" if T_found is None else f"{se3.rotation_error_deg(T_found, T_checked):.2f} deg apart"
     picture = render(
-        shown, result.T_checked if found is None else found, T_before=None if found is None else result.T_checked, lines=[error]
+        shown, T_checked if T_found is None else T_found, T_before=T_found if T_found is None else T_checked, lines=[error]
     )
     if picture.shape[1] > MAX_WIDTH:
         height = round(picture.shape[0] * MAX_WIDTH / picture.shape[1])

@@ -111,14 +111,15 @@ def _comparison(group: tuple[str, str], of_a: Keyed, of_b: Keyed, seed: int, res
         len(in_b - in_a),
         int(np.sum(success[:, 1] > success[:, 0])),
         int(np.sum(success[:, 1] < success[:, 0])),
-        {name: _estimate(both(one.column), frames, one.kind, one.sign, seed, resamples) for name, one in MEASURES.items()},
+        {name: paired_change(both(one.column), frames, one.kind, one.sign, seed, resamples) for name, one in MEASURES.items()},
     )
 
 
-def _estimate(
-    values: Matrix, frames: Sequence[tuple[str, tuple[int, ...]]], kind: str, sign: int, seed: int, resamples: int
+def paired_change(
+    values: Matrix, frames: Sequence[tuple[str, tuple[int, ...]]], kind: str, sign: int, seed: int = 0, resamples: int = 2000
 ) -> PairedChange:
-    """values: (n, 2) in A and B. kind, sign: as of Measure."""
+    """values: (n, 2) in A and B; pairs with one that is not finite are left out. frames: of each pair, alike within a cluster.
+    kind, sign: as of Measure."""
     if kind == "ratio":
         with np.errstate(divide="ignore", invalid="ignore"):
             values = np.log(values)

@@ -79,6 +79,16 @@ class KittiSource:
         height, width = read_picture(self._images[first]).shape[:2]
         self.camera = Camera(P[:, :3], width, height)
 
+    @property
+    def cameras(self) -> list[str]:
+        """Numbers of the cameras that the folder has."""
+        return [str(number) for number in self._layout.images]
+
+    def calibration_at(self, index: int) -> tuple[Matrix, Matrix]:
+        """Camera matrix (3, 3) and T_camera_lidar (4, 4) of a frame, whose picture and scan are not read."""
+        P, T_camera_lidar = self._layout.calibrate(self.numbers[index])
+        return P[:, :3], T_camera_lidar
+
     def __len__(self) -> int:
         return len(self.numbers)
 
@@ -130,6 +140,11 @@ class KittiSource:
             "lidar_frame": self.lidar_frame,
             "reference": "from the calibration files" + (", one per frame" if self._layout.kind == "object" else ""),
         }
+
+
+def is_drive(path: Path) -> bool:
+    """Whether a folder is a drive, complete or not."""
+    return bool(_kind(path))
 
 
 def drives_in(path: Path) -> list[Path]:

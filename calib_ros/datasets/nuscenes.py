@@ -65,6 +65,21 @@ class NuScenesSource:
             )
         self.camera, self.reference = self._calibration(*self._pairs[0])
 
+    @property
+    def scenes(self) -> list[str]:
+        """Names of all scenes of the dataset."""
+        return self._tables.scenes
+
+    @property
+    def cameras(self) -> list[str]:
+        """Channels of all cameras."""
+        return self._tables.cameras
+
+    def calibration_at(self, index: int) -> tuple[Matrix, Matrix]:
+        """Camera matrix (3, 3) and T_camera_lidar (4, 4) of a frame, whose picture and scan are not read."""
+        camera, T_camera_lidar = self._calibration(*self._pairs[index])
+        return camera.K, T_camera_lidar
+
     def __len__(self) -> int:
         return len(self._pairs)
 

@@ -47,6 +47,7 @@ class OnceSource:
         self.camera_frame = dict(enumerate(names)).get(camera or 0, "") if not isinstance(camera, str) else camera
         if self.camera_frame not in cameras:
             raise BadInputError(f"{self.path} has no camera {camera or 0}; it has {', '.join(map(shown, names)) or 'none'}")
+        self.cameras = [name for name in names if (self.path / name).is_dir()]
         self._others = [name for name in names if name != self.camera_frame]
         self._images = numbered_files(self.path / self.camera_frame, (".jpg", ".png"), STAMP_DIGITS)
         self._scans = numbered_files(self.path / SCANS, (".bin",), STAMP_DIGITS)

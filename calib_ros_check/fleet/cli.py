@@ -25,12 +25,7 @@ def check_many(args: argparse.Namespace, options: CheckOptions) -> int:
             raise BadInputError(f"--{option} is for one recording; the page and the tables of a fleet are written into --out")
     if args.frames:
         check_positions(args.frames)
-    if not args.out:
-        raise BadInputError("--out is given without a name; name a folder, or leave --out out")
-    facts = {
-        "Command": shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode(),
-        "Version": f"calib-ros {VERSION}",
-    }
+    facts = checked_arguments(args)
     fleet_options = FleetOptions(
         args.source,
         Path(args.out),
@@ -47,6 +42,14 @@ def check_many(args: argparse.Namespace, options: CheckOptions) -> int:
         note(line)
     print(summary(fleet))
     return fleet.exit_code
+
+
+def checked_arguments(args: argparse.Namespace) -> dict[str, str]:
+    """Facts for the head of a page. BadInputError for --out without a name."""
+    if not args.out:
+        raise BadInputError("--out is given without a name; name a folder, or leave --out out")
+    command = shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode()
+    return {"Command": command, "Version": f"calib-ros {VERSION}"}
 
 
 def summary(fleet: Fleet) -> str:

@@ -83,13 +83,8 @@ class Fleet:
 
     @property
     def exit_code(self) -> int:
-        """0 all pass, 1 any fails, 3 none fails and any is inconclusive or could not be checked, 2 none could be checked."""
-        counts = self.counts
-        if counts[ERROR] == len(self.rows):
-            return 2
-        if counts[CheckVerdict.FAIL.value]:
-            return 1
-        return 0 if counts[CheckVerdict.PASS.value] == len(self.rows) else 3
+        """See `exit_code_of`."""
+        return exit_code_of([row.verdict for row in self.rows])
 
 
 def check_fleet(
@@ -108,20 +103,34 @@ def check_fleet(
     found = find_recordings(options.sources, options.vehicle_pattern)
     settings = options_key(options.options)
     jobs = [CheckJob(one.path, one.fingerprint, settings) for one in found]
-    with Journal(options.out, ABOUT, options.fresh, "fleet check") as journal:
+    answers, notes = answers_of(jobs, options, "fleet check", progress)
+    rows = [row_of(recording, answer) for recording, answer in zip(found, answers, strict=True)]
+    results: dict[str, Any] = {row.path: answer.get("result") for row, answer in zip(rows, answers, strict=True)}
+    histories, variances = vehicles(rows, results, options.false_alarms)
+    ordered = [row for vehicle in histories for row in vehicle.rows]
+    return _written(Fleet(ordered, histories, np.sqrt(variances)), options, facts or {}, notes)
+
+
+def answers_of(jobs: Sequence[CheckJob], options: FleetOptions, what: str, progress: Progress) -> tuple[list[Answer], list[str]]:
+    """The answers of all jobs, those of earlier runs out of the journal of `what` in options.out, and notes for people."""
+    with Journal(options.out, ABOUT, options.fresh, what) as journal:
         # What failed for another reason than the recording may succeed now.
         for key in [key for key, answer in journal.done.items() if answer.get("from") == OTHER]:
             del journal.done[key]
         pool: Pool = ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers or os.cpu_count() or 1)
         work = partial(run_checks, _portable(options.options))
         run([[job] for job in jobs], work, journal, pool, progress, lost)
-        answers: list[Answer] = [journal.done[job.key] for job in jobs]
-        notes = list(journal.notes)
-    rows = [row_of(recording, answer) for recording, answer in zip(found, answers, strict=True)]
-    results: dict[str, Any] = {row.path: answer.get("result") for row, answer in zip(rows, answers, strict=True)}
-    histories, variances = vehicles(rows, results, options.false_alarms)
-    ordered = [row for vehicle in histories for row in vehicle.rows]
-    return _written(Fleet(ordered, histories, np.sqrt(variances)), options, facts or {}, notes)
+        return [journal.done[job.key] for job in jobs], list(journal.notes)
+
+
+def exit_code_of(verdicts: Sequence[str]) -> int:
+    """0 all pass, 1 any fails, 3 none fails and any is inconclusive or could not be checked, 2 none could be checked."""
+    found = set(verdicts)
+    if found <= {ERROR}:
+        return 2
+    if CheckVerdict.FAIL.value in found:
+        return 1
+    return 0 if found == {CheckVerdict.PASS.value} else 3
 
 
 def _written(fleet: Fleet, options: FleetOptions, facts: Mapping[str, str], notes: list[str]) -> Fleet:

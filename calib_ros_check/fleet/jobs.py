@@ -10,10 +10,11 @@ import resource
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from calib_ros.config import SemanticsConfig
+from calib_ros.datasets.nuscenes import split_scene
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
 from calib_ros.rig.description import read_rig
@@ -27,16 +28,24 @@ INPUT, OTHER = "input", "other"
 
 @dataclass(frozen=True)
 class CheckJob:
-    """path: the recording. fingerprint: of its files. options: of the check, see `options_key`."""
+    """path: the recording. fingerprint: of its files. options: of the check, see `options_key`. camera, frames: instead of those
+    of the options, where they differ between recordings."""
 
     path: str
     fingerprint: str
     options: str
+    camera: str = ""
+    frames: str = ""
 
     @property
     def key(self) -> str:
         """Other for a recording that has changed, and for other options."""
-        return f"{self.path}|{self.fingerprint}|{self.options}"
+        own = f"|{self.camera}|{self.frames}" if self.camera or self.frames else ""
+        return f"{self.path}|{self.fingerprint}|{self.options}{own}"
+
+    def of(self, options: CheckOptions) -> CheckOptions:
+        """Options with what is the job's own."""
+        return replace(options, camera=self.camera or options.camera, frames=self.frames or options.frames)
 
 
 def _weights(config: SemanticsConfig) -> list[str | None]:
@@ -74,7 +83,7 @@ def run_checks(options: CheckOptions, jobs: Sequence[CheckJob]) -> list[Answer]:
 
     Raises MissingDependencyError and ImportError only: no recording would fare better.
     """
-    return [_checked(job, options) for job in jobs]
+    return [_checked(job, job.of(options)) for job in jobs]
 
 
 def lost(jobs: Sequence[CheckJob], how: str) -> list[Answer]:
@@ -92,7 +101,7 @@ def _checked(job: CheckJob, options: CheckOptions) -> Answer:
     except (MissingDependencyError, ImportError):
         raise
     except CalibrationError as error:
-        if job.fingerprint and not Path(job.path).exists():
+        if job.fingerprint and not Path(split_scene(job.path)[0]).exists():
             answer = {"error": f"{job.path} is not there on {socket.gethostname()}; mount it on all workers", "from": OTHER}
         else:
             answer = {"error": str(error), "from": INPUT}

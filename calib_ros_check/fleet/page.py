@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 # A browser sorts a few thousand rows at once, and draws some hundred plots; the rest is in the CSV file.
 MOST_ROWS, MOST_VEHICLES = 3000, 60
 TOLD = 3.0  # standard deviations from which an axis of a change is named
-TEMPLATE = """\
-{% block style %}
+# Colours of verdicts, tiles and plots.
+STYLE = """\
 :root { --pass: #1d7a3a; --fail: #b3261e; --inconclusive: #8a6d00; --error: #6b4fa0; }
 @media (prefers-color-scheme: dark) { :root { --pass: #5cc27c; --fail: #ff8a80; --inconclusive: #e0bd3c; --error: #b9a1ea; } }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(8.5rem, 1fr)); gap: .8rem; margin: 0 0 1.2rem; }
@@ -35,6 +35,47 @@ TEMPLATE = """\
 .tile.changed { border-left-color: var(--accent); }
 .verdict-pass { color: var(--pass); } .verdict-fail { color: var(--fail); font-weight: 700; }
 .verdict-inconclusive { color: var(--inconclusive); } .verdict-error { color: var(--error); font-weight: 700; }
+.plots { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 21rem), 1fr)); gap: .3rem; padding: .5rem; }
+.plots svg { display: block; width: 100%; height: auto; }
+.plots text { font: 11px system-ui, sans-serif; fill: var(--soft); }
+.plots .axis { font-weight: 700; fill: var(--ink); }
+.plots .grid-line { stroke: var(--line); } .plots .mean { stroke: var(--accent); stroke-width: 1.5; }
+.plots .change { stroke: var(--fail); stroke-dasharray: 4 3; stroke-width: 1.5; }
+.point { stroke: currentColor; fill: currentColor; } .point.outlier circle { fill: var(--card); stroke-width: 1.5; }
+"""
+PLOT_SIZE = {"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": WIDTH - RIGHT, "top": TOP}
+# Of a `vehicle`, its `figures` and `plot`, PLOT_SIZE.
+PLOTS = """\
+<div class="plots">
+{% for own in figures %}
+<svg viewBox="0 0 {{ plot.width }} {{ plot.height }}" role="img" aria-label="{{ own.axis }} of {{ vehicle.name }} over time">
+<text class="axis" x="{{ plot.left }}" y="12">{{ own.axis }}, {{ own.unit }}</text>
+{% for y, text in own.ticks %}
+<line class="grid-line" x1="{{ plot.left }}" x2="{{ plot.right }}" y1="{{ y }}" y2="{{ y }}"/>
+<text x="{{ plot.left - 4 }}" y="{{ y + 4 }}" text-anchor="end">{{ text }}</text>
+{% endfor %}
+{% for x in own.changes %}
+<line class="change" x1="{{ x }}" x2="{{ x }}" y1="{{ plot.top }}" y2="{{ plot.height - 18 }}"/>
+{% endfor %}
+{% for a, b, y in own.means %}<line class="mean" x1="{{ a }}" x2="{{ b }}" y1="{{ y }}" y2="{{ y }}"/>{% endfor %}
+{% for p in own.points %}
+<g class="point verdict-{{ p.verdict }}{{ ' outlier' if p.outlier }}"><title>{{ p.title }}</title>
+<line x1="{{ p.x }}" x2="{{ p.x }}" y1="{{ p.low }}" y2="{{ p.high }}"/><circle cx="{{ p.x }}" cy="{{ p.y }}" r="2.6"/></g>
+{% endfor %}
+{% if vehicle.known[0].time %}
+<text x="{{ plot.left }}" y="{{ plot.height - 4 }}">{{ vehicle.known[0].time[:10] }}</text>
+<text x="{{ plot.right }}" y="{{ plot.height - 4 }}" text-anchor="end">{{ vehicle.known[-1].time[:10] }}</text>
+{% endif %}
+</svg>
+{% endfor %}
+</div>
+"""
+TEMPLATE = (
+    """\
+{% block style %}
+"""
+    + STYLE
+    + """\
 .sheet { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
 .sheet .scroll { padding: 0 .9rem .8rem; max-height: 80vh; overflow: auto; }
 .sheet th { position: sticky; top: 0; background: var(--card); z-index: 1; padding-top: .6rem; }
@@ -44,13 +85,6 @@ td.words { white-space: normal; min-width: 80rem; } td.number { text-align: righ
 #recordings td.name { max-width: 12rem; overflow: hidden; text-overflow: ellipsis; }
 th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid var(--accent); }
 th[aria-sort=ascending] button::after { content: " ▲"; } th[aria-sort=descending] button::after { content: " ▼"; }
-.plots { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 21rem), 1fr)); gap: .3rem; padding: .5rem; }
-.plots svg { display: block; width: 100%; height: auto; }
-.plots text { font: 11px system-ui, sans-serif; fill: var(--soft); }
-.plots .axis { font-weight: 700; fill: var(--ink); }
-.plots .grid-line { stroke: var(--line); } .plots .mean { stroke: var(--accent); stroke-width: 1.5; }
-.plots .change { stroke: var(--fail); stroke-dasharray: 4 3; stroke-width: 1.5; }
-.point { stroke: currentColor; fill: currentColor; } .point.outlier circle { fill: var(--card); stroke-width: 1.5; }
 .more { color: var(--soft); }
 @media (max-width: 600px) { #recordings td.name { max-width: 7.5rem; } }
 nav { display: none; }
@@ -108,29 +142,9 @@ blue the mean between changes; a dashed line where it changed. Hollow: outliers.
 <figcaption><b>{{ vehicle.name }}</b>{{ vehicle.rows|length }} recordings, {{ vehicle.known|length }} with an estimate;
 {{ vehicle.changes|length or "no" }} change{{ "s" if vehicle.changes|length != 1 }}</figcaption>
 {% if figures %}
-<div class="plots">
-{% for own in figures %}
-<svg viewBox="0 0 {{ plot.width }} {{ plot.height }}" role="img" aria-label="{{ own.axis }} of {{ vehicle.name }} over time">
-<text class="axis" x="{{ plot.left }}" y="12">{{ own.axis }}, {{ own.unit }}</text>
-{% for y, text in own.ticks %}
-<line class="grid-line" x1="{{ plot.left }}" x2="{{ plot.right }}" y1="{{ y }}" y2="{{ y }}"/>
-<text x="{{ plot.left - 4 }}" y="{{ y + 4 }}" text-anchor="end">{{ text }}</text>
-{% endfor %}
-{% for x in own.changes %}
-<line class="change" x1="{{ x }}" x2="{{ x }}" y1="{{ plot.top }}" y2="{{ plot.height - 18 }}"/>
-{% endfor %}
-{% for a, b, y in own.means %}<line class="mean" x1="{{ a }}" x2="{{ b }}" y1="{{ y }}" y2="{{ y }}"/>{% endfor %}
-{% for p in own.points %}
-<g class="point verdict-{{ p.verdict }}{{ ' outlier' if p.outlier }}"><title>{{ p.title }}</title>
-<line x1="{{ p.x }}" x2="{{ p.x }}" y1="{{ p.low }}" y2="{{ p.high }}"/><circle cx="{{ p.x }}" cy="{{ p.y }}" r="2.6"/></g>
-{% endfor %}
-{% if vehicle.known[0].time %}
-<text x="{{ plot.left }}" y="{{ plot.height - 4 }}">{{ vehicle.known[0].time[:10] }}</text>
-<text x="{{ plot.right }}" y="{{ plot.height - 4 }}" text-anchor="end">{{ vehicle.known[-1].time[:10] }}</text>
-{% endif %}
-</svg>
-{% endfor %}
-</div>
+"""
+    + PLOTS
+    + """\
 {% endif %}
 </figure>
 {% endfor %}
@@ -157,6 +171,7 @@ document.querySelectorAll("#recordings th").forEach((head, column) => head.addEv
 </script>
 {% endblock %}
 """
+)
 
 
 def write_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[str, str]) -> None:
@@ -179,7 +194,7 @@ def write_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[s
         left_out=len(rows) - len(listed),
         vehicles=[(own, plots(own, fleet.scatter**2)) for own in shown[:MOST_VEHICLES]],
         vehicles_left_out=len(shown[MOST_VEHICLES:]),
-        plot={"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": WIDTH - RIGHT, "top": TOP},
+        plot=PLOT_SIZE,
     )
     write_atomically(path, page.encode("utf-8", "backslashreplace"))
 

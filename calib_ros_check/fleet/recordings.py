@@ -11,7 +11,7 @@ from pathlib import Path
 
 from calib_ros.datasets.capture import is_capture
 from calib_ros.datasets.folder import is_folder_dataset
-from calib_ros.datasets.kitti import drives_in
+from calib_ros.datasets.kitti import drives_in, is_drive
 from calib_ros.datasets.once import is_once
 from calib_ros.datasets.open import is_nuscenes, is_single
 from calib_ros.errors import BadInputError
@@ -78,11 +78,11 @@ def _found_in(source: str) -> list[str]:
     if not path.is_dir() or is_nuscenes(path):
         return [str(path.resolve()) if path.exists() and "#" not in source else source]
     found: list[Path] = []
-    _look(path.resolve(), set(drives_in(path.resolve())), found, set())
+    _look(path.resolve(), found, set())
     return [str(one) for one in sorted(found)]
 
 
-def _look(folder: Path, drives: set[Path], found: list[Path], seen: set[str]) -> None:
+def _look(folder: Path, found: list[Path], seen: set[str]) -> None:
     """Add the recordings at and below a folder; links are followed, each folder once."""
     real = os.path.realpath(folder)
     if real in seen:
@@ -99,12 +99,12 @@ def _look(folder: Path, drives: set[Path], found: list[Path], seen: set[str]) ->
     named = len(stores) == 1 and stores[0].stem.startswith(folder.name)
     whole = (folder / "metadata.yaml").exists() or named
     single = is_capture(folder) or is_folder_dataset(folder) or is_nuscenes(folder) or is_once(folder)
-    if not children or whole or folder in drives or single:
+    if not children or whole or is_drive(folder) or single:
         found.append(folder)
         return
     found += [*stores, *(child for child in children if child.suffix in OTHERS and child.is_file())]
     for child in folders:
-        _look(child, drives, found, seen)
+        _look(child, found, seen)
 
 
 def _with_files(path: str) -> Recording:

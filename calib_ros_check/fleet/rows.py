@@ -111,7 +111,7 @@ def utc(time_ns: int) -> str:
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """One line per recording, with a header; empty where nothing is known."""
-    _write(path, list(COLUMNS), [row.values().values() for row in rows])
+    write_table(path, list(COLUMNS), [row.values().values() for row in rows])
 
 
 def write_changes(path: Path, changes: Sequence[VehicleChange]) -> None:
@@ -123,7 +123,7 @@ def write_changes(path: Path, changes: Sequence[VehicleChange]) -> None:
         places = [own.vehicle, own.before.recording, own.before.time, own.after.recording, own.after.time, own.confirmed]
         value = np.r_[np.rad2deg(own.value[:3]), own.value[3:]]
         lines.append([*places, own.rotation_deg, own.translation_m, *value.tolist(), *own.sigma.tolist()])
-    _write(path, [*header, *names, *(f"{name}_sigma" for name in names)], lines)
+    write_table(path, [*header, *names, *(f"{name}_sigma" for name in names)], lines)
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
@@ -155,7 +155,8 @@ def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _write(path: Path, header: list[str], lines: Iterable[Iterable[Any]]) -> None:
+def write_table(path: Path, header: list[str], lines: Iterable[Iterable[Any]]) -> None:
+    """As CSV, atomically; None is empty."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(header)

@@ -74,7 +74,7 @@ def write_page(path: str | Path, found: RigCheck, config: Config) -> None:
             ("Loops", ["sensors", "closes", "rotation", "translation"], loops),
         ],
         pictures=[
-            (f"{p.target} with {p.source}", picture_of(p.frame, p.check, config))
+            (f"{p.target} with {p.source}", picture_of(p.frame, p.check.T_checked, p.check.T_estimated, config))
             for p in found.pairs
             if p.frame is not None and p.check is not None
         ],

@@ -1,0 +1,1 @@
+"""Certificates of data sets: is every calibration that comes with one right?"""
