@@ -30,9 +30,13 @@ TOOL = module_at(ROOT / "tools/notebooks.py")
 QUICK = {"api", "tutorial"}  # pages that `make test` runs
 # What a block that is not run may say, what each of its commands then looks like, and how many such blocks there may be.
 NOT_RUN = {
-    "needs a ROS install": (r"ros2 |colcon |rosdep |export FAST\w+=\$\(ros2 |git clone |cd |ln -s |pip install |\. install/", 12),
+    "needs a ROS install": (
+        r"ros2 |colcon |rosdep |export FAST\w+=\$\(ros2 |git clone |cd |ln -s |pip install |python3 -m venv |\. install/"
+        "|cp -r |bloom-generate |DEB_BUILD_OPTIONS=",
+        13,
+    ),
     "serves until Ctrl-C": (r"calib-ros view |pip install ", 3),
-    "needs nuScenes": (r".*nuscenes", 1),
+    "needs a data set": (r".*nuscenes|calib-ros certify /data/", 2),
     "needs a longer recording": (r"calib-ros calibrate \w+ --initial motion", 1),
     "takes minutes": (r"make (demo|test)$|calib-ros (rig|evaluate|check \S+ --rig|convert \S+rig=two_lidars)", 8),
     "needs a Dask cluster": (r".* --scheduler ", 1),
