@@ -26,6 +26,7 @@ def options_of(args: argparse.Namespace) -> CheckOptions:
         args.incomplete,
         configuration(args.config),
         args.rig or "",
+        args.rectified,
     )
 
 

@@ -31,8 +31,8 @@ class CheckOptions:
     """How recordings are checked.
 
     extrinsic: ``reference``, what the source says; ``tf``, the static transforms of a bag; or a result file. frames: positions as
-    `frame_positions` has them; "" = FRAMES, evenly spread. camera, topics and clock: as `open_dataset`. config: the default is
-    the node's own for what the node has captured. rig: a description of several sensors, "" = one camera and one LiDAR; extrinsic
+    `frame_positions` has them; "" = FRAMES, evenly spread. camera, topics, clock and rectified: as `open_dataset`. config: the
+    default is the node's own for what the node has captured. rig: a description of several sensors, "" = one pair; extrinsic
     may be a result of `calib-ros rig` then.
     """
 
@@ -47,6 +47,7 @@ class CheckOptions:
     incomplete: bool = False
     config: Config = field(default_factory=Config)
     rig: str = ""
+    rectified: bool | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +118,7 @@ def opened(path: str, options: CheckOptions) -> Source:
     """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
     names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     given: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name)}
+    given |= {} if options.rectified is None else {"rectified": options.rectified}
     captured = is_capture(Path(path).expanduser())
     if captured or is_bag(Path(path).expanduser()):
         given |= {"motion": options.config.motion, "tolerance_s": options.config.online.pair_tolerance_s}

@@ -184,4 +184,5 @@ def _steps_command(args: argparse.Namespace) -> str:
         value = getattr(args, option)
         command += [f"--{option.replace('_', '-')}", value] if value else []
     command += ["--incomplete"] if args.incomplete else []
+    command += [] if args.rectified is None else ["--rectified" if args.rectified else "--no-rectified"]
     return shlex.join(command + (["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else []))

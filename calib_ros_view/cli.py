@@ -32,10 +32,10 @@ FRAMES = 10  # of a source, unless said otherwise
 OUT = "extrinsic.json"
 TITLE = "calib-ros view"
 PAIR = "/pair/{camera}/{lidar}"  # of a rig
-OF_ONE_PAIR = ("yaw_deg", "camera", "image_topic", "points_topic", "camera_info_topic")
+OF_ONE_PAIR = ("yaw_deg", "camera", "image_topic", "points_topic", "camera_info_topic", "rectified")
 OF_SOURCES = (
     *("source", "rig", "initial", "yaw_deg", "config", "frames", "out"),
-    *("camera", "image_topic", "points_topic", "camera_info_topic", "clock", "incomplete"),
+    *("camera", "image_topic", "points_topic", "camera_info_topic", "rectified", "clock", "incomplete"),
 )
 
 

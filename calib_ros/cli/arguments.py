@@ -192,6 +192,11 @@ def add_camera_and_topics(command: argparse.ArgumentParser) -> None:
     command.add_argument("--camera", help="KITTI: 0-3 (default 2); nuScenes, folder: name or number (CAM_FRONT, the first)")
     for topic in ("image", "points", "camera-info"):
         command.add_argument(f"--{topic}-topic", help="topic of a bag that holds several of the kind")
+    command.add_argument(
+        "--rectified",
+        action=argparse.BooleanOptionalAction,
+        help="images of a bag are rectified: P of CameraInfo is their camera; by default if the topic says so (image_rect)",
+    )
     command.add_argument("--incomplete", action="store_true", help="use what is left of a bag of which parts are missing")
     command.add_argument(
         "--clock",

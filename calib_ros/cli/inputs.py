@@ -167,9 +167,10 @@ def open_named_source(args: argparse.Namespace, config: Config | None = None) ->
 
 
 def bag_options(args: argparse.Namespace) -> dict[str, Any]:
-    """What the command line says of a bag: its topics, clock, and whether parts may be missing."""
+    """What the command line says of a bag: its topics, clock, whether images are rectified and parts may be missing."""
     names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
-    return {name: getattr(args, name) for name in names if getattr(args, name)}
+    given = {name: getattr(args, name) for name in names if getattr(args, name)}
+    return given if args.rectified is None else given | {"rectified": args.rectified}
 
 
 def constraint_options(args: argparse.Namespace) -> ConstraintOptions:

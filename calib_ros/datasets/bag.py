@@ -51,6 +51,7 @@ HALF_WIDTHS = (2.0, 6.0)
 # Where in its slot a window is looked for: in the middle, and elsewhere if no frame is there, as in an interruption.
 PLACES = (0.5, 0.2, 0.8)
 ENOUGH = 0.5  # share of the slots that must have a frame
+RECTIFIED = ", of rectified images by P of CameraInfo (--no-rectified if they are raw)"
 WORTHWHILE = 0.6  # share of the recording above which the whole of it is read instead
 
 
@@ -280,7 +281,7 @@ class BagSource:
             + (f"; {self.windows} windows of the recording" if self.windows else ""),
             "stamps": self._stamps_in_words(),
             "pairing": f"scans sweep the view {self._sweep_offset / 1e6:+.0f} ms from their stamps",
-            "camera": describe_camera(self.camera) + (" (rectified images)" if self.rectified else ""),
+            "camera": describe_camera(self.camera) + (RECTIFIED if self.rectified else ""),
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,
             "reference": "none" if self.reference is None else "from /tf_static",

@@ -17,6 +17,7 @@ from rosbags.typesys import get_types_from_msg
 from sample_sources import Listed
 
 from calib_ros.camera import Camera
+from calib_ros.cli.main import main
 from calib_ros.config import MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
@@ -27,6 +28,8 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.se3 import exp, inverse
+from calib_ros_check.recording import CheckOptions
+from calib_ros_check.recording import opened as opened_by_check
 
 # --- round trip -----------------------------------------------------------------------------------------------------------
 
@@ -417,6 +420,19 @@ def test_rectified_images_use_the_projection_matrix(tmp_path):
     assert bag.camera.is_pinhole
     assert "rectified" in bag.describe()["camera"]
     assert not BagSource(tmp_path / "bag", rectified=False).camera.is_pinhole
+
+
+def test_the_command_line_says_that_images_are_raw_whatever_their_topic_is_called(tmp_path, capsys):
+    with Recorder(tmp_path / "bag") as record:
+        record.image(START, topic="/cam/image_rect")
+        record.info(START)
+        record.cloud(START)
+    assert main(["info", str(tmp_path / "bag")]) == 0
+    assert "--no-rectified" in capsys.readouterr().out
+    assert main(["info", str(tmp_path / "bag"), "--no-rectified"]) == 0
+    assert "rectified" not in capsys.readouterr().out
+    raw = opened_by_check(str(tmp_path / "bag"), CheckOptions(rectified=False))
+    assert not raw.camera.is_pinhole
 
 
 @pytest.mark.parametrize("separate", [False, True])
