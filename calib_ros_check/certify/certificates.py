@@ -13,13 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
-from calib_ros_check.certify.claims import Claim, find_claims
-from calib_ros_check.fleet.fleet import FleetOptions, Progress, answers_of, exit_code_of
-from calib_ros_check.fleet.history import Vehicle, VehicleChange, vehicles
-from calib_ros_check.fleet.jobs import CheckJob, options_key
-from calib_ros_check.fleet.rows import ERROR, ERRORS, VERDICTS, Row, row_of, write_changes, write_csv, write_table
+from calib_ros_check.certify.claims import Claim
+from calib_ros_check.fleet.fleet import exit_code_of
+from calib_ros_check.fleet.history import Vehicle, VehicleChange
+from calib_ros_check.fleet.rows import ERROR, ERRORS, VERDICTS, Row
 from calib_ros_check.outcome import CheckVerdict, Deviation, Tolerance
-from calib_ros_check.recording import FRAMES
 from calib_ros_check.tolerance import Judgement, judge, reason_of, unknown
 
 CSV, RECORDINGS, CHANGES, PAGE = "certificates.csv", "recordings.csv", "changes.csv", "certificates.html"
@@ -94,45 +92,7 @@ class Certified:
         return exit_code_of([own.verdict for own in self.certificates])
 
 
-def certify(
-    options: FleetOptions,
-    frames: int = FRAMES,
-    facts: Mapping[str, str] | None = None,
-    progress: Progress = lambda done, total: None,
-) -> Certified:
-    """Check every calibration of data sets, and write page and tables; options.vehicle_pattern is not used. frames: of each
-    calibration in a recording.
-
-    Goes on where it was interrupted, and raises, as `check_fleet`.
-    """
-    from calib_ros_check.certify.page import page_of_certificates, write_certificates
-
-    page_of_certificates()  # says what is missing before the work
-    settings = options_key(options.options)
-    claims = find_claims(options.sources, options.options, frames)
-    jobs = [CheckJob(c.recording.path, c.recording.fingerprint, settings, c.camera, c.frames) for c in claims]
-    answers, notes = answers_of(jobs, options, "certification", progress)
-    rows = [row_of(claim.recording, answer) for claim, answer in zip(claims, answers, strict=True)]
-    for row, job in zip(rows, jobs, strict=True):
-        row.path = job.key  # recordings with several cameras or calibrations have several rows
-    results: dict[str, Any] = {job.key: answer.get("result") for job, answer in zip(jobs, answers, strict=True)}
-    histories, variances = vehicles(rows, results, options.false_alarms)
-    by_key = {job.key: claim for job, claim in zip(jobs, claims, strict=True)}
-    found = [_certificate(own, results, by_key, options.options.tolerance) for own in histories]
-    found.sort(key=lambda own: (VERDICTS.index(own.verdict), own.name))
-    for row, claim in zip(rows, claims, strict=True):
-        row.path = claim.recording.path
-    out = options.out
-    header = list(found[0].values())
-    write_table(out / CSV, header, [own.values().values() for own in found])
-    write_csv(out / RECORDINGS, [row for own in found for row in own.rows])
-    write_changes(out / CHANGES, [change for own in found for change in own.changes])
-    certified = Certified(found, np.sqrt(variances), [out / name for name in (PAGE, CSV, RECORDINGS, CHANGES)], notes)
-    write_certificates(out / PAGE, certified, options, facts or {})
-    return certified
-
-
-def _certificate(own: Vehicle, results: Mapping[str, Any], claims: Mapping[str, Claim], tolerance: Tolerance) -> Certificate:
+def certificate_of(own: Vehicle, results: Mapping[str, Any], claims: Mapping[str, Claim], tolerance: Tolerance) -> Certificate:
     """A single recording speaks for itself; several by what they show together."""
     known = [row for row in own.rows if row.verdict != ERROR]
     if not known:

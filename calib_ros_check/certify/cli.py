@@ -9,7 +9,8 @@ from pathlib import Path
 from calib_ros.cli.inputs import configuration
 from calib_ros.cli.output import note, progress_bar
 from calib_ros.errors import BadInputError
-from calib_ros_check.certify.certificates import Certified, certify
+from calib_ros_check.certify.certificates import Certified
+from calib_ros_check.certify.certify import certify
 from calib_ros_check.fleet.cli import SHOWN, checked_arguments
 from calib_ros_check.fleet.fleet import FleetOptions
 from calib_ros_check.fleet.rows import VERDICTS

@@ -26,7 +26,7 @@ from calib_ros.cli.main import main
 from calib_ros.config import MotionConfig
 from calib_ros.frame import Frame
 from calib_ros.lidar.deskew import deskewed_frame
-from calib_ros_check.certify.certificates import Certificate, _certificate
+from calib_ros_check.certify.certificates import Certificate, certificate_of
 from calib_ros_check.certify.claims import Claim, find_claims
 from calib_ros_check.fleet.history import vehicles
 from calib_ros_check.fleet.rows import row_of
@@ -185,7 +185,7 @@ def certificate(errors: list[list[float]], factor: float = 6.0, shared: np.ndarr
         own["shared_covariance"] = None if shared is None else shared.tolist()
     (vehicle,), _ = vehicles(rows, results)
     claims = {row.path: Claim(recording) for row, (recording, _) in zip(rows, made, strict=True)}
-    return _certificate(vehicle, results, claims, Tolerance())
+    return certificate_of(vehicle, results, claims, Tolerance())
 
 
 def test_recordings_that_tell_too_little_each_tell_enough_together() -> None:
@@ -224,6 +224,6 @@ def test_a_calibration_without_anything_readable_is_an_error() -> None:
     recording, answer = broken("set", 0, "no such file")
     row = row_of(recording, answer)
     (vehicle,), _ = vehicles([row], {row.path: None})
-    found = _certificate(vehicle, {row.path: None}, {row.path: Claim(replace(recording))}, Tolerance())
+    found = certificate_of(vehicle, {row.path: None}, {row.path: Claim(replace(recording))}, Tolerance())
     assert (found.verdict, found.reason) == ("error", "no such file")
     assert found.values()["rotation_deg"] is None
