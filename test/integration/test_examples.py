@@ -31,8 +31,8 @@ QUICK = {"api", "tutorial"}  # pages that `make test` runs
 # What a block that is not run may say, what each of its commands then looks like, and how many such blocks there may be.
 NOT_RUN = {
     "needs a ROS install": (
-        r"ros2 |colcon |rosdep |export FAST\w+=\$\(ros2 |git clone |cd |ln -s |pip install |python3 -m venv |\. install/"
-        "|cp -r |bloom-generate |DEB_BUILD_OPTIONS=",
+        r"ros2 |colcon |rosdep |export FAST\w+=\$\(ros2 |git clone |cd |ln -s |pip install |\. install/"
+        r"|python3 -m venv |touch venv/|\. venv/|cp -r |bloom-generate |DEB_BUILD_OPTIONS=",
         13,
     ),
     "serves until Ctrl-C": (r"calib-ros view |pip install ", 3),

@@ -23,6 +23,8 @@ from calib_ros.ros.parameters import SETTINGS
 FOREIGN = (
     r"cd [\w~/.]+", r"git clone <this repository> calib_ros", r"ln -s calib_ros/calib_ros_msgs \.", r"\. install/setup\.bash",
     r"rosdep install --from-paths src --ignore-src", r"colcon build", r"ros2 lifecycle set /calib_ros (configure|activate)",
+    r"python3 -m venv --system-site-packages venv", r"touch venv/COLCON_IGNORE", r"\. venv/bin/activate",
+    r"cp -r \. /tmp/calib_ros", r"bloom-generate rosdebian( --[\w-]+ \w+)+", r"DEB_BUILD_OPTIONS=nocheck dpkg-buildpackage -b -us -uc",
     r"ros2 bag record( /[\w/]+)+( -o \w+)?", r"ros2 topic echo /diagnostics( --once)?",
 )  # fmt: skip
 
@@ -87,8 +89,9 @@ def _check_pip(what: list[str]) -> None:
     extras = set(re.findall(r'^    "(\w+)": \[', (ROOT / "setup.py").read_text(), re.MULTILINE)) | {"all"}
     pinned = (ROOT / "requirements.txt").read_text() + (ROOT / "constraints.txt").read_text()
     for name in what:
-        extra = re.fullmatch(r"\.\[(\w+)\]", name)
-        assert (extra[1] in extras) if extra else name == "." or re.search(rf"^{name}\b", pinned, re.MULTILINE), name
+        extra = re.fullmatch(r"(?:\.|calib_ros)\[(\w+)\]", name)
+        library = re.split("[<>=]", name)[0]
+        assert (extra[1] in extras) if extra else name == "." or re.search(rf"^{library}\b", pinned, re.MULTILINE), name
 
 
 def _check_launch(file: str, arguments: list[str]) -> None:
