@@ -24,7 +24,8 @@ FOREIGN = (
     r"cd [\w~/.]+", r"git clone <this repository> calib_ros", r"ln -s calib_ros/calib_ros_msgs \.", r"\. install/setup\.bash",
     r"rosdep install --from-paths src --ignore-src", r"colcon build", r"ros2 lifecycle set /calib_ros (configure|activate)",
     r"python3 -m venv --system-site-packages venv", r"touch venv/COLCON_IGNORE", r"\. venv/bin/activate",
-    r"cp -r \. /tmp/calib_ros", r"bloom-generate rosdebian( --[\w-]+ \w+)+", r"DEB_BUILD_OPTIONS=nocheck dpkg-buildpackage -b -us -uc",
+    r"cp -r \. /tmp/calib_ros", r"bloom-generate rosdebian( --[\w-]+ \w+)+",
+    r"DEB_BUILD_OPTIONS=nocheck dpkg-buildpackage -b -us -uc",
     r"ros2 bag record( /[\w/]+)+( -o \w+)?", r"ros2 topic echo /diagnostics( --once)?",
 )  # fmt: skip
 
