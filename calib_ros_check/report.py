@@ -83,6 +83,15 @@ DEVIATIONS = """\
 {% endfor %}
 </table></div></div>
 """
+# Of `pictures`: names and JPEGs.
+SHEET = """\
+<div class="grid">
+{% for name, picture in pictures %}
+<figure class="wide"><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="frame {{ name }}">
+<figcaption><b>frame {{ name }}</b></figcaption></figure>
+{% endfor %}
+</div>
+"""
 TEMPLATE = (
     f"{{% block style %}}\n{STYLE}{{% endblock %}}"
     + """
@@ -112,14 +121,9 @@ its median, and where it lies with 95 %. Green: the tolerance, {{ result.toleran
 <h2>Frames</h2>
 <p class="intro">{{ "Before: as given. After: as the scenes show it." if both else "The extrinsic as given." }}
 Points are coloured by depth, near ones warm.</p>
-<div class="grid">
-{% for name, picture in pictures %}
-<figure class="wide"><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="frame {{ name }}">
-<figcaption><b>frame {{ name }}</b></figcaption></figure>
-{% endfor %}
-</div>
-{% endblock %}
 """
+    + SHEET
+    + "{% endblock %}\n"
 )
 
 

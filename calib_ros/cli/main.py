@@ -6,6 +6,7 @@ import argparse
 import sys
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TextIO
 
 from calib_ros.cli.arguments import BAD_INPUT, parser
@@ -158,8 +159,6 @@ def _replay(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     """What is not an accepted estimate is exported with a note, since initial extrinsics are exported as well."""
-    from pathlib import Path
-
     from calib_ros.cli.output import note
     from calib_ros.export import DESCRIPTIONS, Pose, export, renamed, write_joints
     from calib_ros.io import write_atomically

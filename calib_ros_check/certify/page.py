@@ -20,7 +20,7 @@ from calib_ros_check.fleet.plot import plots
 from calib_ros_check.fleet.rows import ERROR, VERDICTS
 from calib_ros_check.page import page_template
 from calib_ros_check.recording import CheckOptions, opened, positions_of, read_frames
-from calib_ros_check.report import DEVIATIONS, deviation_rows, picture_of
+from calib_ros_check.report import DEVIATIONS, SHEET, deviation_rows, picture_of
 from calib_ros_check.report import STYLE as REPORT_STYLE
 
 MOST_SHOWN, PICTURES = 60, 2  # calibrations with pictures, the doubtful first, and pictures of each; the rest is in the CSV file
@@ -94,12 +94,9 @@ td.error { background: none; color: var(--error); font-weight: 600; }
 {% if pictures %}
 <p class="intro">{{ "Before: as it comes with the data. After: as the scenes show it." if own.T_found is not none
 else "As it comes with the data." }} Points are coloured by depth, near ones warm.</p>
-<div class="grid">
-{% for name, picture in pictures %}
-<figure class="wide"><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="frame {{ name }}">
-<figcaption><b>frame {{ name }}</b></figcaption></figure>
-{% endfor %}
-</div>
+"""
+    + SHEET
+    + """\
 {% endif %}
 {% endfor %}
 {% if left_out %}<p>{{ left_out }} more calibrations are in certificates.csv.</p>{% endif %}
