@@ -52,7 +52,10 @@ def too_far_from_start(rotation_deg: float, translation_m: float, max_rotation_d
 def low_score(score: float) -> Refusal:
     """The score is no better than that of the mean of the edge maps; NaN where there is none."""
     figure = f" (score {score:.2g})" if math.isfinite(score) else ""
-    text = f"the image shows nothing where the LiDAR sees edges{figure}; check exposure, lens, topics and time stamps"
+    text = (
+        f"the image shows nothing where the LiDAR sees edges{figure}; check exposure, lens, topics and time stamps, or widen the "
+        "search if the start may be farther off"
+    )
     return _refusal(RefusalCode.LOW_SCORE, text, score=score)
 
 
