@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from calib_ros import __version__, io, se3
-from calib_ros.arrays import Covariance, Transform
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.io import write_atomically
@@ -121,8 +121,9 @@ class Result:
     origin* : where an initial extrinsic comes from.
     shared_covariance* : (6, 6), part of `covariance` that estimates of the same sensors have in common: what the intrinsics and
         the clocks leave open.
-    clock_covariance* : (6, 6), what an offset of the clocks as large as motion.max_time_offset_s would leave open, beyond what
-        the scenes tell of it. clock_sigma_s* : standard deviation of that offset, s, as far as they tell.
+    clock_direction* : (6,), left twist of the extrinsic per second that the points are measured later, rad/s and m/s.
+    clock_sigma_s* : standard deviation, s, of an offset of the clocks that may be as large as motion.max_time_offset_s, as far as
+        the scenes tell.
     time_offset_s : of the clocks, which belongs to the extrinsic, as motion.time_offset_s: positive = points were measured later,
         or the image was exposed earlier, than stamped. time_offset_sigma_s : its standard deviation, s.
     stamping : how scans without point times are stamped, where the frames show that it is another way than configured.
@@ -155,7 +156,7 @@ class Result:
     intrinsics: Mapping[str, IntrinsicEstimate] = field(default_factory=dict)
     origin: InitialSource | None = None
     shared_covariance: Covariance | None = None
-    clock_covariance: Covariance | None = None
+    clock_direction: Matrix | None = None
     clock_sigma_s: float | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.arrays import Covariance
+from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
 from calib_ros.registration.covariance import unobservable_directions
@@ -18,6 +20,10 @@ from calib_ros.result import Result
 
 # Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
 NOTICED = SIGNIFICANT_Z + 1
+# Standard deviations by which an estimate's offset must differ to be another one than that known so far, where nothing has
+# confirmed that, and where it is known: by chance one estimate in 20 or 16,000.
+UNCONFIRMED_Z, KNOWN_Z = 2.0, 4.0
+SAME_S = 1e-3  # s; time offsets nearer than this are the same: no stamps are better
 
 
 def usable_clocks(config: Config, known: Result) -> Result:
@@ -48,6 +54,59 @@ def with_clocks_moved(features: FrameFeatures, before: MotionConfig, after: Moti
     return at_time_offset(restamped(features, before, after), after.time_offset_s - before.time_offset_s)
 
 
+class OffsetFilter:
+    """The clocks' offset over time, the seventh unknown of a PoseFilter: a constant of which every estimate tells something.
+
+    used_s: the offset that the extrinsic belongs to. It follows what is known of it in steps that count: points of all keyframes
+    move with it.
+    """
+
+    def __init__(self, used_s: float) -> None:
+        self.used_s, self._mean_s, self._information = used_s, used_s, 0.0
+
+    @property
+    def sigma_s(self) -> float | None:
+        """Standard deviation, s; None if no estimate has told."""
+        return float(self._information**-0.5) if self._information > 0 else None
+
+    def differs(self, estimate: Result, deviations: float = UNCONFIRMED_Z) -> bool:
+        """Does an estimate belong to another offset, by so many standard deviations of both, or to other stamps?"""
+        if not estimate.converged or estimate.time_offset_s is None:
+            return False
+        sigma = math.hypot(estimate.time_offset_sigma_s or 0.0, self.sigma_s or 0.0)
+        return estimate.stamping is not None or abs(estimate.time_offset_s - self.used_s) > max(deviations * sigma, SAME_S)
+
+    def restart(self, estimate: Result) -> None:
+        """Forget what was known; where the estimate tells nothing, keep it."""
+        if estimate.time_offset_s is not None:
+            self.used_s, self._mean_s, self._information = estimate.time_offset_s, estimate.time_offset_s, 0.0
+            self._add(estimate.time_offset_sigma_s, 1.0, estimate.time_offset_s)
+
+    def update(self, estimate: Result, share_new: float) -> None:
+        """Fuse an estimate of whose keyframes only a share is new."""
+        if estimate.time_offset_s is None:
+            return
+        if self._information > 0:
+            # What its own scenes tell: its standard deviation counts what was known before once more.
+            self._add(estimate.clock_sigma_s or estimate.time_offset_sigma_s, share_new, estimate.time_offset_s)
+        else:
+            self._add(estimate.time_offset_sigma_s, 1.0, estimate.time_offset_s)
+        if abs(self._mean_s - self.used_s) > SAME_S:
+            self.used_s = self._mean_s
+
+    def _add(self, sigma_s: float | None, share_new: float, seconds: float) -> None:
+        information = share_new / max(MotionConfig.time_offset_sigma_s if sigma_s is None else sigma_s, SAME_S) ** 2
+        if information > 0:
+            self._information += information
+            self._mean_s += (seconds - self._mean_s) * information / self._information
+
+
+def at_offset(estimate: Result, seconds: float) -> Transform:
+    """T_camera_lidar (4, 4) of an estimate if the clocks' offset were another one, s."""
+    T, direction, own = estimate.T_camera_lidar, estimate.clock_direction, estimate.time_offset_s
+    return T if own is None or direction is None else se3.exp(direction * (seconds - own)) @ T
+
+
 class ClockEvidence:
     """Has an accepted estimate shown that the clocks agree? If not, is one open to an offset? Estimates at rest are neither."""
 
@@ -56,17 +115,18 @@ class ClockEvidence:
 
     def add(self, estimate: Result, config: Config) -> None:
         """An accepted estimate."""
-        left, sigma, largest = estimate.clock_covariance, estimate.clock_sigma_s, config.motion.max_time_offset_s
-        if left is None or sigma is None:
+        direction, sigma, largest = estimate.clock_direction, estimate.clock_sigma_s, config.motion.max_time_offset_s
+        if direction is None or sigma is None:
             return
 
-        def leaves_open(covariance: Covariance) -> bool:
-            """Could an offset of the clocks that nobody has noticed, of this covariance (6, 6), have moved the estimate? Where
+        def leaves_open(seconds: float) -> bool:
+            """Could an offset of the clocks that nobody has noticed, of this standard deviation, have moved the estimate? Where
             the vehicle always moves alike, an offset looks like another mount."""
+            covariance = np.outer(direction, direction) * seconds**2
             return bool(unobservable_directions(covariance, config.tracker.max_sigma_deg, config.tracker.max_sigma_m))
 
-        matters = sigma > 0 and leaves_open(left * (largest / sigma) ** 2)
+        matters = sigma > 0 and leaves_open(largest)
         noticed = matters and (largest / sigma) ** 2 - 1 >= NOTICED**2  # by how much less is known of the offset in advance
-        is_open = matters and (leaves_open(left) or not noticed)
+        is_open = matters and (leaves_open(sigma) or not noticed)
         self._shown = self._shown or (matters and not is_open)
         self.open = is_open and not self._shown

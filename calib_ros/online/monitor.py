@@ -174,13 +174,18 @@ class Monitor:
         spread: Covariance,
         anchor: Transform | None = None,
         same_scene: bool = False,
+        clock_sigma_s: float | None = None,
     ) -> Assessment:
         """Test T (4, 4) of covariance `spread` (6, 6) against the keyframes it should hold for, the newest one last.
 
         To be called once per keyframe. anchor: see ObjectiveMaker.of_edges. same_scene: the newest one shows what the one before
-        it has shown.
+        it has shown. clock_sigma_s: see measure_shift.
         """
-        alone = measure_shift(calibrator, keyframes[-1:], T, spread, anchor, self._noise.scale)
+
+        def shift_of(tested: Sequence[FrameFeatures]) -> ShiftTest:
+            return measure_shift(calibrator, tested, T, spread, anchor, self._noise.scale, clock_sigma_s)
+
+        alone = shift_of(keyframes[-1:])
         if alone.conclusive:
             self._match.add(alone.z_score, alone.points, same_scene)
         self._suspects = self._suspects + 1 if self._suspects else 0
@@ -188,7 +193,7 @@ class Monitor:
         window = min(window, self.config.confirm if self._out_of_sync else FAILED_WINDOWS * WINDOW)
         newest = keyframes[-window:]
         informative = self.informative(newest, T) or newest[-1:]
-        together = alone if window == 1 else measure_shift(calibrator, informative, T, spread, anchor, self._noise.scale)
+        together = alone if window == 1 else shift_of(informative)
         if self._suspects:
             several = together.keyframes >= min(self.config.confirm, len(newest))  # not one of them, tested again and again
             return self._decide(calibrator, informative, T, together, window, several)
@@ -206,7 +211,8 @@ class Monitor:
             return Assessment(Verdict.SUSPECT, self._describe(test, count), test.p_value, count)
         if alone.conclusive and alone.significant and not same_scene:
             self._match.learn(alone.z_score, alone.points)
-            self._noise.learn(alone.squared, alone.axes, alone.freedom)
+            if clock_sigma_s is None:  # else shifts are small beside what the clocks may do
+                self._noise.learn(alone.squared, alone.axes, alone.freedom)
             self._counts.append(points_in_view(keyframes[-1], T))
         # An optimum that may be chance speaks neither against the extrinsic nor for it.
         if not (together.conclusive and together.significant) or self.in_doubt:
@@ -278,23 +284,26 @@ def measure_shift(
     spread: Covariance | None = None,
     anchor: Transform | None = None,
     scale: float = 1.0,
+    clock_sigma_s: float | None = None,
 ) -> ShiftTest:
     """Optimise from T (4, 4) on the keyframes alone: how far does the optimum lie, in units of the uncertainty?
 
     spread: covariance (6, 6) of T itself; None = T is exact. anchor: see ObjectiveMaker.of_edges. scale: of both covariances, see
-    ShiftNoise. A test of this kind finds smaller errors than the share of worse neighbours (Levinson and Thrun 2013), since it
-    uses the shape of the score and not only its order.
+    ShiftNoise. clock_sigma_s: standard deviation of the clocks' offset, None = as configured. A test of this kind finds smaller
+    errors than the share of worse neighbours (Levinson and Thrun 2013), since it uses the shape of the score and not only its
+    order.
     """
     try:
         objective = calibrator.objectives.of_edges(keyframes, T, anchor)
         X = objective.optimise(T)
         score = objective.score
         C = covariance(score, X, systematic_error=objective.systematic_error, constraints=objective.constraints)
-        C = C + clock_covariance(keyframes, T, calibrator.config.motion.time_offset_sigma_s)
+        sigma = np.sqrt(np.diag(C))  # what the scene shows; a fast vehicle's clocks do not make it poor
+        configured = calibrator.config.motion.time_offset_sigma_s
+        C = C + clock_covariance(keyframes, T, configured if clock_sigma_s is None else clock_sigma_s)
         null = null_distribution(score, T)
     except TooFewFeaturesError:
         return ShiftTest(1.0, np.zeros(6), 0.0, False)
-    sigma = np.sqrt(np.diag(C))
     shift = se3.log(X @ se3.inverse(T))
     known = np.zeros((6, 6)) if spread is None else spread
     freedom, together = REGIONS * effective_frames(score), C + known  # see noise_level: its prior makes up for the unknowns

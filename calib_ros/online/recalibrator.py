@@ -24,7 +24,7 @@ from calib_ros.online.first_guess import FirstGuess
 from calib_ros.online.glance import Glance
 from calib_ros.online.keyframe_classes import KeyframeSegmenter
 from calib_ros.online.keyframes import Batch, EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, feature_config
-from calib_ros.online.monitor import Assessment, Monitor, Verdict
+from calib_ros.online.monitor import MIN_TWIST, Assessment, Monitor, Verdict
 from calib_ros.online.pacing import LONGEST_REST_S, REST_SPACING_S, Rest, Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
@@ -109,6 +109,7 @@ class Recalibrator:
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
+        self._twists = np.full((2, 6), np.nan)  # of the keyframes in the last estimate, rad/s and m/s: the lowest and the highest
         self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
         self._test_wanted = False  # a look has struck, and the load has not allowed for a test yet
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
@@ -183,8 +184,19 @@ class Recalibrator:
         with self._lock:
             if self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < self.config.online.min_keyframes:
                 return False
-            rest_s = self.rest.estimates_s(self.config.online.rest_period_s) if self.at_rest else 0.0
-            return self.schedule.due(rest_s, self.tracker.lost or self.tracker.tentative) and self._has_enough()
+            waits = self._awaits_motion()
+            rest_s = self.config.online.rest_period_s if waits else 0.0
+            if self.at_rest:
+                rest_s = self.rest.estimates_s(self.config.online.rest_period_s)
+            return self.schedule.due(rest_s, self.tracker.lost or (self.tracker.tentative and not waits)) and self._has_enough()
+
+    def _awaits_motion(self) -> bool:
+        """With the lock held: another estimate would tell nothing new, since all new keyframes move as those in the last one."""
+        if not (self.tracker.awaits_motion and self._keyframes_fit):
+            return False
+        twists = np.array([f.twist for f in list(self.buffer)[-self.keyframes.new :] if f.twist is not None]).reshape(-1, 6)
+        lowest, highest = self._twists
+        return bool((twists >= lowest - MIN_TWIST).all() and (twists <= highest + MIN_TWIST).all())
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
@@ -313,7 +325,9 @@ class Recalibrator:
             if tested is not None:
                 keyframes.append(tested)
             T, spread, anchor = tracker.T, tracker.spread, tracker.initial.T_camera_lidar
-        assessment = self.monitor.check(self.calibrator, keyframes, T, spread, anchor, same_scene=tested is not None)
+            clock_sigma_s = tracker.clock_sigma_s
+        same_scene = tested is not None
+        assessment = self.monitor.check(self.calibrator, keyframes, T, spread, anchor, same_scene, clock_sigma_s)
         with self._lock:
             if generation != self.keyframes.generation or self._restart_monitor:
                 return
@@ -395,20 +409,22 @@ class Recalibrator:
                 newest = batch.features[-1].stamp
                 seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
                 self._estimated_at = newest
+                twists = np.array([f.twist for f in batch.features if f.twist is not None]).reshape(-1, 6)
+                self._twists = np.array([twists.min(0), twists.max(0)]) if len(twists) else np.full((2, 6), np.nan)
             accepted = self.tracker.current.accepted
             share_new = min(batch.unfused_features / max(len(batch.features), 1), 1.0)
             extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all=not self.keyframes.incomplete)
             if result.converged or result.refusal is RefusalCode.WRONG_INTRINSICS:  # where they are wrong, it is wanted most
                 self.refined_camera = result.refined_camera
             if extrinsic.accepted > accepted:
-                self._use_clocks(result)
+                self._use_clocks(extrinsic.result)
                 self.keyframes.unfused -= batch.unfused
                 self._restart_monitor = self._restart_monitor or on_request
             return extrinsic
 
-    def _use_clocks(self, estimate: Result) -> None:
-        """With the lock held: take over what an estimate has found of the clocks, so that the points of all keyframes move."""
-        before, config = self.config.motion, with_clocks(self.config, estimate)
+    def _use_clocks(self, known: Result) -> None:
+        """With the lock held: take over what is known of the clocks, so that the points of all keyframes move."""
+        before, config = self.config.motion, with_clocks(self.config, known)
         after = config.motion
         if after == before:
             return

@@ -11,7 +11,7 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import Config
 from calib_ros.config.online import MANUAL
-from calib_ros.online.clocks import ClockEvidence
+from calib_ros.online.clocks import KNOWN_Z, ClockEvidence, OffsetFilter, at_offset
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
@@ -25,7 +25,6 @@ UNSETTLING_REJECTIONS = 3  # so many in a row, and the whole box is searched aga
 # Estimates in a row that must agree with the one before, after the calibration has moved: a few keyframes of one place may share
 # a wrong optimum, and 2 did so on a KITTI junction.
 RECOVERING = 3
-SAME_S = 1e-3  # s; time offsets nearer than this are the same: no stamps are better
 # An estimate farther from a settled extrinsic, or less probable given it, is rejected: a mount that drifts does not jump.
 MAX_STEP_DEG, MAX_STEP_M = 1.0, 0.15
 GATE = 1e-4
@@ -57,7 +56,8 @@ class Tracker:
         self._estimated_at = result.data_stamp
         self.fused_keyframes = 0.0
         self._consistent_keyframes, self._agreed = 0, False  # confirmations: keyframes, and another estimate
-        self._clocks = ClockEvidence()
+        self._clocks, self._offset = ClockEvidence(), OffsetFilter(self.config.motion.time_offset_s)
+        self._offset.restart(result)
         self._objection = result.reason if self.lost else None  # of the monitor
         self.sensor_problem: SensorProblem | None = None
         self._assessment: Assessment | None = None
@@ -100,12 +100,24 @@ class Tracker:
         return self.settled and self._result.status == CONVERGED and not doubted
 
     @property
+    def awaits_motion(self) -> bool:
+        """True while it would be steady but for frames of another speed or turn."""
+        in_line = self.settled and self._result.status == CONVERGED and not (self.suspect or self.lost)
+        return in_line and self.tentative and self.missing == Confirmations(clocks=1)
+
+    @property
     def spread(self) -> Covariance:
         """Random part of the current extrinsic's covariance (6, 6), rad and m: without the systematic error of all estimates."""
         if self._accepted:
             return self.filter.spread
         saved = self._result.covariance
         return np.zeros((6, 6)) if saved is None else without_systematic_error(saved)
+
+    @property
+    def clock_sigma_s(self) -> float | None:
+        """Standard deviation of the clocks' offset, s, that the extrinsic may have absorbed while no frames have shown it; None
+        = as configured."""
+        return self.config.motion.max_time_offset_s if self.missing.clocks else None
 
     @property
     def carry_over(self) -> Result:
@@ -138,9 +150,11 @@ class Tracker:
         rest on, and replaces them.
         """
         self.filter.predict(seconds, self.config.tracker)
+        if self._offset.used_s != self.config.motion.time_offset_s:  # stated anew
+            self._offset = OffsetFilter(self.config.motion.time_offset_s)
         if self.suspect and not on_request:  # its keyframes are in question
             return self.current
-        if self._rests_on_other_clocks(estimate) and (self.tentative or on_request):
+        if self._offset.differs(estimate) and (self.tentative or on_request):
             self._start_anew()
         why = self._objection_to(estimate, on_request)
         if why:
@@ -148,12 +162,6 @@ class Tracker:
         else:
             self._accept(estimate, share_new, on_request, covers_all)
         return self._published()
-
-    def _rests_on_other_clocks(self, estimate: Result) -> bool:
-        """Does an estimate belong to another time offset than the extrinsic so far, by more than both are known to?"""
-        before, now, known = self.config.motion.time_offset_s, estimate.time_offset_s, self._result.time_offset_sigma_s
-        sigma = math.hypot(estimate.time_offset_sigma_s or 0.0, known or 0.0)
-        return estimate.converged and now is not None and abs(now - before) > max(2 * sigma, SAME_S)
 
     def _start_anew(self) -> None:
         """The extrinsic so far rests on a wrong time offset, and nothing has confirmed it: the next estimate is the first one."""
@@ -200,17 +208,19 @@ class Tracker:
     def _too_far(self, estimate: Result) -> str:
         """Why an estimate is farther from the current extrinsic than the process noise allows for; "" if it is not."""
         (deg, m), covariance = self._innovation_of(estimate), estimate.covariance
+        T = at_offset(estimate, self._offset.used_s)
         away, kept = f"{deg:.2f} deg / {100 * m:.0f} cm away", "kept until more keyframes confirm it"
         if deg > MAX_STEP_DEG or m > MAX_STEP_M:
             limits = f"{MAX_STEP_DEG:g} deg / {100 * MAX_STEP_M:g} cm"
             return f"the estimate is {away} from the current extrinsic, beyond {limits}: {kept}"
-        if covariance is not None and self.filter.probability(estimate.T_camera_lidar, covariance) < GATE:
+        if covariance is not None and self.filter.probability(T, covariance) < GATE:
             return f"the estimate does not fit the current extrinsic ({away}, far beyond the uncertainty of both): {kept}"
         return ""
 
     def _innovation_of(self, estimate: Result) -> tuple[float, float]:
-        """Angle, deg, and distance, m, of an estimate from the current extrinsic."""
-        T = estimate.T_camera_lidar
+        """Angle, deg, and distance, m, of an estimate from the current extrinsic, both at the same offset of the clocks: that one
+        estimate takes for a late image what another takes for a shift is no movement."""
+        T = at_offset(estimate, self._offset.used_s)
         return se3.rotation_error_deg(self.T, T), se3.translation_error_m(self.T, T)
 
     def _reject(self, estimate: Result, why: str) -> None:
@@ -248,7 +258,7 @@ class Tracker:
             # Rejected estimates have opened the search, and it ended elsewhere: one estimate is not enough to believe that.
             self._change(TrackerEvent.MOVED)
             self._accepted_since_moved, self._search_start = 0, before
-        restart = not self.settled or covers_all or self._rests_on_other_clocks(estimate)
+        restart = not self.settled or covers_all or self._offset.differs(estimate, KNOWN_Z)
         self._fuse(estimate, share_new, restart)
         self._agreeing_in_a_row = self._agreeing_in_a_row + 1 if agrees else 0
         if self.lost and (self._agreeing_in_a_row >= RECOVERING or on_request):
@@ -315,15 +325,21 @@ class Tracker:
 
     def _fuse(self, estimate: Result, share_new: float, restart: bool) -> None:
         """Update the filter. restart: from a box in which any pose is as likely, instead of from earlier estimates."""
-        T = self.T
+        T, offset, before = self.T, self._offset, self._offset.used_s
+        if restart:
+            offset.restart(estimate)
+        else:
+            offset.update(estimate, share_new)
         if estimate.covariance is None:
             self.filter = PoseFilter(estimate.T_camera_lidar, self._box_covariance())
             return
         if restart:
             self.filter, share_new, self.fused_keyframes = PoseFilter(T, self._box_covariance()), 1.0, 0.0
+        elif estimate.clock_direction is not None:
+            self.filter.T = se3.exp(estimate.clock_direction * (offset.used_s - before)) @ self.filter.T
         self.fused_keyframes += share_new * estimate.frames_used
         shared = np.zeros((6, 6)) if estimate.shared_covariance is None else estimate.shared_covariance
-        self.filter.update(estimate.T_camera_lidar, estimate.covariance - shared, share_new)
+        self.filter.update(at_offset(estimate, offset.used_s), estimate.covariance - shared, share_new)
         # Both are within the limits; the pose between them on SE(3) may be a hair outside.
         limits = pose_constraints(self.initial.T_camera_lidar, self.config.constraints, 1).limits
         self.filter.T = limits.clip(self.filter.T)
@@ -336,12 +352,11 @@ class Tracker:
             covariance = covariance + estimate.shared_covariance
         hidden = f"the scenes do not show {', '.join(map(str, weak))} well; drive on" if weak else ""
         reason = "; ".join(filter(None, [hidden, estimate.reason]))
-        # What these frames do not show of the clocks earlier ones may.
-        clocks = estimate if estimate.time_offset_s is not None else self._result
+        known = self._offset.sigma_s
         return replace(
             estimate,
-            time_offset_s=clocks.time_offset_s,
-            time_offset_sigma_s=clocks.time_offset_sigma_s,
+            time_offset_s=None if known is None else self._offset.used_s,
+            time_offset_sigma_s=known,
             stamping=estimate.stamping or self._result.stamping,
             T_camera_lidar=self.filter.T,
             covariance=None if estimate.covariance is None else covariance,

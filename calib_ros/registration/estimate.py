@@ -133,7 +133,7 @@ class Estimate:
             intrinsics={e.parameter.name: _intrinsic(e) for e in self.intrinsics},
             covariance=None if refusal else self.pose.covariance + nuisance.covariance,
             shared_covariance=None if refusal else nuisance.covariance,
-            clock_covariance=None if refusal or clocks is None else clocks.covariance(largest_s),
+            clock_direction=None if refusal or clocks is None else clocks.direction,
             clock_sigma_s=None if refusal or clocks is None else clocks.sigma(largest_s),
             time_offset_s=None if known is None else motion.time_offset_s + known.seconds,
             time_offset_sigma_s=None if known is None else known.clocks(motion)[0],

@@ -11,7 +11,7 @@ from paths import ROOT
 JUDGES = (
     *("calib_ros/registration/acceptance/*.py", "calib_ros/registration/nuisance/*.py", "calib_ros/registration/covariance.py"),
     *("calib_ros/registration/estimate.py", "calib_ros_check/*.py", "benchmarks/compare.py"),
-    *(f"calib_ros/online/{name}.py" for name in ("evidence", "monitor", "glance", "tracker")),
+    *(f"calib_ros/online/{name}.py" for name in ("evidence", "monitor", "glance", "tracker", "clocks")),
 )
 OF_PAGES = {"report", "page", "cli", "commands"}
 TABLE = ROOT / "docs" / "figures" / "constants.csv"

@@ -124,6 +124,51 @@ def test_offsets_that_differ_by_their_noise_are_the_same_clocks():
     assert tracked(*(estimate(0.0, 0.001 * (k % 2)) for k in range(6)), confirmations=0).settled
 
 
+AHEAD_M_S = 4.0  # how fast the points that are measured later move the extrinsic back
+
+
+def alike(x: float, offset: float, sigma: float = 0.016) -> Result:
+    """An estimate where all frames move at one speed: the extrinsic could be elsewhere with other clocks."""
+    T, direction = np.eye(4), np.array([0.0, 0.0, 0.0, -AHEAD_M_S, 0.0, 0.0])
+    T[0, 3] = x - AHEAD_M_S * offset
+    clocks = {"time_offset_s": offset, "time_offset_sigma_s": sigma, "clock_sigma_s": sigma, "clock_direction": direction}
+    spread, shared = np.diag([1e-5] * 3 + [1e-4] * 3), np.zeros((6, 6))
+    shared[3, 3] = (AHEAD_M_S * sigma) ** 2
+    return Result(T, CONVERGED, covariance=spread + shared, shared_covariance=shared, frames_used=5, **clocks)
+
+
+def followed(tracker: Tracker, *estimates: Result, share_new: float = 0.2) -> Tracker:
+    for new in estimates:
+        known = tracker.update(new, share_new).result
+        tracker.config = update(tracker.config, {"motion": {"time_offset_s": known.time_offset_s}})
+    return tracker
+
+
+@pytest.mark.parametrize("before", [2, 5])  # the second agrees with the first; an estimate over new keyframes alone is searched
+def test_what_one_estimate_takes_for_a_late_image_and_another_for_a_shift_is_no_movement(before):
+    tracker = followed(tracked(confirmations=0), *[alike(0.0, 0.0)] * before)
+    for offset in (-0.039, 0.0, -0.026, 0.03) * 3:  # 16 cm from one to the next
+        followed(tracker, alike(0.01, offset))
+        known = tracker.current.result
+        assert (known.status, tracker.settled) == (CONVERGED, True)
+        at_none = known.T_camera_lidar[0, 3] + AHEAD_M_S * known.time_offset_s
+        assert at_none == pytest.approx(0.0, abs=0.012)
+        assert abs(known.time_offset_s) < 0.016
+    assert known.time_offset_sigma_s < 0.01  # each of them has told something
+    followed(tracker, alike(0.6, 0.0))  # another mount moves at any clock
+    assert not tracker.current.result.converged
+
+
+def test_an_offset_that_estimates_agree_on_is_followed_with_the_extrinsic():
+    tracker = followed(tracked(confirmations=0), *[alike(0.0, 0.0)] * 2)
+    followed(tracker, *[alike(0.0, -0.02, 0.011)] * 40)
+    known = tracker.current.result
+    assert known.time_offset_s == pytest.approx(-0.02, abs=0.003)
+    assert known.T_camera_lidar[0, 3] == pytest.approx(-AHEAD_M_S * known.time_offset_s, abs=1e-6)
+    tracker.update(alike(0.0, 0.05, 0.002))  # clearly other clocks
+    assert tracker.current.result.time_offset_s == 0.05
+
+
 def test_a_driver_that_stamps_at_the_other_end_of_the_scan(scene):
     period = 0.1
     result = recalibrated(scene, late_s=-period).current.result

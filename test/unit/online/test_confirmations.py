@@ -80,7 +80,7 @@ def test_a_confirmed_saved_extrinsic_stays_usable_on_an_empty_road():
 
 def clocks(left_m: float, sigma_s: float) -> dict[str, object]:
     """What clocks that are known to sigma_s leave open of an estimate: a shift along the view."""
-    return {"clock_covariance": np.diag([0, 0, 0, 0, 0, left_m**2]), "clock_sigma_s": sigma_s}
+    return {"clock_direction": np.array([0, 0, 0, 0, 0, left_m / sigma_s]), "clock_sigma_s": sigma_s}
 
 
 STANDING, ALIKE, SLOWING_DOWN = clocks(0.0, 0.05), clocks(0.2, 0.05), clocks(0.02, 0.005)

@@ -287,3 +287,21 @@ def test_what_the_clocks_leave_open_in_a_bend_is_no_movement(scene):
     )
     assert measure_shift(exact, bend, late).p_value < 1e-3
     assert measure_shift(scattering, bend, late).p_value > 0.05
+
+
+def test_while_no_frames_have_shown_the_clocks_a_shift_along_the_way_is_no_movement(scene):
+    """An extrinsic that has absorbed 30 ms at 8 m/s, and the vehicle stops."""
+    ahead = np.array([0.0, 0.0, 0.0, 8.0, 0.0, 0.0])
+    off, turned = scene.truth @ se3.exp(0.03 * ahead), scene.off(DISPLACEMENT)
+    driving = [replace(f, twist=ahead) for f in scene.features]
+
+    def verdicts(T, clock_sigma_s):
+        monitor = Monitor(CONFIG)
+        return [
+            monitor.check(scene.calibrator, driving[: k + 1], T, EXACT, clock_sigma_s=clock_sigma_s).verdict
+            for k in range(len(driving))
+        ]
+
+    assert Verdict.SUSPECT in verdicts(off, 0.003)
+    assert not {Verdict.MOVED, Verdict.SUSPECT} & set(verdicts(off, 0.05))
+    assert Verdict.MOVED in verdicts(turned, 0.05)

@@ -14,6 +14,7 @@ from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online import pacing
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.tracker_states import Confirmations
 from calib_ros.result import BLINDED, CONVERGED, MOVED, SUSPECT
 from calib_ros_synthetic.drive import SyntheticDrive
 
@@ -162,6 +163,27 @@ def test_before_the_extrinsic_is_confirmed_every_keyframe_counts(street: list[Fr
     assert parade.estimates == parade.keyframes[2 : confirmed - 1]  # at the last one it is at rest
     parade(6)
     assert len(parade.estimates) <= confirmed + 1
+
+
+def test_what_only_lacks_frames_of_another_speed_is_estimated_seldom_until_one_comes(
+    street: list[Frame], start: np.ndarray
+) -> None:
+    ahead = np.array([8.0, 0.0, 0.0])
+    alike = [dataclasses.replace(frame, twist=np.r_[0.0, 0.0, 0.0, ahead]) for frame in street]
+    clocks = {"motion": {"max_time_offset_s": 0.05}, "tracker": {"confirmations": 3}}
+    parade = Parade(alike, start, online={"rest_period_s": 4.0}, **clocks)
+    parade(30)
+    tracker = parade.recalibrator.tracker
+    assert tracker.missing == Confirmations(clocks=1)
+    assert set(gaps(parade.estimates)[-4:]) == {4.0}
+    assert len(parade.keyframes) == 30  # each of them may be the one
+    made = len(parade.estimates)
+    while parade.n * GAP_S - parade.estimates[-1] > GAP_S:
+        parade(1)
+    slower = dataclasses.replace(alike[int(parade.n) % len(alike)], twist=np.r_[0.0, 0.0, 0.0, ahead / 2])
+    parade.show(slower)
+    assert len(parade.estimates) > made
+    assert parade.estimates[-1] == parade.keyframes[-1]
 
 
 @pytest.fixture

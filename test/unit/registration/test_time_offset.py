@@ -212,9 +212,15 @@ def test_the_offset_is_named_rightly_at_speed(dense, late_s):
     assert refusal.figures["seconds"] == pytest.approx(late_s, abs=0.01)
 
 
+def left_open(result):
+    """Covariance (6, 6) of what the clocks may have done to an extrinsic unnoticed."""
+    shift = result.clock_direction * result.clock_sigma_s
+    return np.outer(shift, shift)
+
+
 def test_clocks_that_cannot_be_told_are_left_to_the_covariance(dense):
     result = estimated(dense, ALIKE, box=None)
-    assert along(dense, result.clock_covariance) > 0.35  # 50 ms at 8 m/s
+    assert along(dense, left_open(result)) > 0.35  # 50 ms at 8 m/s
     assert along(dense, result.shared_covariance) > 0.02  # 3 ms
     exact = {"motion": {"time_offset_sigma_s": 0.0}, "camera": {"focal_sigma": 0.0, "centre_sigma": 0.0}}
     sharp = estimated(dense, ALIKE, box=None, **exact)
@@ -225,12 +231,12 @@ def test_clocks_that_cannot_be_told_are_left_to_the_covariance(dense):
 @pytest.mark.parametrize("speed", [2.0, 25.0])
 def test_however_fast_it_is_the_clocks_are_not_known_from_constant_motion(dense, speed):
     result = estimated(dense, [STRAIGHT * speed / 8.0] * 4, box=None)
-    assert along(dense, result.clock_covariance) == pytest.approx(0.05 * speed, rel=0.1)
+    assert along(dense, left_open(result)) == pytest.approx(0.05 * speed, rel=0.1)
     assert result.clock_sigma_s > 0.04
 
 
 @pytest.mark.parametrize("known", [{"sigma_m": [0.005] * 3}, {"limit_m": [0.02] * 3}])
 def test_what_is_known_in_advance_is_not_left_open(dense, known):
     result = estimated(dense, ALIKE, box=None, constraints=known)
-    assert np.sqrt(np.diag(result.clock_covariance)[3:].max()) < 0.3  # 0.4 without
+    assert np.sqrt(np.diag(left_open(result))[3:].max()) < 0.3  # 0.4 without
     assert np.sqrt(np.diag(result.shared_covariance)[3:].max()) < 0.025
