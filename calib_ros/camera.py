@@ -30,6 +30,7 @@ class Camera:
     K : (3, 3), px. width, height : of the image, px, at most 32766 each.
     model : a name in LENSES; the names of ROS, Kalibr, basalt and OpenCV are understood.
     D : (n,) distortion coefficients in the model's order, which is that of ROS; empty or all zero = a pinhole camera.
+    said_rectified : the image is taken for rectified although its CameraInfo has a distortion: it may be raw. Not compared.
 
     Raises BadInputError if K is no camera matrix, the size is out of range, or D does not fit the model.
     """
@@ -39,6 +40,7 @@ class Camera:
     height: int
     model: str = "plumb_bob"
     D: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    said_rectified: bool = False
 
     def __post_init__(self) -> None:
         K = np.array(self.K, float)

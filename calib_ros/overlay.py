@@ -164,17 +164,18 @@ def render(
     T: ArrayLike,
     *,
     T_before: ArrayLike | None = None,
+    names: tuple[str, str] = ("before", "after"),
     edges: EdgePoints | None = None,
     lines: Sequence[str] = (),
     status: str = "",
     max_range: float = 60.0,
 ) -> Image:
-    """Picture (h, w, 3) BGR of a frame under T_camera_lidar (4, 4); with T_before, panels "before" and "after".
+    """Picture (h, w, 3) BGR of a frame under T_camera_lidar (4, 4); with T_before, two panels of these names.
 
     Points nearer than max_range (m, along the optical axis) are coloured by depth; edges (LiDAR frame) are magenta. The size is
     that of `layout`. Raises BadInputError only for a transform that is not (4, 4).
     """
-    views = {"": T} if T_before is None else {"before": T_before, "after": T}
+    views = {"": T} if T_before is None else dict(zip(names, (T_before, T), strict=True))
     transforms = [np.asarray(t, float) for t in views.values()]
     if any(t.shape != (4, 4) for t in transforms):
         raise BadInputError(f"an overlay needs T_camera_lidar of shape (4, 4), got {[t.shape for t in transforms]}")

@@ -20,6 +20,7 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros_check.causes import (
     ALREADY_RECTIFIED,
+    FISHEYE_AS_RECTIFIED,
     UNRECTIFIED_FISHEYE,
     centre_finding,
     distorts,
@@ -77,7 +78,8 @@ def unrectified_fisheye(camera: Camera) -> Iterator[CameraGuess]:
     """The image of a fisheye, if its CameraInfo says that it is rectified: far beyond a distortion that bends a picture."""
     if camera.is_pinhole:
         D = np.array([LEAST_DISTORTION, 0.0, 0.0, 0.0])
-        yield CameraGuess(_found(Cause.NOT_RECTIFIED, UNRECTIFIED_FISHEYE), replace(camera, model="equidistant", D=D))
+        message = FISHEYE_AS_RECTIFIED if camera.said_rectified else UNRECTIFIED_FISHEYE
+        yield CameraGuess(_found(Cause.NOT_RECTIFIED, message), replace(camera, model="equidistant", D=D))
 
 
 def other_focal_lengths(camera: Camera) -> Iterator[CameraGuess]:

@@ -8,6 +8,8 @@ import numpy as np
 
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
+from calib_ros.config.sensors import ESTIMATE
+from calib_ros.registration.acceptance.refusal import AS_RAW
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.lens import CENTRE
 from calib_ros.result import RefusalCode, Result
@@ -26,6 +28,10 @@ UNRECTIFIED_FISHEYE = (
     "the image is that of a fisheye, but its CameraInfo has no distortion; take the rectified topic, or give the model "
     "'equidistant' with its coefficients"
 )
+KNOW_CLOCKS = (
+    "drive at changing speeds and through turns, or, if it is known, state motion.time_offset_s with motion.time_offset: fixed"
+)
+FISHEYE_AS_RECTIFIED = f"the image is that of a fisheye, but is taken for rectified; {AS_RAW}"
 _INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
 
 
@@ -43,8 +49,11 @@ def clock_finding(
     if result.refusal is RefusalCode.WRONG_TIMES:
         return CauseFinding(cause, CauseState.FOUND, f"the clocks are about {ms} apart: {late}; {advice}", {"seconds": seconds})
     if result.time_offset_s is None or result.time_offset_sigma_s is None:
+        if config.time_offset != ESTIMATE:
+            return CauseFinding(cause, CauseState.NOT_JUDGED, "the clocks are taken as stated (motion.time_offset: fixed)")
         why = "all frames move alike, or their motion is not known" if len(features) > 1 else "one frame does not tell"
-        return CauseFinding(cause, CauseState.NOT_JUDGED, f"the offset of the clocks is not known: {why}")
+        message = f"the offset of the clocks is not known: {why}; {KNOW_CLOCKS}"
+        return CauseFinding(cause, CauseState.NOT_JUDGED, message)
     sigma = result.time_offset_sigma_s
     values = {"seconds": seconds, "sigma_s": sigma}
     twists = np.array([f.twist for f in features if f.twist is not None])
@@ -72,7 +81,8 @@ def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[Ca
     values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
     if found is not None:
         better = f"{fit.deviations:.1f} standard deviations better"
-        message = f"{_lens_words(best, found, camera)} ({better}); {_INTRINSICS}"
+        advice = AS_RAW if found is Cause.NOT_RECTIFIED and camera.said_rectified else _INTRINSICS
+        message = f"{_lens_words(best, found, camera)} ({better}); {advice}"
         return instead(CauseFinding(found, CauseState.FOUND, message, values), of_cameras(camera))
     return findings(of_cameras(camera), CauseState.EXCLUDED, "no other camera matches clearly better")
 
@@ -137,9 +147,12 @@ def _lens_words(lens: LensChange, cause: Cause | None, camera: Camera) -> str:
         return ALREADY_RECTIFIED
     if cause is Cause.NOT_RECTIFIED:
         way = "towards" if lens.barrel > 0 else "away from"
+        corners = f"corners lie {abs(lens.barrel):.0%} of the radius {way} the centre"
+        if camera.said_rectified:
+            return f"the image is taken for rectified, but is raw: {corners}"
         return (
-            f"the image shows a lens distortion that its CameraInfo does not have: corners lie {abs(lens.barrel):.0%} of "
-            f"the radius {way} the centre; take the rectified topic, or the CameraInfo of the camera as it is"
+            f"the image shows a lens distortion that its CameraInfo does not have: {corners}; take the rectified topic, or the "
+            "CameraInfo of the camera as it is"
         )
     parts = [_focal_words(lens.focal)] * bool(lens.focal) + _centre_words(lens, camera)
     other = ""

@@ -38,6 +38,13 @@ DIRECTIONS = {
     "ty": ("camera is {} too far above the LiDAR", "camera is {} too far below the LiDAR"),
     "tz": ("camera is {} too far behind the LiDAR", "camera is {} too far in front of the LiDAR"),
 }
+# The extrinsic with a cause that was found mended, as far as a check can do that.
+_THEN = {
+    CheckVerdict.PASS: "with that mended, the extrinsic is right: {sizes}",
+    CheckVerdict.INCONCLUSIVE: "with that mended, the scenes do not tell whether it is right to within {limits}: {sizes}",
+    CheckVerdict.FAIL: "even with that mended the extrinsic seems to be off by more than {limits}, {sizes}; so the cause "
+    "may be another or not the only one: mend it and check again",
+}
 DEGREES = np.array([np.rad2deg(1.0)] * 3 + [1.0] * 3)
 
 
@@ -160,8 +167,7 @@ def reason_of(
     limits = f"{tolerance.deg:g} deg / {100 * tolerance.m:g} cm"
     sizes = f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
     if cause is not None:
-        rest = "right" if judgement.verdict is CheckVerdict.PASS else judgement.verdict.value
-        return f"{cause.message}; with that mended, the extrinsic is {rest}: {sizes}"
+        return f"{cause.message}; {_THEN[judgement.verdict].format(limits=limits, sizes=sizes)}"
     if judgement.verdict is CheckVerdict.PASS:
         return f"right to within {limits}: {sizes}"
     axes = [axis.words for axis in _worst(judgement)]

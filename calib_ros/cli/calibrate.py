@@ -8,6 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.cli.inputs import initial_extrinsic, require_classes, search_box
@@ -97,18 +99,23 @@ def _read(source: Source, positions: list[int], config: Config) -> list[Frame]:
 
 
 def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:
-    """Write the before/after picture of a frame with its LiDAR edges; before is where the estimate started. BadInputError if
-    `path` cannot be written."""
+    """Write the before/after picture of a frame with its LiDAR edges: before is where the estimate started, and after a refusal
+    the optimum that was refused; without one, only the start. BadInputError if `path` cannot be written."""
     from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame
     from calib_ros.lidar.edges import edge_points
     from calib_ros.lidar.range_image import range_image
     from calib_ros.overlay import caption, render, write_png
 
     result = extrinsic.result
+    names, before = ("before", "after"), result.initial
+    if result.optimum is not None:
+        names, result = ("start", "refused optimum"), replace(result, T_camera_lidar=result.optimum)
+    elif not result.converged and before is not None and np.array_equal(before, result.T_camera_lidar):
+        before = None
     edges = deskewed_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
-    lines = caption(extrinsic, result.frames_used, result.initial)
+    lines = caption(replace(extrinsic, result=result), result.frames_used)
     shown = deskewed_frame(frame, config.motion)
-    picture = render(shown, result.T_camera_lidar, T_before=result.initial, edges=edges, lines=lines, status=result.status)
+    picture = render(shown, result.T_camera_lidar, T_before=before, names=names, edges=edges, lines=lines, status=result.status)
     write_png(path, picture)
 
 

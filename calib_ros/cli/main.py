@@ -180,7 +180,8 @@ def _export(args: argparse.Namespace) -> int:
         print(f"changed the joint between the sensors in {args.out}")
     else:
         write_atomically(args.out, text.encode())
-        print(f"wrote {args.out}")
+        what = ": a joint alone, not a description; put it between the <robot> tags of one that has both links"
+        print(f"wrote {args.out}{what if args.format == 'urdf' else ''}")
     return OK
 
 

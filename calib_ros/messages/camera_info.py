@@ -33,9 +33,10 @@ def decode_camera_info(msg: Any, rectified: bool = False) -> Camera:
     K[0] /= bin_x
     K[1] /= bin_y
     size = (width // bin_x, height // bin_y)
+    D = np.asarray(_field(msg, "d"), float)
     if rectified:
-        return Camera(K, *size)
-    return _rectifiable(K.tobytes(), *size, str(msg.distortion_model), np.asarray(_field(msg, "d"), float).tobytes())
+        return Camera(K, *size, said_rectified=bool(D.any()))
+    return _rectifiable(K.tobytes(), *size, str(msg.distortion_model), D.tobytes())
 
 
 @lru_cache(maxsize=8)

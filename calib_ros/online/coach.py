@@ -47,6 +47,7 @@ CURES = {
     RefusalCode.WRONG_INTRINSICS: "calibrate the camera's intrinsics anew, or have them refined",
     RefusalCode.WRONG_TIMES: "mend the time stamps of the drivers",
 }
+IF_RAW = "set image_is_rectified: false if straight lines are bent in the images"
 
 
 @dataclass(frozen=True)
@@ -205,7 +206,8 @@ def _text(result: Result, config: Config, counted: Counted, lacking: Need | None
             return f"no keyframe yet: drive where there are {STRUCTURE}, in light", True
         return f"keep driving: {counted.keyframes} of {needed} keyframes, each of another view", True
     if result.refusal in CURES:
-        return CURES[result.refusal], False
+        raw = result.refusal is RefusalCode.WRONG_INTRINSICS and camera.said_rectified
+        return f"{IF_RAW}, else {CURES[result.refusal]}" if raw else CURES[result.refusal], False
     if config.online.mode == MANUAL and status != TENTATIVE:
         return f"{weak}; then call ~/calibrate" if weak else "call ~/calibrate", False
     if weak:

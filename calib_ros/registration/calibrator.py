@@ -23,7 +23,7 @@ from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import RefinedCamera
 from calib_ros.registration.acceptance.checks import Acceptance
-from calib_ros.registration.acceptance.refusal import joined, semantic_note
+from calib_ros.registration.acceptance.refusal import MAYBE_RAW, joined, semantic_note
 from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.camera_rounds import refined_with_camera
@@ -242,7 +242,10 @@ class Calibrator:
             found = Estimate(initial, start, optimised, alignment, evidence, pose, intrinsics)
             nuisance = found.nuisance(self.config, intrinsics if self._given is None else ())
             # Accept, or say why not.
-            result = found.result(nuisance, acceptance.refusal(found, watch), self.config.motion, notes)
+            refusal = acceptance.refusal(found, watch)
+            if refusal is not None and refusal.suspects_intrinsics and self.extract.source_camera.said_rectified:
+                notes = [MAYBE_RAW, *notes]
+            result = found.result(nuisance, refusal, self.config.motion, notes)
             if self.config.camera.intrinsics == REFINE:
                 result = replace(result, refined_camera=self._refined(found, acceptance))
             self.objectives.keep_maps(objective)

@@ -257,4 +257,5 @@ def working_camera(camera: Camera, max_width: int) -> Camera:
     width, height = max_width, round(camera.height * max_width / camera.width)
     sx, sy = width / camera.width, height / camera.height
     S = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
-    return Camera(S @ camera.K, width, height, camera.model if camera.is_sphere else "plumb_bob")
+    model = camera.model if camera.is_sphere else "plumb_bob"
+    return Camera(S @ camera.K, width, height, model, said_rectified=camera.said_rectified)

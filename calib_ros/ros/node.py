@@ -316,18 +316,19 @@ class CalibNode(Node):
     """The node that is active from its start to its end."""
 
     def __init__(self, **kwargs: Any) -> None:
+        self.calibration: Any = None  # until it is made: stop() and destroy_node() may follow an __init__ that raised
         super().__init__("calib_ros", allow_undeclared_parameters=True, **kwargs)  # which are refused, with the nearest name
-        self.calibration: Any = interface(self)
+        self.calibration = interface(self)
         self.calibration.activate()
 
     @property
     def others(self) -> tuple[Node, ...]:
         """The nodes of a rig's pairs, which are to spin along with this one."""
-        return tuple(self.calibration.nodes)
+        return () if self.calibration is None else tuple(self.calibration.nodes)
 
     def stop(self) -> bool:
         """End all threads of the node; True if they ended."""
-        return bool(self.calibration.stop())
+        return self.calibration is None or bool(self.calibration.stop())
 
     def destroy_node(self) -> None:
         """Ends the threads first: they publish through this node."""

@@ -12,6 +12,10 @@ from calib_ros.result import RefusalCode
 # What a Result notes whether or not it is refused.
 NO_INTENSITY = "the cloud has no intensity: reflectivity edges are off"
 ONE_FRAME = "one frame only: a direction that it does not show may be wrong; use more scenes"
+AS_RAW = "give --no-rectified, or image_is_rectified: false to the node"
+# And where intrinsics may be at fault, of a Camera.said_rectified.
+MAYBE_RAW = f"the images are taken for rectified, but camera_info has a distortion: if straight lines are bent in them, {AS_RAW}"
+_SUSPECT_INTRINSICS = (RefusalCode.WRONG_INTRINSICS, RefusalCode.NOT_SIGNIFICANT, RefusalCode.LOW_SCORE)
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,11 @@ class Refusal:
 
     def __str__(self) -> str:
         return self.text
+
+    @property
+    def suspects_intrinsics(self) -> bool:
+        """Whether a wrong camera may be the reason."""
+        return self.code in _SUSPECT_INTRINSICS
 
 
 def _refusal(code: RefusalCode, text: str, **figures: float) -> Refusal:
@@ -115,7 +124,7 @@ def wrong_intrinsics(focal: float, u: float, v: float, deviations: float) -> Ref
         what = f"with the principal point about {abs(v):.3g} px further {'down' if v > 0 else 'up'}"
     text = (
         f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); check K and D "
-        "in camera_info, the image size they are for, and image_is_rectified"
+        "in camera_info, the image size they are for, and image_is_rectified (--rectified)"
     )
     return _refusal(RefusalCode.WRONG_INTRINSICS, text, focal=focal, u=u, v=v, deviations=deviations)
 

@@ -9,7 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import rclpy
 from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.context import Context
 from rclpy.parameter import Parameter
 from ros_peer import Peer, camera_info_message
 from vehicle import vehicle_fixture  # noqa: F401  # a fixture
@@ -18,6 +20,7 @@ from calib_ros.config import SearchConfig, preset, stages, update
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.online import recalibrator as recalibrator_module
 from calib_ros.ros import parameters
+from calib_ros.ros.node import CalibNode
 from calib_ros.ros.parameters import LIVE, SETTINGS
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -98,6 +101,16 @@ def test_a_parameter_under_both_names_is_refused():
 def test_bad_parameters_at_the_start(wrong, text):
     with pytest.raises(CalibrationError, match=text):
         Peer(**wrong)
+
+
+def test_a_node_that_could_not_be_made_can_be_stopped():
+    node, context = CalibNode.__new__(CalibNode), Context()
+    rclpy.init(context=context)
+    with pytest.raises(CalibrationError, match="image_transport"):
+        CalibNode.__init__(node, context=context, parameter_overrides=[Parameter("image_transport", value="theora")])
+    assert node.stop()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
 
 
 def test_every_parameter_describes_its_meaning_and_range(vehicle):

@@ -11,12 +11,14 @@ from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, SearchConfig
+from calib_ros.config import Config, MotionConfig, SearchConfig
 from calib_ros.datasets import open_dataset
+from calib_ros.result import CONVERGED, Result
 from calib_ros_check.cameras import camera_guesses, turned_over
+from calib_ros_check.causes import KNOW_CLOCKS, clock_finding, lens_findings
 from calib_ros_check.checker import Checker
 from calib_ros_check.evidence import Candidate
-from calib_ros_check.outcome import Cause, CauseState, CheckVerdict
+from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
 from calib_ros_check.sensors import LensChange, moved_deg, moves_by
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
@@ -87,6 +89,27 @@ def test_guesses_about_cameras_with_and_without_a_distortion():
     guesses = list(camera_guesses(Camera(K, 640, 240, D=BARREL)))
     assert [guess.camera.is_pinhole for guess in guesses].count(True) == 1
     assert {guess.finding.cause for guess in guesses} == {Cause.ALREADY_RECTIFIED, Cause.OTHER_CAMERA}
+
+
+def test_raw_images_that_are_taken_for_rectified_are_to_be_taken_as_raw():
+    camera = Camera(np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]]), 640, 240)
+    bent = replace(fitted(LensChange(barrel=0.1), 9.0), parts={"barrel": 40.0})
+    for said, cure in ((True, "--no-rectified, or image_is_rectified: false to the node"), (False, "take the rectified topic")):
+        own = replace(camera, said_rectified=said)
+        found = [lens_findings(bent, "", own)[0], *(guess.finding for guess in camera_guesses(own))]
+        assert [(finding.cause, cure in finding.message) for finding in found] == [(Cause.NOT_RECTIFIED, True)] * 2
+
+
+@pytest.mark.parametrize(("count", "why"), [(1, "one frame does not tell"), (3, "all frames move alike")])
+def test_what_is_not_known_of_the_clocks_comes_with_what_to_do(count, why):
+    motion, result = MotionConfig(), Result(np.eye(4), CONVERGED)
+    told = clock_finding([None] * count, result, 0.0, Tolerance(), motion)
+    assert told.state is CauseState.NOT_JUDGED
+    assert why in told.message
+    assert told.message.endswith(f"; {KNOW_CLOCKS}")
+    stated = clock_finding([None] * count, result, 0.0, Tolerance(), replace(motion, time_offset="fixed"))
+    assert stated.state is CauseState.NOT_JUDGED
+    assert "taken as stated" in stated.message
 
 
 def test_intrinsics_of_half_the_image_size_are_named_with_the_factor(drive):

@@ -10,8 +10,8 @@ from scipy.special import stdtr
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
-from calib_ros_check.outcome import CheckVerdict, Tolerance
-from calib_ros_check.tolerance import deviation, judge, posterior_samples, undecided
+from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckVerdict, Tolerance
+from calib_ros_check.tolerance import deviation, judge, posterior_samples, reason_of, undecided
 
 TRUTH = se3.from_parts(se3.OPTICAL_FROM_BODY, [0.1, -0.3, -0.2])
 SHARP = np.diag([np.deg2rad(0.03) ** 2] * 3 + [0.01**2] * 3)
@@ -50,6 +50,24 @@ def test_what_the_scenes_do_not_show_is_inconclusive_on_that_axis_only():
     found = judge(TRUTH, TRUTH, SHARP + UNSHOWN, Tolerance(0.5, 0.1))
     assert [axis.verdict for axis in found.axes] == [PASS] * 5 + [INCONCLUSIVE]
     assert found.verdict is INCONCLUSIVE
+
+
+@pytest.mark.parametrize(
+    ("m", "known", "says"),
+    [
+        (0.0, SHARP, "wrong; with that mended, the extrinsic is right: rotation off by"),
+        (
+            0.1,
+            BLURRED,
+            "wrong; with that mended, the scenes do not tell whether it is right to within 0.5 deg / 10 cm",
+        ),
+        (1.17, SHARP, "wrong; even with that mended the extrinsic seems to be off by more than 0.5 deg / 10 cm, rotation"),
+    ],
+)
+def test_a_cause_is_a_cure_only_where_the_extrinsic_is_right_with_it_mended(m, known, says):
+    cause, tolerance = CauseFinding(Cause.FOCAL_LENGTH, CauseState.FOUND, "wrong"), Tolerance(0.5, 0.1)
+    judgement = judge(se3.perturb(TRUTH, [0, 0, 0], [0, 0, m]), TRUTH, known, tolerance)
+    assert reason_of(judgement, tolerance, cause).startswith(says)
 
 
 def test_samples_of_few_degrees_of_freedom_have_students_tails():

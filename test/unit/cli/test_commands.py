@@ -21,16 +21,17 @@ from paths import ROOT
 from calib_ros import open_dataset, se3
 from calib_ros.camera import Camera
 from calib_ros.cli import inputs, main
-from calib_ros.cli.calibrate import advice, calibrate
+from calib_ros.cli.calibrate import advice, calibrate, draw
 from calib_ros.cli.inputs import ConstraintOptions
 from calib_ros.cli.output import motion, summary
 from calib_ros.config import Config, MotionConfig, update
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import FOCAL, camera_info_yaml, changed
+from calib_ros.overlay import layout
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
-from calib_ros.result import CONVERGED, REFUSED, RefusalCode, Result, load
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Extrinsic, RefusalCode, Result, load
 from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
@@ -146,6 +147,25 @@ def test_calibrate_writes_result_and_overlay(
     first, second = (json.loads(run(capsys, *refine[:-1], "-")[1]) for _ in range(2))
     assert first["status"] == "converged"
     assert first | {"elapsed_s": 0, "stamp": 0} == second | {"elapsed_s": 0, "stamp": 0}
+
+
+def test_a_refusal_is_drawn_with_its_optimum_or_the_start_alone(drive: SyntheticDrive, tmp_path: Path) -> None:
+    frame, T = drive[0], drive.reference
+    off, path = se3.perturb(T, [0, 3, 0], [0, 0, 0]), tmp_path / "overlay.png"
+    width, height = frame.camera.width, frame.camera.height
+
+    def drawn(panels: int, result: Result) -> np.ndarray:
+        """The last of so many panels."""
+        draw(path, frame, Extrinsic(result), Config())
+        picture, plan = cv2.imread(str(path)), layout(width, height, panels)
+        assert picture.shape[:2] == plan.size[::-1]
+        x, y = plan.panels[-1]
+        return picture[y : y + height, x : x + width]
+
+    found, start = drawn(2, Result(T, CONVERGED, initial=off)), drawn(2, Result(off, CONVERGED, initial=off))
+    assert (drawn(2, Result(off, REFUSED, initial=off, optimum=T)) == found).all()
+    assert (drawn(1, Result(off, INSUFFICIENT, initial=off)) == start).all()
+    assert (found != start).any()
 
 
 def test_not_converged_is_exit_code_1(bag: Path, quick: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

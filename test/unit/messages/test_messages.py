@@ -356,6 +356,9 @@ def test_camera_info(ros):
     rectified = decode_camera_info(message, rectified=True)
     assert np.array_equal(rectified.K, P[:, :3])
     assert rectified.is_pinhole
+    assert rectified.said_rectified
+    assert not decode_camera_info(ros.camera_info(640, 480, K, [], P), rectified=True).said_rectified
+    assert not camera.said_rectified
     loose = {"K": list(K.ravel()), "D": [0.1, 0, 0, 0], "P": list(P.ravel()), "distortion_model": "equidistant"}  # ROS 1's names
     assert decode_camera_info(SimpleNamespace(width=640, height=480, **loose)).model == "equidistant"
     for model, D in (("mei", [1.2, -0.1, 0.02, 1e-3, 0.0]), ("double_sphere", [-0.2, 0.6]), ("fisheye", [0.1, 0, 0, 0, 0.01])):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import RenderedDrive
@@ -15,7 +17,7 @@ from calib_ros.online.coach import FAR, LYING, STANDING, Advice, Counted, Need, 
 from calib_ros.online.sensor_health import SensorFault
 from calib_ros.online.tracker_states import Confirmations
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.features import FrameFeatures, working_camera
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import (
     BLINDED,
@@ -163,6 +165,13 @@ def test_every_state_has_its_advice(told: Advice, text: str) -> None:
     assert text in told.text
     assert bool(told.text) == bool(text)
     assert (told.progress == 1.0) == (not told.text or told.text.endswith("more keyframes decide"))
+
+
+def test_images_that_may_be_raw_are_looked_at_before_intrinsics_are_calibrated() -> None:
+    result = Result(UPRIGHT, REFUSED, refusal=RefusalCode.WRONG_INTRINSICS)
+    camera = working_camera(replace(CAMERA, said_rectified=True), 320)
+    told = advise(result, CONFIG, camera, Counted(keyframes=9)).text
+    assert told.startswith("set image_is_rectified: false if straight lines are bent in the images, else calibrate")
 
 
 def test_progress_rises_with_keyframes_information_and_confirmations() -> None:

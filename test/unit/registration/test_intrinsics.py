@@ -65,6 +65,17 @@ def test_wrong_intrinsics_are_refused_and_named(scene, focal, u, v, says):
     assert result.refusal_figures["focal"] == pytest.approx(-focal, abs=0.01)
 
 
+def test_of_images_that_are_said_to_be_rectified_the_refusal_says_how_to_take_them_as_raw(scene):
+    camera = wrong(scene.camera, -0.04)
+    refused = calibrated(scene, replace(camera, said_rectified=True))
+    assert refused.refusal is RefusalCode.WRONG_INTRINSICS
+    assert "; the images are taken for rectified, but camera_info has a distortion" in refused.reason
+    assert "--no-rectified, or image_is_rectified: false to the node" in refused.reason
+    right = calibrated(scene, replace(scene.camera, said_rectified=True))
+    for result in (calibrated(scene, camera), right):
+        assert "--no-rectified" not in result.reason
+
+
 def test_right_intrinsics_are_estimated_as_given(scene):
     result = calibrated(scene, scene.camera)
     scene.assert_found(result)
