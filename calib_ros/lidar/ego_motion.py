@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.errors import MissingDependencyError
-from calib_ros.frame import Frame, PointCloud
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.deskew import MAX_TIME, has_times, moved, scan_times
+from calib_ros.lidar.sweep import MIN_POINTS as MIN_VIEWED
+from calib_ros.lidar.sweep import view_times
 
 Floats = NDArray[np.float64]
 MISSING = "the vehicle's motion is estimated from scans with small_gicp, which is missing: pip install small_gicp==1.0.1"
@@ -49,6 +51,18 @@ def needs_ego_motion(frame: Frame, config: MotionConfig) -> bool:
         return False
     # By azimuth only if configured: drivers differ, and a wrong guess moves points farther than the vehicle did.
     return config.from_scans == "always" or has_times(frame.cloud)
+
+
+def unknown_motion_s(frame: Frame, T_camera_lidar: NDArray[np.floating], config: MotionConfig) -> float:
+    """For how long, s, an unknown velocity displaces the points in a camera's view: the root mean square of their times after the
+    image's stamp. 0 where no velocity is to be estimated, or it is known. T_camera_lidar: (4, 4), to some degrees."""
+    if not needs_ego_motion(frame, config):
+        return 0.0
+    between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s
+    times = view_times(frame.cloud, frame.camera, T_camera_lidar, config)
+    if times is None or len(times) < MIN_VIEWED:
+        return float(np.hypot(between, config.scan_period_s * frame.camera.field_deg / 720))
+    return float(np.sqrt(np.mean((between + times) ** 2)))
 
 
 def estimate_motion(

@@ -295,15 +295,14 @@ class EgoMotion:
         self._known = (stamp, self.last.twist)
         return replace(frame, twist=self.last.twist)
 
-    def check_known(self, frame: Frame, limits: TrackerConfig) -> None:
-        """BadTimesError if a frame's motion is unknown although the vehicle moved shortly before, in half the time in which the
-        scan sweeps the image by more than a converged extrinsic may be off: nobody knows how the scan is bent."""
+    def check_known(self, frame: Frame, seconds: float, limits: TrackerConfig) -> None:
+        """BadTimesError if a frame's motion is unknown although the vehicle moved shortly before, in `seconds` (see
+        `unknown_motion_s`) by more than a converged extrinsic may be off: nobody knows how the scan is bent."""
         stamp = frame.cloud_stamp
-        if stamp is None or self._known is None or not needs_ego_motion(frame, self.config):
+        if stamp is None or self._known is None or not seconds:
             return
         since, twist = (stamp - self._known[0]) / NANOSECONDS, self._known[1]
-        sweep_s = self.config.scan_period_s * frame.camera.field_deg / 720
-        turn, way = (sweep_s * float(np.linalg.norm(part)) for part in (twist[:3], twist[3:]))
+        turn, way = (seconds * float(np.linalg.norm(part)) for part in (twist[:3], twist[3:]))
         if 0 <= since <= REMEMBERED_S and (turn > np.deg2rad(limits.max_sigma_deg) or way > limits.max_sigma_m):
             self.left_out += 1
             speed, rate = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))

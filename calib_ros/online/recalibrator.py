@@ -15,7 +15,7 @@ from calib_ros.config import Config, SemanticsConfig
 from calib_ros.config.online import CONTINUOUS
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.intrinsics import RefinedCamera
-from calib_ros.lidar.ego_motion import estimate_motion
+from calib_ros.lidar.ego_motion import estimate_motion, unknown_motion_s
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.coach import Advice, Counted, advise
@@ -250,11 +250,14 @@ class Recalibrator:
         generation = self.keyframes.generation
         try:
             frame_with_twist = self.motion.with_twist(frame, scan_before)
-            self.motion.check_known(frame_with_twist, self.config.tracker)
+            unknown_s = unknown_motion_s(frame_with_twist, self.tracker.T, self.config.motion)
+            self.motion.check_known(frame_with_twist, unknown_s, self.config.tracker)
             if frame_with_twist is not frame and not self.speed_gate.allows(frame_with_twist):
                 return False  # the selector goes on from this frame: scans in a turn are not aligned one by one
             frame_with_twist = self.motion.accumulated(frame_with_twist)
             features = self.calibrator.extract(frame_with_twist)
+            if unknown_s:
+                features = replace(features, unknown_motion_s=unknown_s)
         except Exception:
             if is_keyframe:
                 self.selector.reset()  # the scene is still wanted: the next frame may show it with a good scan

@@ -44,9 +44,9 @@ class FrameFeatures:
 
     has_reflectivity: False if the source gave no usable intensity. twist: (6,) the LiDAR's velocity, rad/s and m/s in its own
     frame, by which the points were moved to the image's moment; None = they were not. timed_by_azimuth: the times of its points
-    come from their azimuth, by the stage ``motion``. unknown_motion_s: half the time in which the scan sweeps the image, s, by
-    which points at the sides are off where nothing is known of the motion; else 0. plain: the same frame without semantics, where
-    it has some. view: its classes as `ClassModels` keeps them. own: what another objective keeps of the frame.
+    come from their azimuth, by the stage ``motion``. unknown_motion_s: how long an unknown motion displaces points, s: half the
+    time in which the scan sweeps the image, or as `ego_motion.unknown_motion_s` has it; 0 where it is known. plain: the same
+    frame without semantics, where it has some. view: its classes as `ClassModels` keeps them. own: what another objective keeps.
     """
 
     points: EdgePoints

@@ -18,7 +18,7 @@ from calib_ros.datasets.kitti_files import NOMINAL_LEVER_ARM, Oxts, ScanMotion, 
 from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError, BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.lidar.ego_motion import estimate_motion, needs_ego_motion
+from calib_ros.lidar.ego_motion import estimate_motion, needs_ego_motion, unknown_motion_s
 from calib_ros.online.events import Inputs, Problem
 from calib_ros.online.keyframes import EgoMotion
 from calib_ros.online.pipeline import Pipeline
@@ -204,6 +204,18 @@ class TestEstimate:
             recalibrator.ingest(later(1.0))
         assert (recalibrator.keyframes_seen, recalibrator.motion.left_out) == (2, 1)
         assert recalibrator.ingest(later(9.0))  # nobody knows whether it still moves
+        assert recalibrator.newest().unknown_motion_s > 0
+
+    def test_an_unknown_motion_counts_for_as_long_as_points_are_measured_beside_the_image(self, drive):
+        frame = Bare(drive)[0]
+        at_once = unknown_motion_s(frame, drive.reference, AUTO)
+        assert 0.002 < at_once < 0.02  # half the sweep of the view
+        apart = replace(frame, stamp=frame.stamp + round(0.05 * NANOSECONDS))
+        assert unknown_motion_s(apart, drive.reference, AUTO) == pytest.approx(0.05, abs=0.01)
+        behind = drive.reference @ se3.exp([0, 0, np.pi, 0, 0, 0])  # a view that scans begin and end in
+        assert unknown_motion_s(frame, behind, AUTO) > 0.04
+        assert unknown_motion_s(drive[0], drive.reference, AUTO) == 0  # known
+        assert unknown_motion_s(replace(frame, compensated=True), drive.reference, AUTO) == 0
 
     def test_clouds_that_tell_nothing(self, drive):
         bare, motion = Bare(drive), EgoMotion(AUTO)
