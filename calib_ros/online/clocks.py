@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.arrays import Transform
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
+from calib_ros.online.monitor import MIN_TWIST
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.joint import clocks_are_estimated
@@ -105,6 +107,27 @@ def at_offset(estimate: Result, seconds: float) -> Transform:
     """T_camera_lidar (4, 4) of an estimate if the clocks' offset were another one, s."""
     T, direction, own = estimate.T_camera_lidar, estimate.clock_direction, estimate.time_offset_s
     return T if own is None or direction is None else se3.exp(direction * (seconds - own)) @ T
+
+
+class SeenMotion:
+    """How the keyframes in the last estimate move: those of another speed or turn tell of the clocks."""
+
+    def __init__(self) -> None:
+        self._lowest = self._highest = np.full(6, np.nan)
+
+    def learn(self, keyframes: Sequence[FrameFeatures]) -> None:
+        """Those in an estimate."""
+        if len(twists := _twists(keyframes)):
+            self._lowest, self._highest = twists.min(axis=0), twists.max(axis=0)
+
+    def covers(self, keyframes: Sequence[FrameFeatures]) -> bool:
+        """Whether none of these moves otherwise, by what counts as a motion."""
+        twists = _twists(keyframes)
+        return bool((twists >= self._lowest - MIN_TWIST).all() and (twists <= self._highest + MIN_TWIST).all())
+
+
+def _twists(keyframes: Sequence[FrameFeatures]) -> Matrix:
+    return np.array([f.twist for f in keyframes if f.twist is not None]).reshape(-1, 6)
 
 
 class ClockEvidence:

@@ -164,6 +164,17 @@ class KeyframeBuffer:
         del kept[max(first, 0) : max(first + count, 0)]
         self.features = deque(kept, self.features.maxlen)
 
+    def drop(self, unwanted: Callable[[FrameFeatures], bool]) -> None:
+        """Remove keyframes that should not have been taken. What is being computed from them becomes void."""
+        kept = [not unwanted(f) for f in self.features]
+        if all(kept):
+            return
+        self.generation += 1
+        first_new, first_unfused = len(kept) - self.new, len(kept) - self.unfused
+        self.new -= kept[max(first_new, 0) :].count(False)
+        self.unfused -= kept[max(first_unfused, 0) :].count(False)
+        self.features = deque((f for f, keep in zip(self.features, kept, strict=True) if keep), self.features.maxlen)
+
     def resize(self, size: int) -> None:
         """Change the capacity; the oldest keyframes leave if there are more."""
         self.features = deque(self.features, size)
@@ -295,15 +306,21 @@ class EgoMotion:
         self._known = (stamp, self.last.twist)
         return replace(frame, twist=self.last.twist)
 
+    def moves_in(self, seconds: float, limits: TrackerConfig) -> bool:
+        """Whether the vehicle, by what is known of it, moves by more in `seconds` than a converged extrinsic may be off."""
+        if self._known is None:
+            return False
+        turn, way = (seconds * float(np.linalg.norm(part)) for part in (self._known[1][:3], self._known[1][3:]))
+        return turn > np.deg2rad(limits.max_sigma_deg) or way > limits.max_sigma_m
+
     def check_known(self, frame: Frame, seconds: float, limits: TrackerConfig) -> None:
         """BadTimesError if a frame's motion is unknown although the vehicle moved shortly before, in `seconds` (see
         `unknown_motion_s`) by more than a converged extrinsic may be off: nobody knows how the scan is bent."""
         stamp = frame.cloud_stamp
-        if stamp is None or self._known is None or not seconds:
+        if stamp is None or self._known is None or not self.moves_in(seconds, limits):
             return
         since, twist = (stamp - self._known[0]) / NANOSECONDS, self._known[1]
-        turn, way = (seconds * float(np.linalg.norm(part)) for part in (twist[:3], twist[3:]))
-        if 0 <= since <= REMEMBERED_S and (turn > np.deg2rad(limits.max_sigma_deg) or way > limits.max_sigma_m):
+        if 0 <= since <= REMEMBERED_S:
             self.left_out += 1
             speed, rate = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
             reason = self.last.reason if self.last is not None and self.last.twist is None else "the scan before is missing"

@@ -17,14 +17,14 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.intrinsics import RefinedCamera
 from calib_ros.lidar.ego_motion import estimate_motion, unknown_motion_s
 from calib_ros.lidar.range_image import require_returns
-from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
+from calib_ros.online.clocks import SeenMotion, usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.coach import Advice, Counted, advise
 from calib_ros.online.common import SharedScans
 from calib_ros.online.first_guess import FirstGuess
 from calib_ros.online.glance import Glance
 from calib_ros.online.keyframe_classes import KeyframeSegmenter
 from calib_ros.online.keyframes import Batch, EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, feature_config
-from calib_ros.online.monitor import MIN_TWIST, Assessment, Monitor, Verdict
+from calib_ros.online.monitor import Assessment, Monitor, Verdict
 from calib_ros.online.pacing import LONGEST_REST_S, REST_SPACING_S, Rest, Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
@@ -109,7 +109,7 @@ class Recalibrator:
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
-        self._twists = np.full((2, 6), np.nan)  # of the keyframes in the last estimate, rad/s and m/s: the lowest and the highest
+        self._seen_motion = SeenMotion()
         self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
         self._test_wanted = False  # a look has struck, and the load has not allowed for a test yet
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
@@ -192,11 +192,8 @@ class Recalibrator:
 
     def _awaits_motion(self) -> bool:
         """With the lock held: another estimate would tell nothing new, since all new keyframes move as those in the last one."""
-        if not (self.tracker.awaits_motion and self._keyframes_fit):
-            return False
-        twists = np.array([f.twist for f in list(self.buffer)[-self.keyframes.new :] if f.twist is not None]).reshape(-1, 6)
-        lowest, highest = self._twists
-        return bool((twists >= lowest - MIN_TWIST).all() and (twists <= highest + MIN_TWIST).all())
+        waits = self.tracker.awaits_motion and self._keyframes_fit
+        return waits and self._seen_motion.covers(list(self.buffer)[-self.keyframes.new :])
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
@@ -264,6 +261,8 @@ class Recalibrator:
             raise
         with self._lock:
             current = generation == self.keyframes.generation  # else: reset or configured meanwhile
+            if features.twist is not None:  # those before it was known that the vehicle moves
+                self.keyframes.drop(lambda f: self.motion.moves_in(f.unknown_motion_s, self.config.tracker))
             if current and is_keyframe:
                 # Classes may come for one keyframe in many, and a first guess needs several.
                 self.keyframes.add(features, lambda f: self.first_guess.needs_classes and f.view is not None)
@@ -412,8 +411,7 @@ class Recalibrator:
                 newest = batch.features[-1].stamp
                 seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
                 self._estimated_at = newest
-                twists = np.array([f.twist for f in batch.features if f.twist is not None]).reshape(-1, 6)
-                self._twists = np.array([twists.min(0), twists.max(0)]) if len(twists) else np.full((2, 6), np.nan)
+                self._seen_motion.learn(batch.features)
             accepted = self.tracker.current.accepted
             share_new = min(batch.unfused_features / max(len(batch.features), 1), 1.0)
             extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all=not self.keyframes.incomplete)

@@ -194,6 +194,7 @@ class TestEstimate:
         for frame in (bare[0], bare[1]):
             recalibrator.selector.reset()
             assert recalibrator.ingest(frame)
+        assert [f.stamp for f in recalibrator.buffer] == [bare[1].stamp]  # the first one's motion was not known yet
 
         def later(seconds):
             shift = round(seconds * NANOSECONDS)

@@ -165,3 +165,19 @@ def test_keyframes_that_are_out_of_sync_leave_the_buffer(since, count, left):
     buffer.remove(since, count)
     assert list(buffer.features) == left
     assert buffer.features.maxlen == 8
+
+
+def test_keyframes_that_should_not_have_been_taken_leave_the_buffer_with_their_counts():
+    buffer = KeyframeBuffer(5)
+    for k in range(7):
+        buffer.add(k)
+        if k == 3:
+            buffer.batch(list(buffer.features))
+    buffer.unfused = 4
+    generation = buffer.generation
+    buffer.drop(lambda k: k > 100)
+    assert (list(buffer.features), buffer.generation) == ([2, 3, 4, 5, 6], generation)
+    buffer.drop(lambda k: k in (2, 5))
+    assert (list(buffer.features), buffer.new, buffer.unfused) == ([3, 4, 6], 2, 3)
+    assert buffer.generation == generation + 1
+    assert buffer.features.maxlen == 5
