@@ -50,7 +50,7 @@ class LidarsOfRig:
     ) -> None:
         self.names, self._topics, self._decoded, self._common = names, topics, decoded, common
         self._parameters, self._health, self._start = parameters, health, start
-        self.pair = LidarPair(*names, parameters().config.motion.time_offset_sigma_s)
+        self.reset()
         self.load = LoadBudget(parameters().config.online, purse=common.purse)
         self.missing = ""  # why nothing is registered, for a person
         self._recent: dict[str, deque[Stamped]] = {name: deque(maxlen=SCANS_KEPT) for name in names}
@@ -73,6 +73,10 @@ class LidarsOfRig:
         self._listeners = {}
         for recent in self._recent.values():
             recent.clear()
+
+    def reset(self) -> None:
+        """Forget what was registered; scans that are worked on go into what is forgotten."""
+        self.pair = LidarPair(*self.names, self._parameters().config.motion.time_offset_sigma_s)
 
     def stop(self) -> bool:
         """End the thread; True if it ended."""
@@ -119,7 +123,7 @@ class LidarsOfRig:
             self._worker.put(moment)
 
     def _register(self, moment: Moment) -> None:
-        T, motion = self._start(), self._parameters().config.motion
+        pair, T, motion = self.pair, self._start(), self._parameters().config.motion
         with self._common.estimates.mine(self._worker.check_cancelled), self.load.counting(Work.ESTIMATES):
             self.load.start_estimate()
             scans = [
@@ -127,7 +131,7 @@ class LidarsOfRig:
                 for name, own in moment.items()
             ]
             if T is not None:
-                self.pair.add(scans[0], scans[1], T)
+                pair.add(scans[0], scans[1], T)
                 self.stamp = min(int(own.stamps[-1]) for own in scans)
 
     def _failed(self, error: Exception) -> None:
