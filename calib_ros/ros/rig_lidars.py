@@ -18,7 +18,7 @@ from calib_ros.online.pacing import LoadBudget, Work, is_due
 from calib_ros.online.worker import Worker
 from calib_ros.result import INITIAL
 from calib_ros.rig.lidar_pair import QUICK_S, LidarPair
-from calib_ros.rig.lidars import SCANS_KIND, LidarScans
+from calib_ros.rig.lidars import LidarScans
 from calib_ros.rig.live import PairState
 from calib_ros.ros.conversions import Serialized
 from calib_ros.ros.diagnostics import Health
@@ -76,7 +76,8 @@ class LidarsOfRig:
 
     def reset(self) -> None:
         """Forget what was registered; scans that are worked on go into what is forgotten."""
-        self.pair = LidarPair(*self.names, self._parameters().config.motion.time_offset_sigma_s)
+        config = self._parameters().config
+        self.pair = LidarPair(*self.names, config.motion.time_offset_sigma_s, config.refine)
 
     def stop(self) -> bool:
         """End the thread; True if it ended."""
@@ -91,7 +92,7 @@ class LidarsOfRig:
     def state(self) -> PairState:
         """What it says of itself now."""
         extrinsic, silent = self.pair.extrinsic, self.silent()
-        return PairState(*self.names, extrinsic, extrinsic.usable and not silent, silent, SCANS_KIND)
+        return PairState(*self.names, extrinsic, extrinsic.usable and not silent, silent, self.pair.kind)
 
     def check(self) -> None:
         """Follow the publishers and the parameters; to be called about once a second."""
