@@ -210,48 +210,69 @@ def write_back(path: str, result: Result, edges: Edges, joint: str) -> None:
     """
     poses = [Pose.of(result, parent) for parent in ("camera", "lidar")]
     edges = {(pose.parent, pose.child): pose.T for pose in poses} | dict(edges)
-    kind, before = Path(path).suffix.lower(), None
-    try:
-        before = Path(path).read_bytes()
-    except FileNotFoundError:
-        if kind in DESCRIPTIONS:
-            raise BadInputError(f"{path} does not exist; name the robot's description") from None
-    except OSError as error:
-        raise BadInputError(f"cannot read {path}: {error.strerror}; name a file") from None
+    kind, before = Path(path).suffix.lower(), content(path)
     if kind in DESCRIPTIONS:
-        data = _with_origin(before or b"", path, joint, edges)
+        if before is None:
+            raise BadInputError(f"{path} does not exist; name the robot's description")
+        data = _with_origin(before, path, joint, edges)
     elif kind in AUTOWARE:
         data = autoware_yaml(poses[0]).encode() if before is None else _with_entry(before, path, edges)
     else:
         data = result.dumps().encode()
-    if before is not None and data != before:
+    replace_file(path, data, before)
+
+
+def replace_file(path: str, data: bytes, before: bytes | None) -> None:
+    """Write a file that held `before`, None if there was none, which is kept as NAME.former. BadInputError if it cannot be."""
+    if data == before:
+        return
+    if before is not None:
         io.write_atomically(path + FORMER, before)
-    if data != before:
-        io.write_atomically(path, data)
+    io.write_atomically(path, data)
 
 
-def write_joints(path: str, poses: Sequence[Pose], edges: Edges) -> set[str]:
-    """Write to a robot's description: the origins of all joints between frames of `edges` change, and the former file is kept as
-    NAME.former; a missing file is made of joints of the poses. Returns the frames that are joined. Raises BadInputError as
-    `write_back`."""
-    try:
-        before = Path(path).read_bytes()
-    except FileNotFoundError:
+def write_edges(path: str, poses: Sequence[Pose], edges: Edges) -> set[str]:
+    """Write several edges to a robot's description or Autoware's YAML: the origins of all joints, or all entries, between frames
+    of `edges` change, every other byte stays, and the former file is kept as NAME.former; a missing file is made of the poses.
+    Returns the frames that are joined. Raises BadInputError as `write_back`."""
+    before = content(path)
+    if before is None:
         joints = "".join(map(urdf_joint, poses))
-        io.write_atomically(path, f'<?xml version="1.0"?>\n<robot name="rig">\n{joints}</robot>\n'.encode())
+        robot = f'<?xml version="1.0"?>\n<robot name="rig">\n{joints}</robot>\n'
+        text = robot if Path(path).suffix.lower() in DESCRIPTIONS else autoware_yaml(*poses)
+        io.write_atomically(path, text.encode())
         return {frame for pose in poses for frame in (pose.parent, pose.child)}
+    data, ours = with_edges(before, path, edges)
+    replace_file(path, data, before)
+    return {frame for links in ours for frame in links}
+
+
+def with_edges(data: bytes, path: str, edges: Edges) -> tuple[bytes, list[tuple[str, str]]]:
+    """What `write_edges` writes to a file that exists, and which edges these are. Raises BadInputError."""
+    of_joints = Path(path).suffix.lower() in DESCRIPTIONS
+    if of_joints:
+        joined = {n: _links(joint) for n, (joint, *more) in _joints(data, path).items() if not more and _links(joint) in edges}
+        for name in joined:
+            data = _with_origin(data, path, name, edges)
+        ours = list(joined.values())
+    else:
+        root = _yaml(data, path)[1]
+        ours = [(parent, child) for parent, child in edges if _value_of(_value_of(root, parent), child) is not None]
+        for edge in ours:
+            data = _with_entry(data, path, {edge: edges[edge]})
+    if not ours:
+        raise BadInputError(f"{path} has no {'joint' if of_joints else 'entry'} between the sensors; {_no_edge(edges)}")
+    return data, ours
+
+
+def content(path: str) -> bytes | None:
+    """Of a file; None if there is none. BadInputError if it cannot be read."""
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        return None
     except OSError as error:
         raise BadInputError(f"cannot read {path}: {error.strerror}; name a file") from None
-    data = before
-    ours = {n: _links(joint) for n, (joint, *more) in _joints(data, path).items() if not more and _links(joint) in edges}
-    if not ours:
-        raise BadInputError(f"{path} has no joint between the sensors; {_no_edge(edges)}")
-    for name in ours:
-        data = _with_origin(data, path, name, edges)
-    if data != before:
-        io.write_atomically(path + FORMER, before)
-        io.write_atomically(path, data)
-    return {frame for links in ours.values() for frame in links}
 
 
 @dataclass
@@ -331,11 +352,7 @@ def _with_origin(data: bytes, path: str, name: str, edges: Edges) -> bytes:
 
 def _with_entry(data: bytes, path: str, edges: Edges) -> bytes:
     """Autoware's YAML with the numbers of the first of the edges that it has replaced."""
-    try:
-        text = data.decode()
-        root = io.compose(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise BadInputError(f"{path} is no valid YAML{io.what_is_wrong(error)}; correct it") from None
+    text, root = _yaml(data, path)
     for (parent, child), T in edges.items():
         entry = _value_of(_value_of(root, parent), child)
         if entry is None:
@@ -351,6 +368,15 @@ def _with_entry(data: bytes, path: str, edges: Edges) -> bytes:
             text = text[:begin] + _number(value) + text[end:]
         return text.encode()
     raise BadInputError(f"{path} has no entry of the extrinsic; {_no_edge(edges)}")
+
+
+def _yaml(data: bytes, path: str) -> tuple[str, yaml.Node | None]:
+    """Text and root of a YAML file."""
+    try:
+        text = data.decode()
+        return text, io.compose(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise BadInputError(f"{path} is no valid YAML{io.what_is_wrong(error)}; correct it") from None
 
 
 def _value_of(node: yaml.Node | None, name: str) -> yaml.Node | None:

@@ -160,7 +160,7 @@ def _replay(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
     """What is not an accepted estimate is exported with a note, since initial extrinsics are exported as well."""
     from calib_ros.cli.output import note
-    from calib_ros.export import DESCRIPTIONS, Pose, export, renamed, write_joints
+    from calib_ros.export import DESCRIPTIONS, Pose, export, renamed, write_edges
     from calib_ros.io import write_atomically
     from calib_ros.online.state import read_state
 
@@ -176,7 +176,7 @@ def _export(args: argparse.Namespace) -> int:
         print(text, end="")
     elif args.format == "urdf" and Path(args.out).suffix.lower() in DESCRIPTIONS and Path(args.out).exists():
         poses = [Pose.of(renamed(result, args.camera_frame, args.lidar_frame), parent) for parent in ("camera", "lidar")]
-        write_joints(args.out, (), {(pose.parent, pose.child): pose.T for pose in poses})
+        write_edges(args.out, (), {(pose.parent, pose.child): pose.T for pose in poses})
         print(f"changed the joint between the sensors in {args.out}")
     else:
         write_atomically(args.out, text.encode())

@@ -31,7 +31,7 @@ from calib_ros.registration.motion_guess.hand_eye import CONVERGED_RAD, OVERLAP
 from calib_ros.registration.motion_guess.tracks import Run, picture_pairs
 from calib_ros.rig.graph import Edge
 
-SCANS_KIND = "scans"  # of edges
+SCANS_KIND, MOTION_KIND = "scans", "motion"  # of edges
 SCANS = 20  # that are registered: what more of them show is much the same
 VOXEL_M = 0.4  # half of the odometry's, since both scanners see the same at once
 # Of matches: the prior's error at 30 m and more; that which MIN_MATCHED is about; and what the scans in place need.
@@ -271,7 +271,11 @@ def motion_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], 
     starts, ends = pairs[both].T
     if len(starts) < MIN_MOTIONS:
         raise TooFewFeaturesError(f"{name_a} and {name_b}: they moved too little; give some seconds of driving, with a bend")
-    A, B = run.relative(starts, ends), other.relative(starts + shift, ends + shift)
+    return hand_eye_edge(name_a, name_b, run.relative(starts, ends), other.relative(starts + shift, ends + shift), T)
+
+
+def hand_eye_edge(target: str, source: str, A: Matrix, B: Matrix, T: Transform) -> Edge:
+    """The same from motions (n, 4, 4) of target and source, at least MIN_MOTIONS in the order of time."""
     X, H = _hand_eye(A, B, T)
     # Errors of odometry last: what one part of the drive says against the others is more than residuals let expect (jackknife).
     parts = np.array_split(np.arange(len(A)), PARTS)
@@ -280,7 +284,7 @@ def motion_edge(target: tuple[str, LidarScans], source: tuple[str, LidarScans], 
     apart -= apart.mean(axis=0)
     spread = apart.T @ apart * (len(apart) - 1) / len(apart)
     common = np.diag(np.repeat([np.deg2rad(FLOOR_DEG) ** 2, COMMON_M**2], 3))
-    return Edge(name_a, name_b, X, _symmetric(np.linalg.inv(H) + spread + common), "motion", samples=len(A))
+    return Edge(target, source, X, _symmetric(np.linalg.inv(H) + spread + common), MOTION_KIND, samples=len(A))
 
 
 def _hand_eye(A: Matrix, B: Matrix, X: Transform) -> tuple[Transform, Matrix]:

@@ -79,14 +79,19 @@ class SensorState:
 
 @dataclass(frozen=True, eq=False)
 class RigState:
-    """moved: sensors that have been displaced and are not found again. text: what is known of the last displacement. pairs: what
-    it follows from."""
+    """report: on the solution, without the names of frames and intrinsics. moved: sensors that have been displaced and are not
+    found again. text: what is known of the last displacement. pairs: what it follows from."""
 
-    solution: RigSolution
+    report: RigReport
     sensors: tuple[SensorState, ...]
     moved: tuple[str, ...] = ()
     text: str = ""
     pairs: tuple[PairState, ...] = ()
+
+    @property
+    def solution(self) -> RigSolution:
+        """Where the sensors are."""
+        return self.report.solution
 
     def __str__(self) -> str:
         used = [s.name for s in self.sensors if s.usable]
@@ -123,9 +128,9 @@ class LiveRig:
         measured = [Measurement(*p.pair, p.kind, edges.get(p.pair), p.reason) for p in known]
         report = RigReport(self._description, solution, measured, {}, {}, limits=self._limits)
         rejected = {(e.target, e.source) for e in (*solution.rejected, *solution.doubted) if e.kind != PRIOR}
-        joined = _joined(reference, [p.pair for p in known if p.usable and p.pair in edges and p.pair not in rejected])
+        joined = joined_to(reference, [p.pair for p in known if p.usable and p.pair in edges and p.pair not in rejected])
         sensors = tuple(self._sensor(name, report, joined, moved, known) for name in solution.poses)
-        return RigState(solution, sensors, moved, self._told, tuple(pairs))
+        return RigState(report, sensors, moved, self._told, tuple(pairs))
 
     def _sensor(
         self, name: str, report: RigReport, joined: set[str], moved: Sequence[str], pairs: Sequence[PairState]
@@ -188,7 +193,7 @@ def suspects(lost: set[Pair], fitting: Sequence[Pair]) -> tuple[str, ...]:
     return tuple(common or names)
 
 
-def _joined(reference: str, pairs: Sequence[Pair]) -> set[str]:
+def joined_to(reference: str, pairs: Sequence[Pair]) -> set[str]:
     """Sensors that pairs join to the reference, itself among them where there is one."""
     joined, before = {reference}, 0
     while len(joined) > before:

@@ -257,6 +257,16 @@ class RigReport:
                   for n, p in at.items()]  # fmt: skip
         return f'<svg viewBox="0 0 130 100" width="640" height="480">{"".join(drawn)}</svg>'
 
+    def has_changed(self, before: RigReport) -> bool:
+        """Whether a sensor is elsewhere than before: by more than its standard deviation in one of the six directions."""
+        poses, former = self.solution.poses, before.solution.poses
+        if (self.frames, poses.keys()) != (before.frames, former.keys()):
+            return True
+        return any(
+            bool((np.abs(se3.log(T @ se3.inverse(former[n]))) > np.sqrt(np.diag(self.solution.marginal(n)))).any())
+            for n, T in poses.items()
+        )
+
     def edges_of_frames(self) -> dict[tuple[str, str], Transform]:
         """T_parent_child (4, 4) by TF frames, of every two sensors, the reference as parent first."""
         names = [self.solution.reference, *self.solution.columns]
@@ -264,28 +274,23 @@ class RigReport:
         return {(self.frames[a], self.frames[b]): se3.inverse(poses[a]) @ poses[b] for a in names for b in names if a != b}
 
     def write(self, path: str) -> str:
-        """Write to a file of another tool, by its ending: the joints of a robot's description (.urdf, .xacro), whose origins
-        change where the file exists; Autoware's YAML; Kalibr's camera chain where the name begins with camchain. Returns which
-        sensors it has no place for, in a line; "" if none."""
+        """Write to a file of another tool, by its ending: the joints of a robot's description (.urdf, .xacro) or the entries of
+        Autoware's YAML, which change where the file exists; Kalibr's camera chain where the name begins with camchain. Returns
+        which sensors it has no place for, in a line; "" if none."""
         check_out(path)
         frames = sorted(self.frames.values())
         if len(set(frames)) < len(frames) or "" in frames:
-            raise BadInputError(
-                f"--out {path}: sensors share a TF frame or have none ({', '.join(frames)}); set sensors.NAME.frame"
-            )
+            raise BadInputError(f"{path}: sensors share a TF frame or have none ({', '.join(frames)}); set sensors.NAME.frame")
         edges, name = self.edges_of_frames(), Path(path).name
         poses = [export.Pose(a, b, T) for (a, b), T in edges.items() if a == self.frames[self.solution.reference]]
         if name.startswith(CAMCHAIN):
             cameras = {n: (c, self.solution.poses[n], self.description[n].topic) for n, c in self.cameras.items()}
             io.write_atomically(path, export.kalibr_camchain(cameras).encode())
-        elif Path(path).suffix.lower() in export.DESCRIPTIONS:
-            joined = export.write_joints(path, poses, edges)
-            if missing := [name for name, frame in self.frames.items() if frame not in joined]:
-                return f"{path} has no joint for {', '.join(missing)}, which are not written; add joints of their frames"
-        else:
-            if Path(path).is_file():
-                io.write_atomically(path + export.FORMER, Path(path).read_bytes())
-            io.write_atomically(path, export.autoware_yaml(*poses).encode())
+            return ""
+        joined = export.write_edges(path, poses, edges)
+        if missing := [name for name, frame in self.frames.items() if frame not in joined]:
+            what = ("joint", "joints") if Path(path).suffix.lower() in export.DESCRIPTIONS else ("entry", "entries")
+            return f"{path} has no {what[0]} for {', '.join(missing)}, which are not written; add {what[1]} of their frames"
         return ""
 
 

@@ -26,7 +26,7 @@ def done(node: Node, promise: Promise[Any]) -> Future:
     return awaitable
 
 
-def after_answers(node: Node, action: Callable[[], None]) -> None:
+def after_answers(node: Node, action: Callable[[], object]) -> None:
     """Call `action` when answers that wait for no promise any more are sent: without its service an answer ends the executor."""
     executor = node.executor
     if executor is None:

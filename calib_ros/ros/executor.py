@@ -8,15 +8,33 @@ from __future__ import annotations
 
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.timer import Timer
 
 MOST = 50  # callbacks in a row
+SPIN_S = 0.2  # between two looks at these nodes: how late their services may answer
 
 
 class Beside(SingleThreadedExecutor):
     """Spun now and then, from a timer of the node that its nodes belong to and on the same thread."""
 
     _found = False
+    _timer: Timer | None = None
+
+    def spin_from(self, node: Node) -> None:
+        """Spin whenever that node does, every SPIN_S."""
+        self._timer = node.create_timer(SPIN_S, self.spin_ready, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def destroy(self, node: Node) -> None:
+        """End, and destroy its nodes; node: that it is spun from."""
+        if self._timer is not None:
+            node.destroy_timer(self._timer)
+        nodes = self.get_nodes()
+        self.shutdown(timeout_sec=SPIN_S)
+        for own in nodes:
+            own.destroy_node()
 
     def wait_for_ready_callbacks(self, *args: Any, **kwargs: Any) -> Any:
         """See `rclpy.executors.Executor`."""

@@ -55,6 +55,8 @@ class CalibLifecycleNode(LifecycleNode):
     def destroy_node(self) -> None:
         """Ends the threads first: they publish through this node."""
         self.stop()
+        if self.calibration is not None:
+            self.calibration.destroy_nodes()
         super().destroy_node()
 
     def _configured(self) -> RosInterface | RigInterface:
@@ -63,18 +65,12 @@ class CalibLifecycleNode(LifecycleNode):
 
     def _configure(self) -> None:
         self.calibration = interface(self)
-        for other in self.calibration.nodes:
-            if self.executor is not None:
-                self.executor.add_node(other)
 
     def _clean_up(self) -> None:
         calibration, self.calibration = self.calibration, None
         if calibration is not None:
             self._ended = calibration.destroy() and self._ended
-            for other in calibration.nodes:
-                if self.executor is not None:
-                    self.executor.remove_node(other)
-                other.destroy_node()
+            calibration.destroy_nodes()
 
     def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         """rclpy itself would end a transition that raises without a word."""

@@ -48,7 +48,6 @@ class RosInterface:
 
     def __init__(self, node: Node, rig: PairOfRig | None = None) -> None:
         self._node, self._rig = node, rig
-        self.nodes: tuple[Node, ...] = ()  # beside this one
         self.parameters = parameters.declare(node)
         self.health = Health(node.get_logger())
         given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
@@ -91,12 +90,28 @@ class RosInterface:
         self._noted = ""  # the newest line of the diagnostics
         self._nameless: set[str] = set()  # sensors whose messages have no frame_id
         self._timers: list[Timer] = []
-        helpers = self.initial, self.capture, self._save, self.extrinsic, self.health, self._files, self.black_box.events
+        helpers = (
+            self.initial,
+            self.capture,
+            self._save,
+            self.extrinsic,
+            self.health,
+            self._files,
+            self.black_box.events,
+            self.reset,
+        )
         self.serving = Services(node, self.pipeline, *helpers)
         self.calibrating = CalibrateServers(node, self.pipeline, self.serving.message, self.health)
         makers = node_services(node.get_logger().warning)
         self.beside = {name: make(node, self.pipeline, self.health) for name, make in makers.items()}
         node.add_on_set_parameters_callback(self._on_parameters)
+
+    def reset(self) -> None:
+        """Forget the keyframes, and go back to the initial extrinsic."""
+        self.pipeline.reset()
+        self.capture.clear()
+        if self._rig is not None:
+            self._rig.on_reset()
 
     # ---- states -------------------------------------------------------------------------------------------------------
 
@@ -162,6 +177,9 @@ class RosInterface:
         for publishing in (self.extrinsic, self.overlay, self.processed):
             self._node.destroy_publisher(publishing.publisher)
         return ended
+
+    def destroy_nodes(self) -> None:
+        """Those beside this one: none."""
 
     # ---- pipeline, on its threads -------------------------------------------------------------------------------------
 
@@ -321,11 +339,6 @@ class CalibNode(Node):
         self.calibration = interface(self)
         self.calibration.activate()
 
-    @property
-    def others(self) -> tuple[Node, ...]:
-        """The nodes of a rig's pairs, which are to spin along with this one."""
-        return () if self.calibration is None else tuple(self.calibration.nodes)
-
     def stop(self) -> bool:
         """End all threads of the node; True if they ended."""
         return self.calibration is None or bool(self.calibration.stop())
@@ -333,6 +346,6 @@ class CalibNode(Node):
     def destroy_node(self) -> None:
         """Ends the threads first: they publish through this node."""
         self.stop()
-        for other in self.others:
-            other.destroy_node()
+        if self.calibration is not None:
+            self.calibration.destroy_nodes()
         super().destroy_node()

@@ -119,7 +119,9 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
         "files that a converged extrinsic is written to; by their names: .json = result, .urdf and .xacro = origin of "
         "export.joint, .yaml = Autoware's sensor_kit_calibration.yaml; the former file is kept as NAME.former",
     ),
-    "export.joint": option("", "joint of the robot's description in export.on_converged, between camera and LiDAR"),
+    "export.joint": option(
+        "", "joint of the robot's description in export.on_converged, between camera and LiDAR; those of a rig are found"
+    ),
     "capture_dir": option(
         "", "folder that captures, the raw messages of the newest keyframes, are written to; of one node; empty = off"
     ),
@@ -180,7 +182,7 @@ class Parameters:
         for name in files:
             if not name.lower().endswith(WRITABLE):
                 raise ConfigError(f"export.on_converged: the kind of {name!r} is none of {', '.join(WRITABLE)}")
-        if not self["export.joint"] and any(name.lower().endswith(DESCRIPTIONS) for name in files):
+        if not (self["export.joint"] or self["rig_file"]) and any(name.lower().endswith(DESCRIPTIONS) for name in files):
             raise ConfigError(
                 "export.on_converged has a robot's description: export.joint must name its joint between the sensors"
             )

@@ -34,7 +34,7 @@ from typing import Any
 from calib_ros.errors import CalibrationError
 from calib_ros.runtime import return_freed_memory
 
-WAKE_S = 0.2  # Python's handlers of signals run between callbacks only; how late services of the pairs of a rig may answer
+WAKE_S = 0.2  # Python's handlers of signals run between callbacks only
 
 
 def calib_node(args: list[str] | None = None) -> int:
@@ -74,7 +74,6 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
 
     from calib_ros.ros import parameters
     from calib_ros.ros.dds import use_large_message_profile
-    from calib_ros.ros.executor import Beside
 
     use_large_message_profile()
     return_freed_memory()
@@ -89,14 +88,12 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
     except Exception as error:  # rcl's message names what is wrong with the arguments or the parameter file
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    executor, beside = SingleThreadedExecutor(), Beside()
+    executor = SingleThreadedExecutor()
     node: Any = None
     try:
         node = make()
-        node.create_timer(WAKE_S, beside.spin_ready, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(WAKE_S, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
         executor.add_node(node)
-        for own in getattr(node, "others", ()):
-            beside.add_node(own)
         while not _asked_to_end:
             executor.spin_once()
     except CalibrationError as error:
@@ -106,8 +103,7 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
         pass
     finally:
         ended = node is None or node.stop()
-        for own in (beside, executor):
-            own.shutdown(timeout_sec=0.2)
+        executor.shutdown(timeout_sec=0.2)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

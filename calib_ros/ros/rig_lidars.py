@@ -18,7 +18,7 @@ from calib_ros.online.pacing import LoadBudget, Work, is_due
 from calib_ros.online.worker import Worker
 from calib_ros.result import INITIAL
 from calib_ros.rig.lidar_pair import QUICK_S, LidarPair
-from calib_ros.rig.lidars import SCANS_KIND, LidarScans
+from calib_ros.rig.lidars import LidarScans
 from calib_ros.rig.live import PairState
 from calib_ros.ros.conversions import Serialized
 from calib_ros.ros.diagnostics import Health
@@ -50,7 +50,7 @@ class LidarsOfRig:
     ) -> None:
         self.names, self._topics, self._decoded, self._common = names, topics, decoded, common
         self._parameters, self._health, self._start = parameters, health, start
-        self.pair = LidarPair(*names, parameters().config.motion.time_offset_sigma_s)
+        self.reset()
         self.load = LoadBudget(parameters().config.online, purse=common.purse)
         self.missing = ""  # why nothing is registered, for a person
         self._recent: dict[str, deque[Stamped]] = {name: deque(maxlen=SCANS_KEPT) for name in names}
@@ -74,6 +74,11 @@ class LidarsOfRig:
         for recent in self._recent.values():
             recent.clear()
 
+    def reset(self) -> None:
+        """Forget what was registered; scans that are worked on go into what is forgotten."""
+        config = self._parameters().config
+        self.pair = LidarPair(*self.names, config.motion.time_offset_sigma_s, config.refine)
+
     def stop(self) -> bool:
         """End the thread; True if it ended."""
         return self._worker.stop()
@@ -87,7 +92,7 @@ class LidarsOfRig:
     def state(self) -> PairState:
         """What it says of itself now."""
         extrinsic, silent = self.pair.extrinsic, self.silent()
-        return PairState(*self.names, extrinsic, extrinsic.usable and not silent, silent, SCANS_KIND)
+        return PairState(*self.names, extrinsic, extrinsic.usable and not silent, silent, self.pair.kind)
 
     def check(self) -> None:
         """Follow the publishers and the parameters; to be called about once a second."""
@@ -119,7 +124,7 @@ class LidarsOfRig:
             self._worker.put(moment)
 
     def _register(self, moment: Moment) -> None:
-        T, motion = self._start(), self._parameters().config.motion
+        pair, T, motion = self.pair, self._start(), self._parameters().config.motion
         with self._common.estimates.mine(self._worker.check_cancelled), self.load.counting(Work.ESTIMATES):
             self.load.start_estimate()
             scans = [
@@ -127,7 +132,7 @@ class LidarsOfRig:
                 for name, own in moment.items()
             ]
             if T is not None:
-                self.pair.add(scans[0], scans[1], T)
+                pair.add(scans[0], scans[1], T)
                 self.stamp = min(int(own.stamps[-1]) for own in scans)
 
     def _failed(self, error: Exception) -> None:

@@ -5,25 +5,23 @@ Every pair has the interface of a node of its own, named by its LiDAR below the 
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
-from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from calib_ros_msgs.msg import Rig, RigEdge, RigLoop, RigSensor
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from calib_ros_msgs.msg import Rig
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
+from std_srvs.srv import Trigger
 
-from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
@@ -32,27 +30,37 @@ from calib_ros.online.pacing import LoadBudget
 from calib_ros.online.worker import Worker
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import MOVED, SUSPECT
-from calib_ros.rig.description import CAMERA, RigDescription, Sensor, prior_covariance, read_rig
+from calib_ros.rig.description import CAMERA, Sensor, prior_covariance, read_rig
 from calib_ros.rig.edges import box_of
 from calib_ros.rig.graph import solve
-from calib_ros.rig.live import KIND, LiveRig, Pair, PairState, RigState
+from calib_ros.rig.live import LiveRig, Pair, PairState, RigState
 from calib_ros.ros import parameters
-from calib_ros.ros.conversions import covariance_for_ros, time_message, transform_message
-from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
+from calib_ros.ros.answers import ROUNDS, after_answers
+from calib_ros.ros.conversions import transform_message
+from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.executor import Beside
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import VALID_PERIODS
 from calib_ros.ros.rig_lidars import LidarsOfRig
-from calib_ros.ros.rig_pairs import PairOfRig, SharedTopics, decoded_clouds, decoded_images
+from calib_ros.ros.rig_messages import rig_message, rig_status
+from calib_ros.ros.rig_pairs import (
+    OF_PAIR,
+    OF_RIG,
+    USED,
+    PairOfRig,
+    SharedTopics,
+    camera_pairs,
+    decoded_clouds,
+    decoded_images,
+    lidar_pairs,
+    node_of_pair,
+)
 from calib_ros.ros.tf import LATCHED, StaticTf
+from calib_ros.ros.write_back import RigWriteBack, check_files
 
 if TYPE_CHECKING:
     from calib_ros.ros.node import RosInterface
 
-TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")  # of the name of a node
-# Settings of a node of one pair that a rig has in another way, or a pair each by itself.
-OF_RIG = {"rig_file", "publish_tf", "tf_parent", "tf_child", "export.on_converged", "export.joint"}
-OF_PAIR = {"camera_frame", "lidar_frame", "initial_translation_m", "initial_quaternion_xyzw", "state_file", "capture_dir"}
-USED = {"rig_file", "publish_tf", "state_file", "capture_dir"}  # of these, by the rig as well
 TF_CURE = "take what says otherwise out of the robot's description, or write the rig to its joints with calib-ros rig --out"
 Priors = dict[str, tuple[Transform, Covariance]]
 
@@ -60,14 +68,15 @@ Priors = dict[str, tuple[Transform, Covariance]]
 class RigInterface:
     """Topics, services and parameters of a rig on a node, with the members of a `RosInterface`.
 
-    pairs: their interfaces. nodes: of the pairs, to spin along. state: the newest, None before the first second. make: the
+    pairs: their interfaces, on nodes that spin along. state: the newest, None before the first second. make: the
     interface of a pair. Raises a CalibrationError for a rig file or parameters that cannot work.
     """
 
     def __init__(self, node: Node, declared: Parameters, make: Callable[[Node, PairOfRig], RosInterface]) -> None:
         self._node, self.parameters, self.health = node, declared, Health(node.get_logger())
         self.description = read_rig(declared["rig_file"])
-        wanted = _pairs(self.description, declared["rig_file"])
+        wanted = camera_pairs(self.description, declared["rig_file"])
+        self._check_files(declared)
         overrides = node._parameter_overrides
         for line in parameters.misspelt({name: p.value for name, p in overrides.items()}, node._parameters):
             node.get_logger().warning(line)
@@ -84,14 +93,16 @@ class RigInterface:
         decoded = {s.name: decoded_images() if s.kind == CAMERA else decoded_clouds() for s in self.description.sensors}
         self.pairs: dict[Pair, RosInterface] = {}
         self._views: list[PairOfRig] = []  # of pairs that are estimated only if they share a view
-        self.nodes: tuple[Node, ...] = ()
+        self._beside = Beside(context=node.context)
+        self._beside.spin_from(node)
         for camera, lidar in wanted:
             pair = PairOfRig(*(camera, lidar, common, self._shared, self._topics(camera, lidar), decoded[camera], decoded[lidar]))
             known = self._between(camera, lidar)
             pair.T = None if known is None else known[0]
-            own = _node_of(node, camera, lidar, self._overrides(camera, lidar, known))
-            self.nodes = (*self.nodes, own)
+            own = node_of_pair(node, declared, self.description, (camera, lidar), known)
+            self._beside.add_node(own)
             self.pairs[camera, lidar] = made = make(own, pair)
+            pair.on_reset = partial(self._reset_lidars, lidar)
             if self.description.pairs is None:
                 pair.unseen = lambda why, made=made: self._unseen(made, why)
                 self._views.append(pair)
@@ -99,7 +110,7 @@ class RigInterface:
         given = (lambda: self.parameters, self.health)
         self.lidars = [
             LidarsOfRig(pair, topics, decoded, common, *given, partial(self._start_of, *pair))
-            for pair in _lidar_pairs(self.description)
+            for pair in lidar_pairs(self.description)
         ]
         self._lock = threading.Lock()  # of state, active and what is published of them
         self._active = False
@@ -108,11 +119,14 @@ class RigInterface:
         self._text = ""
         self._edges: list[TransformStamped] = []  # of the newest solution
         self._edges_told = self._edges
-        self._solver: Worker[tuple[list[PairState], Priors]] = Worker("calib_rig", self._solve, self._failed)
+        self._files = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_files")  # disks may be slow
+        self._write_back = RigWriteBack(lambda: self.parameters, self._files, self.health)
+        self._solver: Worker[tuple[LiveRig, list[PairState], Priors]] = Worker("calib_rig", self._solve, self._failed)
         self.publisher = node.create_publisher(Rig, "~/rig", LATCHED)
         self._diagnostics_pub = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timers: list[Timer] = []
         self._ended: bool | None = None
+        self._service = node.create_service(Trigger, "~/reset", self._reset)
         node.add_on_set_parameters_callback(self._on_parameters)
 
     # ---- states -------------------------------------------------------------------------------------------------------
@@ -151,20 +165,28 @@ class RigInterface:
             with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
                 ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
             self._ended = all([*ended, *(lidars.stop() for lidars in self.lidars), self._solver.stop()])
+            self._files.shutdown(wait=True)
         return self._ended
 
     def destroy(self) -> bool:
-        """See `RosInterface`; the pairs' nodes are left to whoever spins them."""
+        """See `RosInterface`."""
         if self._timers:
             self.deactivate()
         ended = self.stop()
         for pair in self.pairs.values():
             pair.destroy()
+        for _ in range(ROUNDS + 1):  # so that `after_answers` comes to its end
+            self._beside.spin_ready()
         self._node.remove_on_set_parameters_callback(self._on_parameters)
         self.tf.destroy()
+        after_answers(self._node, partial(self._node.destroy_service, self._service))
         for publisher in (self.publisher, self._diagnostics_pub):
             self._node.destroy_publisher(publisher)
         return ended
+
+    def destroy_nodes(self) -> None:
+        """Those of the pairs, at the very end."""
+        self._beside.destroy(self._node)
 
     # ---- what the pairs start from --------------------------------------------------------------------------------------
 
@@ -181,26 +203,6 @@ class RigInterface:
             return None
         T, C = solve([], self._priors_given, reference).between(camera, lidar)
         return T, box_of(C)
-
-    def _overrides(self, camera: str, lidar: str, known: tuple[Transform, SearchBox] | None) -> list[Parameter]:
-        """Parameters of a pair: those of the rig's node, but for what is its own."""
-        given, sensors = self._node._parameter_overrides, self.description
-        known_names = [n for n in given if n in self._node._parameters and n not in OF_RIG | OF_PAIR]
-        own: dict[str, Any] = {"camera_frame": sensors[camera].frame, "lidar_frame": sensors[lidar].frame}
-        if sensors[camera].mask:
-            own["image.mask"] = sensors[camera].mask
-        if known is not None:
-            T, box = known
-            own["initial_translation_m"] = T[:3, 3].tolist()
-            own["initial_quaternion_xyzw"] = se3.quaternion_from_rotation(T[:3, :3]).tolist()
-            own["search.rotation_deg"], own["search.translation_m"] = np.max(box.rotation_deg), np.max(box.translation_m)
-            own |= {name: given[name].value for name in ("search.rotation_deg", "search.translation_m") if name in given}
-        if path := self.parameters["state_file"]:
-            stem, dot, ending = path.rpartition(".")
-            own["state_file"] = f"{stem}.{camera}.{lidar}.{ending}" if dot else f"{path}.{camera}.{lidar}"
-        if folder := self.parameters["capture_dir"]:
-            own["capture_dir"] = f"{folder}/{camera}/{lidar}"
-        return [given[n] for n in known_names if n not in own] + [Parameter(n, value=v) for n, v in own.items()]
 
     def _unseen(self, pair: RosInterface, why: str) -> None:
         pair.pipeline.pause(why)
@@ -246,7 +248,7 @@ class RigInterface:
             changed = len(states) != len(self._told) or not all(map(PairState.says_as, states, self._told))
             if changed or self.state is None or len(priors) + 1 != len(self.state.sensors):
                 self._told = states
-                self._solver.put((states, priors))
+                self._solver.put((self._live, states, priors))
             if (edges := self._edges) is not self._edges_told and self.tf.publish_tree(edges):
                 self._edges_told = edges
             self._diagnostics_pub.publish(self._diagnostics(priors))
@@ -265,14 +267,17 @@ class RigInterface:
         state, priors = self.state, self._priors_now
         if not {target, source} <= priors.keys() | {self.description.reference}:
             return None
-        solution = solve([], priors, self.description.reference) if state is None else state.solution
+        # What LiDARs said of themselves must not come back after a reset: their own edge is not to be their start.
+        known = state is not None and not any(own.pair == (target, source) and own.edge() for own in state.pairs)
+        solution = state.solution if state is not None and known else solve([], priors, self.description.reference)
         return solution.between(target, source)[0] if {target, source} <= solution.poses.keys() else None
 
-    def _solve(self, item: tuple[list[PairState], Priors]) -> None:
+    def _solve(self, item: tuple[LiveRig, list[PairState], Priors]) -> None:
         """On a thread of its own."""
-        state = self._live.update(*item)
+        live, states, priors = item
+        state = live.update(states, priors)
         with self._lock:
-            if not self._active or self._ended is not None:  # the last message has been sent
+            if not self._active or self._ended is not None or live is not self._live:  # its last message has been sent
                 return
             self.state = state
             self.publisher.publish(self._message(state))
@@ -285,6 +290,33 @@ class RigInterface:
         reference = self._frame(state.solution.reference)
         others = [own for own in state.sensors if own.name != state.solution.reference]
         self._edges = [transform_message(own.T, reference, self._frame(own.name), self._stamp(own.name)) for own in others]
+        self._write(state)
+
+    def _write(self, state: RigState) -> None:
+        """To the files of export.on_converged, once all sensors are to be relied on."""
+        if len(state.sensors) == len(self.description.sensors) and all(own.usable for own in state.sensors):
+            frames = {own.name: self._frame(own.name) for own in state.sensors}
+            of_cameras = {camera: pair.pipeline.camera for (camera, _), pair in self.pairs.items()}
+            cameras = {name: camera for name, camera in of_cameras.items() if camera is not None}
+            self._write_back.add(replace(state.report, frames=frames, cameras=cameras, source=self.parameters["vehicle"]))
+
+    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        with self.health.guard():
+            for pair in self.pairs.values():
+                pair.reset()
+            for lidars in self.lidars:
+                lidars.reset()
+            with self._lock:
+                self._live = LiveRig(self.description, self.parameters.config.refine)
+                self._forget()
+            response.success, response.message = True, "all pairs are back to the priors"
+        return response
+
+    def _reset_lidars(self, lidar: str) -> None:
+        """What is known of a LiDAR by other ones."""
+        for own in self.lidars:
+            if lidar in own.names:
+                own.reset()
 
     def _failed(self, error: Exception) -> None:
         with self._lock:
@@ -311,50 +343,15 @@ class RigInterface:
         return max((stamp for names, stamp in stamps if not name or name in names), default=0)
 
     def _message(self, state: RigState, usable: bool = True) -> Rig:
-        now, reference = self._node.get_clock().now().nanoseconds, self._frame(state.solution.reference)
-        msg = Rig(reference=state.solution.reference, moved=list(state.moved), text=str(state))
-        msg.header.frame_id, msg.header.stamp = reference, time_message(now)
-        msg.valid_until = time_message(now + round(VALID_PERIODS * self.parameters["publish_period_s"] * NANOSECONDS))
-        for own in state.sensors:
-            said = RigSensor(name=own.name, status=own.status, reason=own.reason, usable=own.usable and usable)
-            said.transform = transform_message(own.T, reference, self._frame(own.name), self._stamp(own.name))
-            said.covariance, (said.moved_deg, said.moved_m) = covariance_for_ros(own.covariance), own.moved
-            msg.sensors.append(said)
-        for loop in state.solution.loops:
-            deg, m = loop.size
-            msg.loops.append(
-                RigLoop(sensors=list(loop.sensors), rotation_deg=deg, translation_m=m, p_value=loop.p_value, closes=loop.closes)
-            )
-        msg.edges = [self._edge(own, state) for own in state.pairs]
-        for told, edges in ((msg.rejected, state.solution.rejected), (msg.doubted, state.solution.doubted)):
-            told.extend(RigEdge(target=e.target, source=e.source, kind=e.kind) for e in edges)
-        return msg
-
-    def _edge(self, own: PairState, state: RigState) -> RigEdge:
-        edge, poses = own.edge(), state.solution.poses
-        said = RigEdge(target=own.target, source=own.source, kind=own.kind, status=own.status, usable=own.usable)
-        said.reason = "" if own.usable else own.reason
-        said.covariance = covariance_for_ros(None if edge is None else edge.covariance)
-        if edge is not None and {*own.pair} <= poses.keys():
-            said.transform = transform_message(edge.T, "", "", 0).transform
-            said.rotation_deg, said.translation_m = se3.error(se3.inverse(poses[own.target]) @ poses[own.source], edge.T)
-        return said
+        now = self._node.get_clock().now().nanoseconds
+        until = now + round(VALID_PERIODS * self.parameters["publish_period_s"] * NANOSECONDS)
+        return rig_message(state, self._frame, self._stamp, (now, until), usable)
 
     def _diagnostics(self, priors: Mapping[str, Any]) -> DiagnosticArray:
-        state = self.state
-        status = DiagnosticStatus(level=OK, name=f"{self._node.get_fully_qualified_name().lstrip('/')}: rig")
-        status.hardware_id = self.parameters["vehicle"]
         missing = [s.name for s in self.description.sensors if s.name not in priors and s.name != self.description.reference]
-        values = {f"{name}": "nobody knows where it is: set its prior, or publish it on /tf_static" for name in missing}
-        if state is not None:
-            status.message = str(state)
-            good = all(s.usable for s in state.sensors) and not missing and not state.solution.rejected
-            status.level = ERROR if state.moved else OK if good else WARN
-            values |= {s.name: ": ".join(filter(None, [s.status, s.reason])) for s in state.sensors}
-            of_lidars = [own for own in state.pairs if own.kind != KIND]
-            values |= {" with ".join(own.pair): own.status if own.usable else f"{own.status}: {own.reason}" for own in of_lidars}
-        values |= {"errors": str(self.health.errors), "last error": self.health.last_error[0]}
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        told = dict.fromkeys(missing, "nobody knows where it is: set its prior, or publish it on /tf_static")
+        status = rig_status(f"{self._node.get_fully_qualified_name().lstrip('/')}: rig", self.state, told, self.health)
+        status.hardware_id = self.parameters["vehicle"]
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         return message
@@ -366,8 +363,13 @@ class RigInterface:
         answer, new = parameters.on_change(self.parameters, list(changed), None)
         if answer.successful and new["publish_tf"] and self.tf.missing:
             return SetParametersResult(successful=False, reason=self.tf.missing)
+        try:
+            if any(p.name == "export.on_converged" for p in changed):
+                self._check_files(new)
+        except BadInputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         passed = [p for p in changed if p.name not in OF_RIG | OF_PAIR]
-        for own in self.nodes if answer.successful and passed else ():
+        for own in self._beside.get_nodes() if answer.successful and passed else ():
             told = own.set_parameters_atomically(passed)
             if not told.successful:
                 return told
@@ -375,41 +377,15 @@ class RigInterface:
             self.parameters, self.load.config = new, new.config.online
             self.tf.switch(new["publish_tf"])
             self._edges_told = []
+            if (state := self.state) is not None:
+                self._write(state)
         return answer
+
+    def _check_files(self, given: Parameters) -> None:
+        pairs = [*camera_pairs(self.description, given["rig_file"]), *lidar_pairs(self.description)]
+        check_files(given["export.on_converged"], self.description, pairs)
 
 
 def _covariance(sensor: Sensor) -> Covariance:
     assert sensor.prior is not None
     return prior_covariance(sensor.prior, sensor.sigma_deg, sensor.sigma_m)
-
-
-def _pairs(description: RigDescription, path: str) -> list[Pair]:
-    """Cameras and LiDARs to be estimated. BadInputError for names that no topic may have, or a rig without such pairs."""
-    for sensor in description.sensors:
-        if not TOKEN.fullmatch(sensor.name):
-            raise BadInputError(f"{path}: sensors.{sensor.name} cannot be part of a topic's name; use letters, digits and _")
-    given = description.pairs
-    found = list(product(description.cameras, description.lidars)) if given is None else list(given)
-    found = [(a, b) for a, b in found if description[a].kind == CAMERA]
-    if not found:
-        raise BadInputError(f"{path}: pairs holds no camera with a LiDAR, which the node estimates; add one")
-    return found
-
-
-def _lidar_pairs(description: RigDescription) -> list[Pair]:
-    """Two LiDARs to be registered to each other."""
-    if description.pairs is None:
-        return list(combinations(description.lidars, 2))
-    return [(a, b) for a, b in description.pairs if description[a].kind != CAMERA]
-
-
-def _node_of(node: Node, camera: str, lidar: str, overrides: list[Parameter]) -> Node:
-    """A node of a pair: what is remapped or renamed on the command line is the rig's."""
-    return Node(
-        lidar,
-        context=node.context,
-        namespace=f"{node.get_fully_qualified_name()}/{camera}",
-        use_global_arguments=False,
-        parameter_overrides=overrides,
-        allow_undeclared_parameters=True,
-    )

@@ -25,7 +25,8 @@ from calib_ros.ros.publishers import ExtrinsicPublisher
 class Services:
     """~/get_extrinsic, ~/reset, ~/save and ~/capture.
 
-    save: writes a result to the state file. publisher: of ~/extrinsic. files: writes captures. events: for these.
+    save: writes a result to the state file. publisher: of ~/extrinsic. files: writes captures. events: for these. reset: forgets
+    what was found.
     """
 
     def __init__(
@@ -39,10 +40,11 @@ class Services:
         health: Health,
         files: Executor,
         events: Callable[[], str],
+        reset: Callable[[], None],
     ) -> None:
         self._health = health
         self._node, self._pipeline, self._initial, self._recorder = node, pipeline, initial, capture
-        self._write, self._publisher, self._files, self._events = save, publisher, files, events
+        self._write, self._publisher, self._files, self._events, self._forget = save, publisher, files, events, reset
         self._services = [
             node.create_service(GetExtrinsic, "~/get_extrinsic", self._safe(self._get_extrinsic)),
             # A callback that awaits blocks its group: in the node's own group it would block all others until it is done.
@@ -113,8 +115,7 @@ class Services:
         return response
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._pipeline.reset()
-        self._recorder.clear()
+        self._forget()
         response.success, response.message = True, "keyframes forgotten, back to the initial extrinsic"
         return response
 

@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_peer import LATCHED, camera_info_message, cloud_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_srvs.srv import Trigger
 from vehicle import QUICK
 from waiting import LIMIT_S, until
 
@@ -90,7 +91,7 @@ class RigPeer:
         for camera in cameras:
             heard = self.extrinsics[camera].append
             self.peer.create_subscription(Extrinsic, f"/calib_ros/{camera}/{self.lidar}/extrinsic", heard, LATCHED)
-        self._spinning = [self._spin(self.node, *self.node.others), self._spin(self.peer)]
+        self._spinning = [self._spin(self.node), self._spin(self.peer)]
         self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()), "the subscriptions")
 
     @property
@@ -144,6 +145,15 @@ class RigPeer:
         answer = self.node.set_parameters_atomically([Parameter(n.replace("__", "."), value=v) for n, v in named.items()])
         assert answer.successful, answer.reason
 
+    def trigger(self, name: str) -> str:
+        """The answer of a service below the node's name."""
+        client = self.peer.create_client(Trigger, f"/calib_ros/{name}")
+        assert client.wait_for_service(LIMIT_S)
+        asked = client.call_async(Trigger.Request())
+        self.until(asked.done, name)
+        assert asked.result().success, asked.result().message
+        return str(asked.result().message)
+
     def until(self, condition: Callable[[], Any], what: object = "") -> Any:
         """Wait until the condition holds."""
         return until(condition, what, state=lambda: self.calibration.health.last_error[0])
@@ -151,10 +161,9 @@ class RigPeer:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.statuses |= {status.name: status for status in message.status}
 
-    def _spin(self, *nodes: Any) -> tuple[SingleThreadedExecutor, threading.Thread]:
+    def _spin(self, node: Any) -> tuple[SingleThreadedExecutor, threading.Thread]:
         executor = SingleThreadedExecutor(context=self.context)
-        for node in nodes:
-            executor.add_node(node)
+        executor.add_node(node)
 
         def run() -> None:
             with suppress(ExternalShutdownException, InvalidHandle):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import sys
+import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from subprocess import run
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -21,12 +25,14 @@ from rclpy.parameter import Parameter
 from rclpy.time import Time
 from rig_peer import RigPeer, again, describe, measured, poses
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
-from waiting import pause
+from waiting import pause, until
 
 from calib_ros import se3
 from calib_ros.config import OnlineConfig
 from calib_ros.errors import BadInputError
+from calib_ros.export import FORMER
 from calib_ros.lidar.edges import edge_points
 from calib_ros.lidar.ego_motion import estimate_motion
 from calib_ros.messages import decode_cloud
@@ -34,6 +40,7 @@ from calib_ros.online import common
 from calib_ros.online.common import Common
 from calib_ros.online.pacing import Work
 from calib_ros.registration import features
+from calib_ros.rig.report import load
 from calib_ros.ros import conversions
 from calib_ros.ros.conversions import matrix_from_transform
 from calib_ros.ros.lifecycle_node import CalibLifecycleNode
@@ -145,6 +152,46 @@ def test_a_dead_driver_is_named_and_the_other_pair_stays(driven) -> None:
     peer.change(max_data_age_s=3600.0, online__mode="continuous")
 
 
+def test_files_are_written_once_all_sensors_are_usable_and_a_wrong_one_is_refused(rig, driven, tmp_path) -> None:
+    peer, frames = driven.peer, [rig.frame_id(name) for name in (TOP, LEFT, RIGHT)]
+    result, urdf, kit, chain = (tmp_path / name for name in ("rig.json", "car.urdf", "kit.yaml", "camchain.yaml"))
+    joints = [f'<joint name="{c}" type="fixed"><parent link="{TOP}"/><child link="{c}"/></joint>' for c in frames[1:]]
+    urdf.write_text(f'<robot name="car">{"".join(joints)}</robot>')
+    kit.write_text(f"{TOP}:\n  imu: {{x: 1}}  # by hand\n  {frames[1]}: {{x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}\n")
+    before, wrong = kit.read_text(), tmp_path / "other.urdf"
+    wrong.write_text('<robot name="car"><joint name="a" type="fixed"><parent link="b"/><child link="c"/></joint></robot>')
+    refused = peer.node.set_parameters_atomically([Parameter("export.on_converged", value=[str(wrong)])])
+    assert f"{wrong} has no joint between the sensors" in refused.reason
+    peer.change(export__on_converged=[str(path) for path in (result, urdf, kit, chain)])
+    peer.until(lambda: "camera back_left: Kalibr has no plumb_bob lens" in peer.calibration.health.last_error[0], "the last file")
+    solution = load(result)
+    known = dict(poses(peer.rigs[-1]))
+    for name, T in solution.poses.items():
+        np.testing.assert_allclose(T, known[name], atol=1e-6)
+    origins = {j.get("name"): [float(v) for v in j.find("origin").get("xyz").split()] for j in ET.parse(urdf).getroot()}
+    for name, frame in ((LEFT, frames[1]), (RIGHT, frames[2])):
+        np.testing.assert_allclose(origins[frame], solution.poses[name][:3, 3], atol=1e-9)
+    entries = yaml.safe_load(kit.read_text())[TOP]
+    np.testing.assert_allclose([entries[frames[1]][k] for k in "xyz"], solution.poses[LEFT][:3, 3], atol=1e-9)
+    assert "imu: {x: 1}  # by hand" in kit.read_text()
+    assert Path(f"{kit}{FORMER}").read_text() == before
+    assert not chain.exists()
+
+    peer.trigger("reset")
+    peer.until(lambda: peer.rigs[-1].text.startswith("0 of 3"), "the reset")
+    later = tmp_path / "later.json"
+    peer.change(export__on_converged=[str(later)])
+    peer.calibration._files.submit(int).result()  # files are written one after the other
+    assert not later.exists()
+    driven.at += SECONDS + PAUSE_S
+    peer.drive(again(driven.items, driven.at))
+    peer.until(later.exists, "all sensors again")
+    for deg, m in (se3.error(rig.reference(name), T) for name, T in load(later).poses.items()):
+        assert deg < 0.5
+        assert m < 0.15
+    peer.change(export__on_converged=[])
+
+
 @pytest.mark.slow
 def test_a_knocked_camera_is_named_with_its_size_and_found_again(rig, driven) -> None:
     peer = driven.peer
@@ -177,7 +224,7 @@ def two(tmp_path_factory, ros_in_this_process) -> Iterator[Any]:
     describe(rig, ("front",), file, 2, pairs=[["front", "lidar_left"], ["lidar_right", "lidar_left"]])
     with RigPeer(rig, ("front",), file, 2) as peer:
         peer.drive(items)
-        yield SimpleNamespace(peer=peer, items=items, rig=rig)
+        yield SimpleNamespace(peer=peer, items=items, rig=rig, at=0.0)
 
 
 def test_two_lidars_are_registered_to_each_other(two) -> None:
@@ -207,6 +254,26 @@ def test_two_lidars_are_registered_to_each_other(two) -> None:
     assert load.counts().seconds[Work.ESTIMATES] > 0
 
 
+def test_a_reset_forgets_what_the_lidars_told_of_each_other(two) -> None:
+    """Of a pair, the registrations of its LiDAR; of the rig, everything."""
+    peer = two.peer
+    (own,) = peer.calibration.lidars
+    before = own.pair
+    for name in ("front/lidar_left/reset", "reset"):
+        assert own.pair.extrinsic.accepted
+        peer.trigger(name)
+        assert (own.pair is before, own.pair.extrinsic.accepted) == (False, 0)
+        peer.until(lambda: peer.sensor("front").status != "converged" and not peer.usable(), "that nothing is known")
+        start = own._start()
+        np.testing.assert_allclose(start, se3.inverse(two.rig.prior("lidar_right")), atol=1e-6)
+        two.at += TWO_S + PAUSE_S
+        for item in again(two.items, two.at):
+            peer.drive([item])
+            if len(peer.usable()) == 3:
+                break
+        peer.until(lambda: len(peer.usable()) == 3, "all sensors")
+
+
 @pytest.mark.slow
 def test_a_displaced_lidar_is_named_with_its_size_and_found_again(two) -> None:
     peer, before = two.peer, len(two.peer.rigs)
@@ -215,7 +282,8 @@ def test_a_displaced_lidar_is_named_with_its_size_and_found_again(two) -> None:
     knocked = SyntheticRig("two_lidars_three_cameras", **settings, **knock)
     scans = iter(item for item in measured(knocked, (), TWO_S, 2, 10.0) if item[1] == "lidar_right")
     items = [next(scans) if item[1] == "lidar_right" else item for item in two.items]
-    for item in again(items, TWO_S + PAUSE_S):
+    two.at += TWO_S + PAUSE_S
+    for item in again(items, two.at):
         peer.drive([item])
         pause()
         if "lidar_right moved by" in peer.rigs[-1].text:
@@ -278,13 +346,21 @@ def test_a_managed_node_makes_its_pairs_and_leaves_none_behind(rig, tmp_path) ->
     executor.add_node(node)
     for transition in (node.trigger_configure, node.trigger_activate):
         assert transition() == TransitionCallbackReturn.SUCCESS
-    assert [own.get_fully_qualified_name() for own in node.calibration.nodes] == [f"/calib_ros/{c}/{TOP}" for c in (LEFT, RIGHT)]
-    assert len(executor.get_nodes()) == 3
-    executor.spin_once(timeout_sec=0.1)
+    asking = rclpy.create_node("asking", context=context)
+    executor.add_node(asking)
+    spin = partial(executor.spin_once, 0.1)
+    for camera in (LEFT, RIGHT):  # whoever spins the node spins its pairs
+        client = asking.create_client(Trigger, f"/calib_ros/{camera}/{TOP}/reset")
+        until(client.service_is_ready, "the service", turn=spin)
+        asked = client.call_async(Trigger.Request())
+        until(asked.done, "an answer", turn=spin)
+        assert asked.result().success
     for transition in (node.trigger_deactivate, node.trigger_cleanup):
         assert transition() == TransitionCallbackReturn.SUCCESS
-    assert (executor.get_nodes(), node.calibration) == ([node], None)
+    assert node.calibration is None
+    until(lambda: {n for n, _ in asking.get_node_names_and_namespaces()} == {"calib_ros", "asking"}, "their end", turn=spin)
     executor.shutdown()
+    asking.destroy_node()
     node.destroy_node()
     rclpy.try_shutdown(context=context)
 
@@ -309,6 +385,29 @@ def test_a_wrong_rig_file_is_refused_by_what_is_wrong(tmp_path, wrong, named) ->
     node.destroy_node()
     rclpy.try_shutdown(context=context)
     assert str(caught.value).startswith(str(file))
+    assert named in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "more", "named"),
+    [
+        ("b: {kind: camera, frame: b}, c: {kind: camera, frame: c}", "pairs: [[b, a]]", "no pairs join c to a; add"),
+        ("b: {kind: camera, frame: b}", "", "has no entry between the sensors; name one of a -> b, b -> a"),
+    ],
+)
+def test_files_that_no_solution_can_be_written_to_are_refused_at_start(tmp_path, sensors, more, named) -> None:
+    file, kit = tmp_path / "rig.yaml", tmp_path / "kit.yaml"
+    file.write_text(f"reference: a\nsensors: {{a: {{kind: lidar, frame: a}}, {sensors}}}\n{more}\n")
+    kit.write_text("base_link: {imu: {x: 0}}\n")
+    context = Context()
+    rclpy.init(context=context)
+    given = {"rig_file": str(file), "export.on_converged": [str(kit)]}
+    node = CalibLifecycleNode(context=context, parameter_overrides=[Parameter(n, value=v) for n, v in given.items()])
+    with pytest.raises(BadInputError) as caught:
+        interface(node)
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
     assert named in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -9,11 +9,13 @@ import pytest
 from room import STILL, TRUE, WRONG, drive, scans
 
 from calib_ros import se3
-from calib_ros.result import CONVERGED, INITIAL, MOVED, SUSPECT
+from calib_ros.config import RefineConfig
+from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, SUSPECT
 from calib_ros.rig.lidar_pair import CONFIRM, FAILED, LEAST, QUICK_S, REST_S, LidarPair
-from calib_ros.rig.lidars import SCANS, LidarScans
+from calib_ros.rig.lidars import MIN_MOTIONS, SCANS, LidarScans
 
 KNOCK = se3.exp(np.r_[np.deg2rad([0.3, 0, 0.8]), 0.04, 0, -0.02])
+LIMITS = RefineConfig()
 FAR = se3.exp([0, 0, 0, 50, 50, 0])
 
 
@@ -25,7 +27,7 @@ def moments(T: np.ndarray, n: int, first: int = 0, turning: float = 0.3) -> Iter
 
 
 def driven(n: int) -> LidarPair:
-    pair = LidarPair("a", "b", STILL.time_offset_sigma_s)
+    pair = LidarPair("a", "b", STILL.time_offset_sigma_s, LIMITS)
     for a, b in moments(TRUE, n):
         pair.add(a, b, WRONG @ TRUE)
     return pair
@@ -77,10 +79,31 @@ def test_the_scene_of_a_parked_vehicle_counts_once_and_rest_comes_with_enough() 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_scans_that_do_not_match_are_told_and_cost_less_and_less(known) -> None:
-    pair = driven(LEAST) if known else LidarPair("a", "b", STILL.time_offset_sigma_s)
-    for a, b in moments(FAR @ TRUE, FAILED, first=6):
+    pair = driven(LEAST) if known else LidarPair("a", "b", STILL.time_offset_sigma_s, LIMITS)
+    driving, standing = moments(FAR @ TRUE, FAILED, first=6), drive(1) * 2  # at rest motion tells nothing, either
+    still = [(scans(standing, np.eye(4), [1, k]), scans(standing, FAR @ TRUE, [2, k])) for k in range(FAILED)]
+    for a, b in driving if known else still:
         pair.add(a, b, FAR @ TRUE if known else FAR)
     result = pair.extrinsic.result
     assert (result.status, pair.extrinsic.usable) == (SUSPECT if known else INITIAL, False)
     assert ("match at" if known else "by their priors they share no view") in result.reason
     assert pair.every_s == (QUICK_S if known else QUICK_S * 2**FAILED)
+
+
+@pytest.mark.parametrize(
+    ("limits", "status"), [(RefineConfig(), INSUFFICIENT), (RefineConfig(tolerance_deg=2, tolerance_m=0.5), CONVERGED)]
+)
+def test_lidars_that_look_apart_are_joined_by_how_they_move(limits, status) -> None:
+    """Before and behind the vehicle; of the drive every fourth scan and the next one are given."""
+    turned, poses, n = TRUE @ se3.exp([0, 0, np.pi, 0, 0, 0]), drive(90), MIN_MOTIONS + 6
+    pair = LidarPair("a", "b", STILL.time_offset_sigma_s, limits)
+    for k in range(0, 4 * n, 4):
+        own = poses[k : k + 2]
+        pair.add(scans(own, np.eye(4), [1, k], side=1), scans(own, turned, [2, k], side=1), WRONG @ turned)
+        assert pair.extrinsic.result.frames_used in (0, len(pair._motions))
+    result = pair.extrinsic.result
+    assert (pair.kind, result.status, pair.extrinsic.usable, result.frames_used) == ("motion", status, status == CONVERGED, n)
+    assert pair.every_s == QUICK_S
+    xi = se3.log(turned @ se3.inverse(result.T_camera_lidar))
+    assert np.rad2deg(np.linalg.norm(xi[:3])) < 1.0
+    assert xi @ np.linalg.solve(result.covariance, xi) < 22.5  # chi^2 of 6, one in a thousand

@@ -125,6 +125,26 @@ def test_autoware_has_all_sensors_below_the_reference(report: RigReport, tmp_pat
     assert data["l0_link"]["c0_link"]["x"] == pytest.approx(report.solution.poses["c0"][0, 3])
 
 
+def test_of_autowares_file_the_entries_of_sensors_change_and_others_stay(report: RigReport, tmp_path: Path) -> None:
+    path, entry = tmp_path / "kit.yaml", "{x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}"
+    text = f"base_link:\n  imu: {entry}  # by hand\nl0_link:\n  c1_link: {entry}\nc0_link:\n  l0_link: {entry}\n"
+    path.write_text(text)
+    assert report.write(str(path)).endswith("has no entry for c2, which are not written; add entries of their frames")
+    data, poses = yaml.safe_load(path.read_text()), report.solution.poses
+    assert data["l0_link"]["c1_link"]["x"] == poses["c1"][0, 3]
+    assert data["c0_link"]["l0_link"]["x"] == pytest.approx(se3.inverse(poses["c0"])[0, 3])
+    assert path.read_text().splitlines()[1] == text.splitlines()[1]
+    assert (tmp_path / "kit.yaml.former").read_text() == text
+
+
+def test_a_solution_has_changed_by_more_than_its_standard_deviation(report: RigReport) -> None:
+    solution, sigma = report.solution, np.sqrt(report.solution.marginal("c1")[4, 4])
+    for by, changed in ((0.9, False), (1.1, True)):
+        poses = {**solution.poses, "c1": se3.exp([0, 0, 0, 0, by * sigma, 0]) @ solution.poses["c1"]}
+        assert replace(report, solution=replace(solution, poses=poses)).has_changed(report) == changed
+    assert replace(report, frames={**report.frames, "c1": "other"}).has_changed(report)
+
+
 def test_kalibr_chains_the_cameras(report: RigReport, tmp_path: Path) -> None:
     report.write(str(tmp_path / "camchain.yaml"))
     data = yaml.safe_load((tmp_path / "camchain.yaml").read_text())
