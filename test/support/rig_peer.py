@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import rclpy
 import yaml
 from calib_ros_msgs.msg import Extrinsic, Rig
@@ -27,6 +28,7 @@ from waiting import LIMIT_S, until
 
 from calib_ros import se3
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.online import pacing
 from calib_ros.ros.conversions import image_message, matrix_from_transform
 from calib_ros.ros.node import CalibNode
 from calib_ros_synthetic.rig import SyntheticRig
@@ -73,6 +75,8 @@ class RigPeer:
         values = {**QUICK, "semantics__segmentation": "none", "online__rest_period_s": 0.0, "online__max_load": 1.0}
         values |= {"max_data_age_s": 3600.0, "initial_from_tf": False, "publish_period_s": 0.2, **parameters}
         self.rig, self.cameras, self.lidar = rig, tuple(cameras), rig.lidars[0]
+        self._patch = pytest.MonkeyPatch()
+        self._patch.setattr(pacing, "SAVED_S", 1e6)  # which frames become keyframes must not depend on the machine
         self.context = Context()
         rclpy.init(context=self.context)
         overrides = [Parameter(n.replace("__", "."), value=v) for n, v in {"rig_file": str(rig_file), **values}.items()]
@@ -184,6 +188,7 @@ class RigPeer:
         self.node.destroy_node()
         self.peer.destroy_node()
         rclpy.try_shutdown(context=self.context)
+        self._patch.undo()
 
 
 def poses(rig: Rig) -> Iterator[tuple[str, Any]]:
