@@ -146,11 +146,9 @@ class RigMeasurer:
         return [(c, lid) for lid in self.description.lidars for c in self.description.cameras if self._sees(c, lid, known)]
 
     def _sees(self, camera: str, lidar: str, known: RigSolution) -> bool:
-        scans = self.scans[lidar]
-        if not len(scans.used):
-            return False
-        points, _ = scans.still(int(scans.used[len(scans.used) // 2]))
-        return seen_share(self.rig.camera(camera), known.between(camera, lidar)[0], points) >= SEEN
+        own, T = self.rig.camera(camera), known.between(camera, lidar)[0]
+        shares = [seen_share(own, T, points) for points in self.scans[lidar].glimpses]
+        return bool(shares) and float(np.median(shares)) >= SEEN
 
     def camera_edge(self, camera: str, lidar: str, known: RigSolution) -> Measurement:
         """Registration of a camera with a LiDAR, around where they are by what is known."""

@@ -37,6 +37,7 @@ VOXEL_M = 0.4  # half of the odometry's, since both scanners see the same at onc
 # Of matches: the prior's error at 30 m and more; that which MIN_MATCHED is about; and what the scans in place need.
 REACHES_M = (3.0, 1.0, 0.5)
 SHARED_M, SHARED = 1.5, 0.3  # points nearer than this to another scanner's by the priors are shared; so many are a view
+GLIMPSES = 5  # scans of a recording that tell what a sensor sees
 ROUNDS = 5  # of reweighting
 # Standard deviations of what all scans have in common, so that their spread does not show it: data sheets give ranges to 1 to
 # 3 cm, an offset of each laser that dozens of them average, and angles to hundredths of a degree.
@@ -113,6 +114,11 @@ class LidarScans:
         return [int(self.used[round(k)]) for k in np.linspace(0, len(self.used) - 1, min(n, len(self.used)))]
 
     @cached_property
+    def glimpses(self) -> list[Matrix]:
+        """Points (n, 3) of a few scans, spread evenly."""
+        return [self.still(k)[0] for k in self.chosen(GLIMPSES)]
+
+    @cached_property
     def run(self) -> Run | None:
         """The longest sequence of scans between which the motion is known; None where there is none."""
         spare = max(len(self.used) - RUN_SCANS, 0)
@@ -133,11 +139,12 @@ class LidarScans:
 
 
 def shared_view(a: LidarScans, b: LidarScans, T: Transform) -> float:
-    """Share of the points of the scanner that sees less which the other one sees, too, by T_a_b (4, 4)."""
+    """Share of the points of the scanner that sees less which the other one sees, too, by T_a_b (4, 4): the median of a few
+    scans, any of which may pass a gap."""
     if not len(a.used) or not len(b.used):
         return 0.0
-    k = int(b.used[len(b.used) // 2])
-    return shared_share(a.still(a.nearest(int(b.stamps[k])))[0], se3.transform(T, b.still(k)[0]))
+    others = [a.still(a.nearest(int(b.stamps[k])))[0] for k in b.chosen(GLIMPSES)]
+    return float(np.median([shared_share(A, se3.transform(T, B)) for A, B in zip(others, b.glimpses, strict=True)]))
 
 
 def shared_share(A: Matrix, B: Matrix) -> float:

@@ -86,6 +86,18 @@ def test_what_fails_is_told_and_the_rest_is_solved(halves: TwoHalves, descriptio
     assert report.status("right")[0] == "insufficient"
 
 
+@pytest.mark.parametrize(("passed", "seen"), [((1, 2), True), ((0, 1, 2, 3), False)])
+def test_a_pair_shares_a_view_although_some_scans_pass_a_gap(
+    halves: TwoHalves, description: RigDescription, passed: tuple[int, ...], seen: bool
+) -> None:
+    measurer = RigMeasurer(halves, description, QUICK)
+    own = measurer.scans["top"]
+    glimpses = [np.zeros((0, 3)) if k in passed else points for k, points in enumerate(own.glimpses)]
+    assert len(glimpses) == 5
+    own.glimpses = glimpses
+    assert measurer.camera_pairs(measurer.solution([])) == [("left", "top"), ("right", "top")] * seen
+
+
 def test_the_search_follows_the_prior() -> None:
     box = box_of(np.diag(np.r_[np.deg2rad([1.0, 2, 0.01]), 0.1, 0.2, 0.001] ** 2))
     np.testing.assert_allclose(box.rotation_deg, [2, 4, 0.5])
