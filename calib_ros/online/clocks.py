@@ -131,7 +131,10 @@ def _twists(keyframes: Sequence[FrameFeatures]) -> Matrix:
 
 
 class ClockEvidence:
-    """Has an accepted estimate shown that the clocks agree? If not, is one open to an offset? Estimates at rest are neither."""
+    """Has an accepted estimate shown that the clocks agree? If not, is one open to an offset? Estimates at rest are neither.
+
+    Each has to show it alone: what keyframes of one road have in common does not average out over several estimates.
+    """
 
     def __init__(self) -> None:
         self.open = self._shown = False

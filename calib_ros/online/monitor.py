@@ -21,7 +21,7 @@ from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import REGIONS, covariance, distance, effective_frames, effective_points
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.nuisance.time_offset import ClockOffset
+from calib_ros.registration.nuisance.time_offset import STAMP_SCATTER_S, ClockOffset
 from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
 
 # The test at a keyframe.
@@ -326,11 +326,12 @@ def measure_shift(
 
 def clock_covariance(keyframes: Sequence[FrameFeatures], T: Transform, sigma_s: float) -> Covariance:
     """What clocks that are known to sigma_s add (6, 6) to the optimum of keyframes at T (4, 4): an offset that all have in
-    common, and stamps that scatter as much. At time tau beside the image a vehicle of this twist has moved by twist tau."""
+    common, and stamps that scatter by at most STAMP_SCATTER_S. At time tau beside the image a vehicle of this twist has moved by
+    twist tau."""
     twists = np.array([np.zeros(6) if k.twist is None else k.twist for k in keyframes])
-    shifts = sigma_s * twists @ se3.adjoint(T).T  # (n, 6), of each keyframe's own optimum
-    common = shifts.mean(axis=0)
-    return np.asarray(np.outer(common, common) + shifts.T @ shifts / len(shifts) ** 2)
+    flows = twists @ se3.adjoint(T).T  # (n, 6), of each keyframe's own optimum
+    common, scatter = sigma_s * flows.mean(axis=0), min(sigma_s, STAMP_SCATTER_S) * flows / len(flows)
+    return np.asarray(np.outer(common, common) + scatter.T @ scatter)
 
 
 def points_in_view(frame: FrameFeatures, T: Transform) -> int:

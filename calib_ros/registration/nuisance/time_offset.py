@@ -44,6 +44,8 @@ STEP_PERIODS = 0.25  # between starts; edges then move by no more than the coars
 # Edge points of the final optimum. On 16 consecutive KITTI frames the offset repeats to 7 ms with 6000, to 2 ms with 20000.
 FINE_POINTS, NEAR_POINTS = 20000, 8000  # after a search, and near an extrinsic that is known
 LEAST_S = 1e-3  # s; no stamps are better
+STAMP_SCATTER_S = MotionConfig.time_offset_sigma_s  # by which stamps scatter at most, where clocks are not better known
+SINGULAR = 1e-9  # of the largest eigenvalue, below which rounding decides
 OBSERVABLE_SIGMAS = 2.0  # by which an offset of motion.max_time_offset_s must differ from 0 to count as observable
 
 
@@ -159,14 +161,37 @@ def estimate_time_offset(
     without = max(refined(fine, T, Limits(T, reach), NEAR_LEVELS, TOLERANCE_DEG)[1], fine.at(-1).value(T))
     free = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     best, seconds, highest = _ascend(fine, best, seconds, twists, free, prior)
-    effect = ClockOffset(0.0, twists).effect(fine.moved(twists, seconds), best, limits, FINE_POINTS)
+    moved = fine.moved(twists, seconds)
+    effect = ClockOffset(0.0, twists).effect(moved, best, limits, FINE_POINTS)
     noise = noise_of(fine, T, limits)
-    gain = float(np.sqrt(max(2 * (highest - without) / noise, 0.0)))
+    scatter_s = min(STAMP_SCATTER_S, config.time_offset_sigma_s)
+    certain = 1 / (1 + effect.information * scatter_s**2 * scatter_gain(moved, best, twists, limits))
+    effect = replace(effect, information=certain * effect.information)
+    gain = float(np.sqrt(max(2 * (highest - without) / noise * certain, 0.0)))
     found = TimeOffset(seconds, best, effect.sigma(range_s), gain, effect, 2 * range_s, highest, noise)
     if not found.exists(config) or fine is score:
         return found
     best, seconds, _ = _ascend(score, best, seconds, twists, free, prior)
     return replace(found, seconds=seconds, T=best)
+
+
+def scatter_gain(score: PointScore, T: Transform, twists: Matrix, limits: Limits) -> float:
+    """Variance of the offset at the joint optimum by that of stamps that scatter from frame to frame.
+
+    Where frames hardly differ in speed, one stamp that is a millisecond late looks like an offset of many. Linear in the frames'
+    own optima, which it moves.
+    """
+    J, axes = _jacobian(score, T, twists, score.n_levels - 1), np.append(np.flatnonzero(limits.open_axes), 6)
+    whole, squares = np.zeros((7, 7)), np.zeros((7, 7))
+    for k in np.unique(score.frame):
+        own = J[:, score.frame == k]
+        information = own * score.weights[score.frame == k] @ own.T
+        whole += information
+        squares += np.outer(information[:, 6], information[:, 6])
+    whole, squares = whole[np.ix_(axes, axes)], squares[np.ix_(axes, axes)]
+    unit = 1 / np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
+    pull = np.linalg.pinv(whole * np.outer(unit, unit), rcond=SINGULAR, hermitian=True)[-1] * unit * unit[-1]
+    return float(pull @ squares @ pull)
 
 
 def _coarse(
@@ -218,9 +243,15 @@ def _ascend(
 
 def linearise(score: PointScore, T: Transform, twists: Matrix, level: int) -> tuple[Matrix, Matrix]:
     """Gradient (7,) of the score by a left twist at T (4, 4) and by the offset, and a positive matrix that scales the step."""
+    J = _jacobian(score, T, twists, level)
+    weighted = J * score.weights
+    return weighted.sum(axis=1), weighted @ J.T
+
+
+def _jacobian(score: PointScore, T: Transform, twists: Matrix, level: int) -> Matrix:
+    """(7, n) of the points' values, by a left twist at T (4, 4) and by the offset."""
     J = np.empty((7, score.points.shape[1]))
     J[:6] = score.jacobian(T, level)
     flow = np.asarray(twists @ se3.adjoint(T).T)  # (n_frames, 6), of every frame in the camera's axes
     J[6] = np.einsum("kn,nk->n", J[:6], flow[score.frame])
-    weighted = J * score.weights
-    return weighted.sum(axis=1), weighted @ J.T
+    return J

@@ -18,7 +18,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, at_time_offset
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.parameters import Effect, estimate_parameters, wrong_parameter
-from calib_ros.registration.nuisance.time_offset import ClockOffset, TimeOffset, estimate_time_offset, linearise
+from calib_ros.registration.nuisance.time_offset import ClockOffset, TimeOffset, estimate_time_offset, linearise, scatter_gain
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode, Result
@@ -226,6 +226,24 @@ def test_clocks_that_cannot_be_told_are_left_to_the_covariance(dense):
     sharp = estimated(dense, ALIKE, box=None, **exact)
     assert np.allclose(sharp.covariance + result.shared_covariance, result.covariance)
     assert not sharp.shared_covariance.any()
+
+
+def test_stamps_that_scatter_hide_an_offset_where_frames_hardly_differ_in_speed(dense):
+    """A share of the speed by which frames differ is that of the scatter by which an offset moves them."""
+    rng = np.random.default_rng(0)
+    for share in (0.03, 0.2):
+        shares = np.array([1.0, 1.0, -1.0, -1.0]) * share
+        twists = np.array([STRAIGHT * (1 + own) for own in shares])
+        score = FastScore(list(driven(dense, list(twists), 0.0)), dense.truth, QUICK.score, margin=1.0)
+        gain = scatter_gain(score, dense.truth, twists, unlimited(dense.truth))
+        assert gain == pytest.approx(1 / (4 * share**2), rel=0.5)
+        # As frames whose own optima the scatter moves, of which the offset explains what it can.
+        J = np.array([[1.0, speed] for speed in 1 + shares])
+        scattered = [np.linalg.lstsq(J, rng.normal(size=4) * (1 + shares), rcond=None)[0][1] for _ in range(2000)]
+        assert np.var(scattered) == pytest.approx(1 / (4 * share**2), rel=0.15)
+    turning = np.array(velocities((0.0, 8.0), (0.25, 8.0), (-0.25, 8.0), (0.0, 8.0)))
+    score = FastScore(list(driven(dense, list(turning), 0.0)), dense.truth, QUICK.score, margin=1.0)
+    assert scatter_gain(score, dense.truth, turning, unlimited(dense.truth)) < 2  # turns tell the clocks whatever the speed
 
 
 @pytest.mark.parametrize("speed", [2.0, 25.0])
