@@ -48,6 +48,11 @@ class RigHypothesis:
     size: tuple[float, float]
     others: tuple[str, ...] = ()
 
+    @property
+    def is_hidden(self) -> bool:
+        """Whether a usual knock would turn these by less than three standard deviations of what the new edges tell."""
+        return self.kind == MOVED and bool(np.rad2deg(np.sqrt(np.diag(self.covariance)[:3].max())) > KNOCK_DEG / 3)
+
     def __str__(self) -> str:
         if self.kind == NOTHING:
             return "nothing has changed"
@@ -97,6 +102,9 @@ def verdict(found: Sequence[RigHypothesis]) -> tuple[tuple[RigHypothesis, ...], 
         text = f"cannot tell between: {'; '.join(map(str, likely))}"
     elif likely[0].kind == MOVED:
         text += f" against {', '.join(likely[0].others)}"
+    elif likely[0].kind == NOTHING and (hidden := [h for h in found if h.is_hidden]):
+        groups = "; ".join(" with ".join(h.sensors) for h in hidden)
+        text += f", as far as it shows: the new edges would hardly show that these moved against the others: {groups}"
     if likely[0].p_value < SIGNIFICANCE:
         text += "; even this explains the new edges badly: more than one thing has changed, or an edge is wrong"
     return tuple(likely), text

@@ -121,3 +121,28 @@ def test_posteriors_are_of_all_ways_to_divide_the_rig() -> None:
     assert sum(h.posterior for h in found) == pytest.approx(1)
     groups = {frozenset(h.sensors) for h in found if h.kind == MOVED}
     assert groups == {frozenset(c) for m in (1, 2) for c in combinations(poses, m)}
+
+
+def test_what_the_edges_would_not_show_is_said_where_nothing_seems_to_have_changed() -> None:
+    """Two ends of a vehicle that only motion joins, to 1.4 deg and a metre."""
+    rng, poses = np.random.default_rng(3), RIGS["ring"][0]
+    names = ("l0", "c0", "c1", "c2")
+    given, own = {n: poses[n] for n in names}, [("c0", "l0"), ("c1", "c2")]
+    coarse = np.diag([np.deg2rad(1.4) ** 2] * 3 + [1.0] * 3)
+
+    def measured() -> list[Edge]:
+        return [*edges(given, own, rng), Edge("c2", "l0", se3.inverse(poses["c2"]) @ poses["l0"], coarse, "motion")]
+
+    before = solve(measured(), priors(given, rng), "l0")
+    likely, text = verdict(hypotheses(before, measured()))
+    assert likely[0].kind == NOTHING
+    assert text.startswith("nothing has changed, as far as it shows: ")
+    assert text.endswith(": c0 with l0; c1 with c2")
+    assert (
+        verdict(
+            hypotheses(
+                solve(edges(given, [*own, ("c2", "l0")], rng), priors(given, rng), "l0"), edges(given, [*own, ("c2", "l0")], rng)
+            )
+        )[1]
+        == "nothing has changed"
+    )
