@@ -167,7 +167,8 @@ class MotionConfig(Stage):
     )
     time_offset_sigma_s: float = option(
         0.003,
-        "standard deviation of the clocks' offset, which enters a moving vehicle's covariance, s; 0 = exact",
+        "standard deviation of the clocks' offset, and up to 3 ms of stamps that scatter, for a moving vehicle's covariance, "
+        "s; 0 = exact",
         low=0.0,
         high=0.5,
     )
