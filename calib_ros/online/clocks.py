@@ -18,6 +18,7 @@ from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.joint import clocks_are_estimated
 from calib_ros.registration.nuisance.parameters import SIGNIFICANT_Z
 from calib_ros.registration.nuisance.stamping import at_stamping, restamped
+from calib_ros.registration.nuisance.time_offset import STAMP_SCATTER_S
 from calib_ros.result import Result
 
 # Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
@@ -37,6 +38,12 @@ def usable_clocks(config: Config, known: Result) -> Result:
     return replace(known, time_offset_s=None, time_offset_sigma_s=None, stamping=None)
 
 
+def states_same_clocks(before: MotionConfig, after: MotionConfig) -> bool:
+    """Whether what a user says of the clocks is the same, so that what was found of them still holds."""
+    names = ("time_offset", "time_offset_s", "stamping", "spin", "stamp_azimuth_deg", "stamp_at")
+    return all(getattr(before, name) == getattr(after, name) for name in names)
+
+
 def with_clocks(config: Config, known: Result) -> Config:
     """The configuration with the time offset, how well it is known, and the stamping of a result that knows them."""
     known, motion = usable_clocks(config, known), config.motion
@@ -45,7 +52,9 @@ def with_clocks(config: Config, known: Result) -> Config:
     if known.stamping is not None:
         motion = at_stamping(motion, known.stamping)
     offset = float(np.clip(known.time_offset_s, -FARTHEST_OFFSET_S, FARTHEST_OFFSET_S))
-    sigma = motion.time_offset_sigma_s if known.time_offset_sigma_s is None else min(known.time_offset_sigma_s, MAX_OFFSET_S)
+    sigma = motion.time_offset_sigma_s
+    if known.time_offset_sigma_s is not None:  # stamps scatter however well the offset is known
+        sigma = min(max(known.time_offset_sigma_s, min(STAMP_SCATTER_S, sigma)), MAX_OFFSET_S)
     return replace(config, motion=replace(motion, time_offset_s=offset, time_offset_sigma_s=sigma))
 
 
@@ -90,7 +99,8 @@ class OffsetFilter:
             return
         if self._information > 0:
             # What its own scenes tell: its standard deviation counts what was known before once more.
-            self._add(estimate.clock_sigma_s or estimate.time_offset_sigma_s, share_new, estimate.time_offset_s)
+            own = estimate.time_offset_sigma_s if estimate.clock_sigma_s is None else estimate.clock_sigma_s
+            self._add(own, share_new, estimate.time_offset_s)
         else:
             self._add(estimate.time_offset_sigma_s, 1.0, estimate.time_offset_s)
         if abs(self._mean_s - self.used_s) > SAME_S:

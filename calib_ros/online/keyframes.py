@@ -313,6 +313,12 @@ class EgoMotion:
         turn, way = (seconds * float(np.linalg.norm(part)) for part in (self._known[1][:3], self._known[1][3:]))
         return turn > np.deg2rad(limits.max_sigma_deg) or way > limits.max_sigma_m
 
+    def moved_unknown(self, keyframe: FrameFeatures, limits: TrackerConfig) -> bool:
+        """Whether a keyframe of unknown motion was taken shortly before it became known that the vehicle moves."""
+        if self._known is None or not self.moves_in(keyframe.unknown_motion_s, limits):
+            return False
+        return 0 <= self._known[0] - keyframe.stamp <= REMEMBERED_S * NANOSECONDS
+
     def check_known(self, frame: Frame, seconds: float, limits: TrackerConfig) -> None:
         """BadTimesError if a frame's motion is unknown although the vehicle moved shortly before, in `seconds` (see
         `unknown_motion_s`) by more than a converged extrinsic may be off: nobody knows how the scan is bent."""

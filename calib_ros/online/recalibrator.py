@@ -17,7 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.intrinsics import RefinedCamera
 from calib_ros.lidar.ego_motion import estimate_motion, unknown_motion_s
 from calib_ros.lidar.range_image import require_returns
-from calib_ros.online.clocks import SeenMotion, usable_clocks, with_clocks, with_clocks_moved
+from calib_ros.online.clocks import SeenMotion, states_same_clocks, usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.coach import Advice, Counted, advise
 from calib_ros.online.common import SharedScans
 from calib_ros.online.first_guess import FirstGuess
@@ -262,7 +262,7 @@ class Recalibrator:
         with self._lock:
             current = generation == self.keyframes.generation  # else: reset or configured meanwhile
             if features.twist is not None:  # those before it was known that the vehicle moves
-                self.keyframes.drop(lambda f: self.motion.moves_in(f.unknown_motion_s, self.config.tracker))
+                self.keyframes.drop(lambda f: self.motion.moved_unknown(f, self.config.tracker))
             if current and is_keyframe:
                 # Classes may come for one keyframe in many, and a first guess needs several.
                 self.keyframes.add(features, lambda f: self.first_guess.needs_classes and f.view is not None)
@@ -451,11 +451,13 @@ class Recalibrator:
 
     def configure(self, config: Config) -> None:
         """Use another configuration from now on. Keyframes are kept unless their features would change, and what was found of
-        the clocks unless the stage ``motion`` changes."""
+        the clocks unless what the stage ``motion`` states of them changes."""
         with self._lock:
             before, self._configured = self._configured.motion, config
             if before == config.motion:
                 config = replace(config, motion=self.config.motion)
+            elif states_same_clocks(before, config.motion):
+                config = with_clocks(config, self.tracker.current.result)
             features_changed = feature_config(config) != feature_config(self.config)
             if config.semantics != self.config.semantics:  # else the models stay loaded
                 self.segmentation = self._models(config.semantics)

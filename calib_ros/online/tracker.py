@@ -11,7 +11,7 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import Config
 from calib_ros.config.online import MANUAL
-from calib_ros.online.clocks import KNOWN_Z, ClockEvidence, OffsetFilter, at_offset
+from calib_ros.online.clocks import KNOWN_Z, SAME_S, ClockEvidence, OffsetFilter, at_offset
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
@@ -150,7 +150,8 @@ class Tracker:
         rest on, and replaces them.
         """
         self.filter.predict(seconds, self.config.tracker)
-        if self._offset.used_s != self.config.motion.time_offset_s:  # stated anew
+        if abs(self._offset.used_s - self.config.motion.time_offset_s) > SAME_S:  # stated anew
+            self._start_anew()
             self._offset = OffsetFilter(self.config.motion.time_offset_s)
         if self.suspect and not on_request:  # its keyframes are in question
             return self.current

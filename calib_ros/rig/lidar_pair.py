@@ -72,14 +72,14 @@ class LidarPair:
         start = T if self._edge is None else self._edge[0].T
         (A, twist), (B, _) = a.still(len(a) - 1), b.still(len(b) - 1)
         try:
-            if not self._found and shared_share(A, se3.transform(T, B)) < SHARED:
+            if self._edge is None and shared_share(A, se3.transform(T, B)) < SHARED:
                 raise TooFewFeaturesError("by their priors they share no view")
             self._take(register(A, B, start, twist, float(b.stamps[-1] - a.stamps[-1]) * 1e-9))
         except TooFewFeaturesError as error:
             self._failures += 1
             lost = self._edge is not None and self._failures >= FAILED
             self.say(SUSPECT if lost else self.extrinsic.result.status, str(error))
-            if not self._found:
+            if self._edge is None:
                 self._follow(a.twist(len(a) - 1), b.twist(len(b) - 1), T)
 
     def _follow(self, of_target: Matrix | None, of_source: Matrix | None, T: Transform) -> None:
@@ -119,7 +119,10 @@ class LidarPair:
         if status != SUSPECT and len(self._found) >= LEAST:
             self._edge = fused(self.target, self.source, self._found, self._clock_sigma_s)
         reason = f"the newest scans of {self.target} and {self.source} match elsewhere" if status in (SUSPECT, MOVED) else ""
-        self.say(INITIAL if self._edge is None else status, reason or "too few registrations yet" * (self._edge is None))
+        if self._edge is not None:
+            self.say(status, reason)
+        elif self._by_motion is None:
+            self.say(INITIAL, "too few registrations yet")
 
     def _fits(self, new: Registration, edge: Edge, scale: float) -> bool:
         """Whether a registration may be of the transform of the edge, the clocks being off by what the edge says."""

@@ -33,6 +33,7 @@ from calib_ros.result import MOVED, SUSPECT
 from calib_ros.rig.description import CAMERA, Sensor, prior_covariance, read_rig
 from calib_ros.rig.edges import box_of
 from calib_ros.rig.graph import solve
+from calib_ros.rig.lidars import MOTION_KIND
 from calib_ros.rig.live import LiveRig, Pair, PairState, RigState
 from calib_ros.ros import parameters
 from calib_ros.ros.answers import ROUNDS, after_answers
@@ -95,17 +96,26 @@ class RigInterface:
         self._views: list[PairOfRig] = []  # of pairs that are estimated only if they share a view
         self._beside = Beside(context=node.context)
         self._beside.spin_from(node)
-        for camera, lidar in wanted:
-            pair = PairOfRig(*(camera, lidar, common, self._shared, self._topics(camera, lidar), decoded[camera], decoded[lidar]))
-            known = self._between(camera, lidar)
-            pair.T = None if known is None else known[0]
-            own = node_of_pair(node, declared, self.description, (camera, lidar), known)
-            self._beside.add_node(own)
-            self.pairs[camera, lidar] = made = make(own, pair)
-            pair.on_reset = partial(self._reset_lidars, lidar)
-            if self.description.pairs is None:
-                pair.unseen = lambda why, made=made: self._unseen(made, why)
-                self._views.append(pair)
+        try:
+            for camera, lidar in wanted:
+                pair = PairOfRig(
+                    *(camera, lidar, common, self._shared, self._topics(camera, lidar), decoded[camera], decoded[lidar])
+                )
+                known = self._between(camera, lidar)
+                pair.T = None if known is None else known[0]
+                own = node_of_pair(node, declared, self.description, (camera, lidar), known)
+                self._beside.add_node(own)
+                self.pairs[camera, lidar] = made = make(own, pair)
+                pair.on_reset = partial(self._reset_lidars, lidar)
+                if self.description.pairs is None:
+                    pair.unseen = lambda why, made=made: self._unseen(made, why)
+                    self._views.append(pair)
+        except BaseException:  # of one pair: the others must not go on
+            for made in self.pairs.values():
+                made.stop()
+            self._beside.destroy(node)
+            self.tf.destroy()
+            raise
         topics = {name: self._topics(name, name)[1] for name in self.description.lidars}
         given = (lambda: self.parameters, self.health)
         self.lidars = [
@@ -240,6 +250,10 @@ class RigInterface:
             doubt = any(own.status in (SUSPECT, MOVED) for own in states)
             for lidars in self.lidars:
                 lidars.urgent = doubt
+                if lidars.pair.kind == MOTION_KIND and any(
+                    own.status == MOVED and {*own.pair} & {*lidars.names} for own in states
+                ):
+                    lidars.reset()  # how both moved before says nothing of where they are now
                 lidars.check()
                 states.append(lidars.state())
             for view in [own for own in self._views if own.T is None]:  # whose priors TF tells

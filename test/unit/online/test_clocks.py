@@ -61,6 +61,9 @@ def test_the_offset_is_used_and_saved_until_another_one_or_a_reset_replaces_it(s
 
     found.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))  # other parameters leave it alone
     assert (found.config.motion.time_offset_s, len(found.buffer)) == (learnt, 4)
+    found.configure(update(CONFIG, {"motion": {"max_time_offset_s": 0.06}}))  # those of the motion, too: the mount has not moved
+    assert found.config.motion.time_offset_s == learnt
+    assert found.config.motion.time_offset_sigma_s >= CONFIG.motion.time_offset_sigma_s  # by which stamps scatter
     saved = parse(replace(found.current.result, status=CONVERGED).dumps(), "a state")
     assert saved.time_offset_s == learnt
     assert saved.time_offset_sigma_s is not None
@@ -157,6 +160,16 @@ def test_what_one_estimate_takes_for_a_late_image_and_another_for_a_shift_is_no_
     assert known.time_offset_sigma_s < 0.01  # each of them has told something
     followed(tracker, alike(0.6, 0.0))  # another mount moves at any clock
     assert not tracker.current.result.converged
+
+
+def test_an_offset_that_is_stated_anew_is_no_movement():
+    tracker = followed(tracked(confirmations=0), *[alike(0.0, 0.03)] * 4)
+    assert tracker.settled
+    tracker.config = update(tracker.config, {"motion": {"time_offset_s": 0.0}})
+    for _ in range(4):
+        followed(tracker, alike(0.0, 0.0))  # 12 cm from there
+        assert tracker.current.result.status == CONVERGED
+    assert tracker.T[0, 3] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_an_offset_that_estimates_agree_on_is_followed_with_the_extrinsic():
