@@ -107,3 +107,9 @@ def test_lidars_that_look_apart_are_joined_by_how_they_move(limits, status) -> N
     xi = se3.log(turned @ se3.inverse(result.T_camera_lidar))
     assert np.rad2deg(np.linalg.norm(xi[:3])) < 1.0
     assert xi @ np.linalg.solve(result.covariance, xi) < 22.5  # chi^2 of 6, one in a thousand
+    own = poses[4 * n : 4 * n + 2]  # a single scan matches, and they go on with what they have
+    pair.add(scans(own, np.eye(4), [1, n]), scans(own, turned, [2, n]), turned)
+    assert len(pair._found) == 1
+    own = poses[4 * n - 2 : 4 * n]
+    pair.add(scans(own, np.eye(4), [1, n + 1], side=1), scans(own, turned, [2, n + 1], side=1), WRONG @ turned)
+    assert (pair.kind, pair.extrinsic.result.status, pair.extrinsic.result.frames_used) == ("motion", status, n + 1)
