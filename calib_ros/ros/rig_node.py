@@ -111,8 +111,7 @@ class RigInterface:
                     pair.unseen = lambda why, made=made: self._unseen(made, why)
                     self._views.append(pair)
         except BaseException:  # of one pair: the others must not go on
-            for made in self.pairs.values():
-                made.stop()
+            self._destroy_pairs()
             self._beside.destroy(node)
             self.tf.destroy()
             raise
@@ -183,16 +182,19 @@ class RigInterface:
         if self._timers:
             self.deactivate()
         ended = self.stop()
-        for pair in self.pairs.values():
-            pair.destroy()
-        for _ in range(ROUNDS + 1):  # so that `after_answers` comes to its end
-            self._beside.spin_ready()
+        self._destroy_pairs()
         self._node.remove_on_set_parameters_callback(self._on_parameters)
         self.tf.destroy()
         after_answers(self._node, partial(self._node.destroy_service, self._service))
         for publisher in (self.publisher, self._diagnostics_pub):
             self._node.destroy_publisher(publisher)
         return ended
+
+    def _destroy_pairs(self) -> None:
+        for pair in self.pairs.values():
+            pair.destroy()
+        for _ in range(ROUNDS + 1):  # so that `after_answers` comes to its end
+            self._beside.spin_ready()
 
     def destroy_nodes(self) -> None:
         """Those of the pairs, at the very end."""

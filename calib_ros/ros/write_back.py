@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from itertools import permutations
@@ -23,7 +24,7 @@ from calib_ros.ros.parameters import Parameters
 Known = TypeVar("Known", Result, RigReport)
 
 
-class _Files(Generic[Known]):
+class _Files(ABC, Generic[Known]):
     """Thread-safe; files are written on the executor's only thread. parameters: gives the current ones."""
 
     def __init__(self, parameters: Callable[[], Parameters], executor: Executor, health: Health) -> None:
@@ -48,12 +49,13 @@ class _Files(Generic[Known]):
             except Exception as error:
                 self._health.unexpected(error)
 
+    @abstractmethod
     def _has_changed(self, known: Known, before: Known) -> bool:
-        raise NotImplementedError
+        """Whether it is to be written again."""
 
+    @abstractmethod
     def _write_to(self, path: str, known: Known) -> None:
         """Raises BadInputError."""
-        raise NotImplementedError
 
 
 class WriteBack(_Files[Result]):

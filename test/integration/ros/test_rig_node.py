@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -344,11 +345,23 @@ def test_a_managed_node_makes_its_pairs_and_leaves_none_behind(rig, tmp_path) ->
     node = CalibLifecycleNode(context=context, parameter_overrides=[Parameter("rig_file", value=file)])
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    for transition in (node.trigger_configure, node.trigger_activate):
-        assert transition() == TransitionCallbackReturn.SUCCESS
     asking = rclpy.create_node("asking", context=context)
     executor.add_node(asking)
     spin = partial(executor.spin_once, 0.1)
+
+    def alone() -> bool:
+        return {n for n, _ in asking.get_node_names_and_namespaces()} == {"calib_ros", "asking"}
+
+    right = Path(file).read_text()
+    described = yaml.safe_load(right)
+    described["sensors"][RIGHT]["mask"] = file  # no picture, which is found after the first pair has been made
+    Path(file).write_text(yaml.safe_dump(described))
+    assert node.trigger_configure() != TransitionCallbackReturn.SUCCESS
+    until(alone, "the end of the pair that was made", turn=spin)
+    assert not any(thread.name.startswith("calib_") and TOP in thread.name for thread in threading.enumerate())
+    Path(file).write_text(right)
+    for transition in (node.trigger_configure, node.trigger_activate):
+        assert transition() == TransitionCallbackReturn.SUCCESS
     for camera in (LEFT, RIGHT):  # whoever spins the node spins its pairs
         client = asking.create_client(Trigger, f"/calib_ros/{camera}/{TOP}/reset")
         until(client.service_is_ready, "the service", turn=spin)
@@ -358,7 +371,7 @@ def test_a_managed_node_makes_its_pairs_and_leaves_none_behind(rig, tmp_path) ->
     for transition in (node.trigger_deactivate, node.trigger_cleanup):
         assert transition() == TransitionCallbackReturn.SUCCESS
     assert node.calibration is None
-    until(lambda: {n for n, _ in asking.get_node_names_and_namespaces()} == {"calib_ros", "asking"}, "their end", turn=spin)
+    until(alone, "their end", turn=spin)
     executor.shutdown()
     asking.destroy_node()
     node.destroy_node()
