@@ -39,7 +39,7 @@ demo: env
 
 # `make test` guards the product in a few minutes. It leaves out two markers of pytest:
 #   slow        a scenario that takes long; a shorter test of the same behaviour stays in `make test`
-#   laboratory  tests of calib_ros_evaluation, benchmarks and training: set by test/conftest.py for their folders
+#   laboratory  tests of calib_ros_evaluation and benchmarks: set by test/conftest.py for their folders
 # `make test-all`, which CI runs, leaves out nothing. `make test ROOM=lidar` runs all tests of one room: a folder of
 # test/ or below (evaluation, ros), or a file of test/unit without its "test_" (ROOM=config).
 ROOM ?=
@@ -82,7 +82,7 @@ docs: env
 # Leaves .venv, which takes a download to make again; distclean does not.
 clean:
 	rm -rf build dist install log site demo_out steps_out evaluation_out .mypy_cache .pytest_cache .ruff_cache *.egg-info
-	find calib_ros* benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
+	find calib_ros* benchmarks launch test tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
 	rm -rf .venv .venv-* calib_ros/registration/score/kernel*.so calib_ros_thesis/kernel*.so

@@ -46,8 +46,6 @@ EXTRAS |= {
     ],
     # `--scheduler` of `calib-ros check` and `calib-ros evaluate`: a Dask cluster.
     "cluster": ["distributed"],
-    # To train the image network, see training/README.md.
-    "training": ["onnx", "onnxscript", "torch"],
     # colcon test picks pytest because it is named here.
     "test": ["pytest", "pytest-timeout", "pytest-xdist", "onnx", "selenium"],
 }

@@ -36,7 +36,7 @@ from calib_ros.frame import Frame
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_synthetic.rig import SyntheticRig
 
-LABORATORY = ("evaluation", "benchmarks", "training")  # folders of tests that do not guard the product
+LABORATORY = ("evaluation", "benchmarks")  # folders of tests that do not guard the product
 LONGEST_FIRST = ("integration", "evaluation", "unit")  # so that no long file begins when the others are done
 LOCKS: list[IO[str]] = []  # open as long as this process runs
 DOMAINS = 100  # ROS domains 1 to 100 need none of the ports that Linux gives to outgoing connections

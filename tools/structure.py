@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CORE = "calib_ros"
 BESIDE = tuple(f"{CORE}_{name}" for name in ("thesis", "semantics", "check", "view", "synthetic"))
 PACKAGES = (CORE, *BESIDE)
-LABORATORY = ("calib_ros_evaluation", "benchmarks", "training", "tools")
+LABORATORY = ("calib_ros_evaluation", "benchmarks", "tools")
 # Values and files that everything may use: the modules in the core's own folder, but for these, which are rooms of their own.
 VALUES = "values"
 NO_VALUES = ("overlay", "export", "extensions")
@@ -154,7 +154,7 @@ def options() -> int:
 
 def words() -> int:
     """Of all pages that a person reads."""
-    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md"), *ROOT.glob("training/*.md")]
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")]
     return sum(len(page.read_text(encoding="utf-8").split()) for page in pages)
 
 
