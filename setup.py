@@ -12,7 +12,7 @@ PACKAGES = [
 ]
 
 HERE = Path(__file__).resolve().parent
-VERSION = re.search(r'^__version__ = "(.+?)"', (HERE / PACKAGE / "__init__.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
+VERSION = re.search(r'^__version__ = "(.+?)"', (HERE / PACKAGE / "version.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
 
 EXTRAS = {
     # PCD, PLY and LAS files of plain folders as sources; clouds of bags that Draco compressed.

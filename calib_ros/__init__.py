@@ -17,6 +17,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from calib_ros.version import __version__
+
 if TYPE_CHECKING:
     from calib_ros import se3
     from calib_ros.camera import Camera
@@ -28,8 +30,6 @@ if TYPE_CHECKING:
     from calib_ros.registration.calibrator import Calibrator
     from calib_ros.registration.search.constraints import SearchBox
     from calib_ros.result import Result
-
-__version__ = "0.1.0"  # read by setup.py; package.xml must say the same
 
 __all__ = [
     "CalibrationError",

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from calib_ros import __version__, io, se3
+from calib_ros import io, se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.io import write_atomically
+from calib_ros.version import __version__
 
 VERSION = __version__
 CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"

@@ -172,7 +172,7 @@ STEPS = [
     ("create .venv", create_venv, ["tools/make_env.py"]),
     ("install requirements", install_requirements, REQUIREMENTS),
     ("build messages", build_messages, MESSAGE_PACKAGES),
-    ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/__init__.py", *KERNELS]),
+    ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/version.py", *KERNELS]),
 ]
 
 

@@ -22,12 +22,12 @@ ROS_ROOMS = ("calib_ros.ros", "calib_ros_check.node", "calib_ros_view.node", "ca
 
 @pytest.fixture(scope="module")
 def imports() -> list[tuple[str, str, str]]:
-    """File, own module and imported module of every import of the product."""
+    """File, own module and imported module of every import of the product, but for type hints."""
     return [
         (str(path.relative_to(ROOT)), structure.module_of(path), module)
         for package in structure.PACKAGES
         for path in structure.package_files(package)
-        for module in structure.imports_of(path)
+        for module in structure.imports_of(path, hints=False)
     ]
 
 
@@ -36,11 +36,12 @@ def test_the_core_imports_no_package_beside_it(imports) -> None:
     assert [(path, module) for path, module in core if module.split(".")[0] in structure.BESIDE] == []
 
 
-def test_no_files_of_the_core_import_each_other() -> None:
-    """Rooms of the core lie on floors; a file or room imports only from floors below."""
-    core = structure.Structure.read([structure.CORE])
-    assert structure.circles(core.arrows) == []
-    assert structure.circles(core.files) == []
+def test_no_count_of_the_repository_is_above_its_ceiling() -> None:
+    """Lines, options, words, classes; and circles, of files or rooms that import each other, type hints included."""
+    found = structure.counts(structure.Structure.read((*structure.PACKAGES, *structure.LABORATORY)))
+    assert structure.above(found) == []
+    more = {section: {name: count + 9999999 for name, count in own.items()} for section, own in found.items()}
+    assert len(structure.above(more)) == sum(map(len, found.values())) == len(structure.ceilings().options("lines")) + 5
 
 
 def test_rclpy_and_messages_are_imported_where_ros_lives(imports) -> None:
