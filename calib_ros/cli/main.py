@@ -125,7 +125,7 @@ def _convert(args: argparse.Namespace) -> int:
 
     rig = named_rig(args.source) if args.camera is None else None
     if rig is not None:
-        from calib_ros.datasets.bag_rig import write_rig_bag
+        from calib_ros.datasets.bag_writer import write_rig_bag
 
         if args.frames != "all":
             raise BadInputError(f"--frames {args.frames} does not go with a rig, which is written as a whole; make it shorter")
