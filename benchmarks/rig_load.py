@@ -28,7 +28,7 @@ from rclpy.qos import QoSProfile
 
 from benchmarks.fed_node import Recorded, cpu_s, memory_mb, own_network, restamped
 from calib_ros.datasets.bag_file import BagFile, peek_header
-from calib_ros.datasets.bag_rig import DESCRIPTION, write_rig_bag
+from calib_ros.datasets.bag_writer import DESCRIPTION, write_rig_bag
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.pacing import Work
 from calib_ros.ros.bags import message_class

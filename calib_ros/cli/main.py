@@ -125,7 +125,7 @@ def _convert(args: argparse.Namespace) -> int:
 
     rig = named_rig(args.source) if args.camera is None else None
     if rig is not None:
-        from calib_ros.datasets.bag_rig import write_rig_bag
+        from calib_ros.datasets.bag_writer import write_rig_bag
 
         if args.frames != "all":
             raise BadInputError(f"--frames {args.frames} does not go with a rig, which is written as a whole; make it shorter")
@@ -160,7 +160,7 @@ def _replay(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
     """What is not an accepted estimate is exported with a note, since initial extrinsics are exported as well."""
     from calib_ros.cli.output import note
-    from calib_ros.export import DESCRIPTIONS, Pose, export, renamed, write_edges
+    from calib_ros.export import DESCRIPTIONS, export, poses_of, renamed, write_edges
     from calib_ros.io import write_atomically
     from calib_ros.online.state import read_state
 
@@ -175,8 +175,7 @@ def _export(args: argparse.Namespace) -> int:
     if args.out is None or args.out == "-":
         print(text, end="")
     elif args.format == "urdf" and Path(args.out).suffix.lower() in DESCRIPTIONS and Path(args.out).exists():
-        poses = [Pose.of(renamed(result, args.camera_frame, args.lidar_frame), parent) for parent in ("camera", "lidar")]
-        write_edges(args.out, (), {(pose.parent, pose.child): pose.T for pose in poses})
+        write_edges(args.out, poses_of(renamed(result, args.camera_frame, args.lidar_frame), "camera", "lidar"), {})
         print(f"changed the joint between the sensors in {args.out}")
     else:
         write_atomically(args.out, text.encode())

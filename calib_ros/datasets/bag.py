@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.config import MotionConfig
-from calib_ros.datasets.bag_file import (
-    COMPRESSED,
-    BagFile,
-    choose_camera_info,
-    choose_image,
-    choose_points,
-    is_rectified,
-    peek_header,
-)  # fmt: skip
+from calib_ros.datasets.bag_file import BagFile
 from calib_ros.datasets.bag_index import (
     AUTO,
     CLOCKS,
@@ -30,10 +22,10 @@ from calib_ros.datasets.bag_index import (
     RECORDING,
     BagIndex,
     Span,
-    TopicIndex,
     difference_in_words,
     located,
-)
+)  # fmt: skip
+from calib_ros.datasets.bag_topics import COMPRESSED, choose_camera_info, choose_image, choose_points, is_rectified
 from calib_ros.datasets.bag_video import KEY_FRAMES, BagVideo
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.recent import Recent
@@ -44,7 +36,7 @@ from calib_ros.lidar.sweep import BLIND_CLOUDS, SweepOffset
 from calib_ros.messages import decode_cloud, decode_compressed_cloud, decode_compressed_image, decode_image
 from calib_ros.messages.compressed_points import COMPRESSED_POINTS
 from calib_ros.messages.video import VIDEO
-from calib_ros.stamps import Stamps, nearest_index, nearest_pairs, pair_tolerance, usual_period
+from calib_ros.stamps import nearest_index, nearest_pairs, pair_tolerance, usual_period
 
 # Half widths of windows, in periods of the slower sensor: four hold a frame and its neighbours; of late ones, it takes more.
 HALF_WIDTHS = (2.0, 6.0)
@@ -157,36 +149,63 @@ class BagSource:
 
     def _new_index(self) -> BagIndex:
         topics = self.image_topic, self.points_topic, self.camera_info_topic
-        return BagIndex(self._bag, *topics, self.rectified, self._clock)
+        return BagIndex(self._bag, topics, self.rectified, self._clock)
 
     def _read_windows(self, count: int) -> list[int] | None:
-        """Positions of the middle frames of windows; None if too few windows have one, and the whole bag has to be read."""
+        """Positions of a frame with a neighbour on either side in most of `count` equal parts of the recording; None if too few
+        have one, and the whole bag has to be read."""
+        start, stop = self._bag.start, self._bag.stop
+        slots = list(pairwise(np.linspace(start, stop, count + 1).astype(np.int64).tolist()))
         period = max(self._bag.period(topic) for topic in (self.image_topic, self.points_topic))
-        for half in HALF_WIDTHS:
-            slots = Slots(self._bag.start, self._bag.stop, count, round(half * period))
+        for half in (round(width * period) for width in HALF_WIDTHS):
+            if 2 * half * count >= WORTHWHILE * (stop - start):
+                continue
             self._index = self._new_index()
-            while spans := slots.next_spans():
-                self._index.read_spans(spans)
-                if not self._index.missing:
-                    self._pair()
-                    image, cloud = self._index.image, self._index.cloud
-                    slots.look(image.recorded[self._pairs[0]], cloud.recorded[self._pairs[1]])
-            if slots.frames is not None:
-                return slots.frames
+            read: list[Span] = []  # none overlaps another
+            windows: dict[int, Span] = {}  # the newest of each slot
+            frames: dict[int, int] = {}  # slot -> position of its frame
+            for place in PLACES:
+                if windows and not frames:  # these are too short, elsewhere, too
+                    break
+                spans: list[Span] = []
+                for slot, (begin, end) in enumerate(slots):
+                    middle = begin + round(place * (end - begin))
+                    span = (middle - half, middle + half)
+                    if slot not in frames and not any(span[0] < b and a < span[1] for a, b in (*read, *spans)):
+                        spans.append(span)
+                        windows[slot] = span
+                if spans:
+                    read += spans
+                    self._index.read_spans(spans)
+                    if not self._index.missing:
+                        self._pair()
+                        frames = self._middles(windows)
+            if len(frames) >= max(ENOUGH * count, 1):
+                return sorted(frames.values())
         return None
+
+    def _middles(self, windows: dict[int, Span]) -> dict[int, int]:
+        """The frame nearest to the middle of each window that has one between two others."""
+        images, clouds = self._index.image.recorded[self._pairs[0]], self._index.cloud.recorded[self._pairs[1]]
+        found = {}
+        for slot, (start, stop) in windows.items():
+            inside = (start <= images) & (images < stop) & (start <= clouds) & (clouds < stop)
+            between = np.flatnonzero(inside)[1:-1]
+            if len(between):
+                found[slot] = int(between[np.argmin(np.abs(images[between] - (start + stop) // 2))])
+        return found
 
     def _pair(self) -> None:
         """Pair the images and clouds that the index knows."""
         image, cloud = self._index.image, self._index.cloud
-        self._sweep_offset = self._learn_sweep(self._motion, self._view)
-        moments = cloud.stamps + self._sweep_offset
+        self._sweep_offset = self._learn_sweep()
         periods = usual_period(np.diff(image.stamps)), usual_period(np.diff(cloud.stamps))
         self._tolerance = pair_tolerance(periods, self._tolerance_s)
-        self._pairs = nearest_pairs(image.stamps, moments, self._tolerance)
+        self._pairs = nearest_pairs(image.stamps, cloud.stamps + self._sweep_offset, self._tolerance)
 
-    def _learn_sweep(self, motion: MotionConfig, T: Transform | None) -> int:
+    def _learn_sweep(self) -> int:
         """From a cloud's stamp to the moment at which it sweeps the camera's view, ns, by the first clouds."""
-        sweep, cloud = SweepOffset(motion), self._index.cloud
+        sweep, cloud, T = SweepOffset(self._motion), self._index.cloud, self._view
         for k in range(min(len(cloud), BLIND_CLOUDS)):
             if T is None:
                 T = self._index.reference_at(int(cloud.recorded[k]))
@@ -244,25 +263,14 @@ class BagSource:
         index = self._index.image
         if self._video is not None:
             return self._video.picture(int(index.recorded[position]), int(index.headers[position]))
-        message = self._fetch(index, position)
+        message = self._index.message(index, position)
         compressed = self._bag.topics[self.image_topic].type == COMPRESSED
         return decode_compressed_image(message) if compressed else decode_image(message)
 
     def _cloud(self, position: int) -> PointCloud:
         index = self._index.cloud
         key = (index.topic, int(index.recorded[position]), int(index.headers[position]))
-        return self.recent(key, lambda: cloud_of(self._fetch(index, position), self._bag.topics[index.topic].type))
-
-    def _fetch(self, index: TopicIndex, position: int) -> Any:
-        recorded = int(index.recorded[position])
-        kept = self._index.kept(index.topic, recorded, int(index.headers[position]))
-        if kept is not None:
-            return self._bag.decode(index.topic, kept)
-        for topic, _, data in self._bag.raw([index.topic], recorded, recorded + 1):
-            # Several messages may have been recorded at the same time.
-            if peek_header(data)[0] == index.headers[position]:
-                return self._bag.decode(topic, data)
-        raise BadInputError(f"bag {self.path}: a message on {index.topic} is gone; the bag has changed, open it again")
+        return self.recent(key, lambda: cloud_of(self._index.message(index, position), self._bag.topics[index.topic].type))
 
     def describe(self) -> dict[str, str]:
         """What the bag holds: label -> text."""
@@ -299,50 +307,3 @@ def cloud_of(message: Any, kind: str) -> PointCloud:
     if isinstance(message, PointCloud):
         return message
     return decode_compressed_cloud(message) if kind == COMPRESSED_POINTS else decode_cloud(message)
-
-
-class Slots:
-    """Equal parts of a recording, in each of which one frame with a neighbour on either side is looked for. start, stop: of the
-    recording, ns. count: of slots. half: half the width of a window, ns."""
-
-    def __init__(self, start: int, stop: int, count: int, half: int) -> None:
-        self._half, self._count = half, count
-        edges = np.linspace(start, stop, count + 1).astype(np.int64).tolist()
-        worthwhile = 2 * half * count < WORTHWHILE * (stop - start)
-        self._slots = list(pairwise(edges)) if worthwhile else []
-        self._places = list(PLACES)
-        self._read: list[Span] = []
-        self._windows: dict[int, Span] = {}  # the newest of each slot
-        self._frames: dict[int, int] = {}  # slot -> position of its frame
-
-    def next_spans(self) -> list[Span]:
-        """Windows to read next, apart from each other and from all before; none when every slot has its frame, or there is
-        nowhere left to look. Where no slot has one in its middle, windows are too short, and no others are tried."""
-        spans: list[Span] = []
-        while self._places and not spans and (self._frames or not self._windows):
-            place = self._places.pop(0)
-            for slot, (start, stop) in enumerate(self._slots):
-                middle = start + round(place * (stop - start))
-                span = (middle - self._half, middle + self._half)
-                if slot not in self._frames and not self._overlaps(span):
-                    spans.append(span)
-                    self._read.append(span)
-                    self._windows[slot] = span
-        return spans
-
-    def _overlaps(self, span: Span) -> bool:
-        return any(span[0] < stop and start < span[1] for start, stop in self._read)
-
-    def look(self, images: Stamps, clouds: Stamps) -> None:
-        """Look for the frames of the windows. images, clouds: (n,) recording times of all pairs, in their order."""
-        self._frames = {}
-        for slot, (start, stop) in self._windows.items():
-            inside = (start <= images) & (images < stop) & (start <= clouds) & (clouds < stop)
-            between = np.flatnonzero(inside)[1:-1]
-            if len(between):
-                self._frames[slot] = int(between[np.argmin(np.abs(images[between] - (start + stop) // 2))])
-
-    @property
-    def frames(self) -> list[int] | None:
-        """Positions of the frames in the middle of the windows; None if too few have one."""
-        return sorted(self._frames.values()) if len(self._frames) >= max(ENOUGH * self._count, 1) else None

@@ -1,42 +1,34 @@
-"""A bag on disk, read through rosbags: topics, raw messages, static transforms, clear errors."""
+"""A bag on disk, read through rosbags: its files, of which some may be missing, topics and raw messages, with clear errors."""
 
 from __future__ import annotations
 
 import re
-from collections import deque
+import shutil
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import pairwise
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from weakref import finalize
 
-import numpy as np
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.storage_mcap import McapReader
 
-from calib_ros import se3
-from calib_ros.arrays import Matrix
-from calib_ros.datasets.bag_parts import METADATA, BagParts, storage_files, storage_of
-from calib_ros.datasets.bag_types import layout_of, typestore
+from calib_ros import io
+from calib_ros.datasets.bag_messages import Raw, heads, layout_of, messages, storages_of, typestore, zstd
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS
-from calib_ros.messages.compressed_points import COMPRESSED_POINTS, REPUBLISH
 from calib_ros.messages.point_fields import LIVOX, decode_livox
-from calib_ros.messages.video import VIDEO
-from calib_ros.messages.wire import shown, wire_header
+from calib_ros.messages.wire import wire_header
 
-IMAGE = "sensor_msgs/msg/Image"
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-POINTS = "sensor_msgs/msg/PointCloud2"
-TF = "tf2_msgs/msg/TFMessage"
-# Types that hold images or clouds in a form that is not read, and what makes one that is.
-REMEDIES = {
-    "VelodyneScan": "play the bag, run the transform node of velodyne_pointcloud for your model, and record its cloud",
-    "PacketMsg": "play the bag, run the cloud node of ouster_ros, and record its cloud",
-    "CompressedPointCloud2": REPUBLISH,  # of other packages
-    "LaserScan": "a scan of one plane has no edges to calibrate by; record a 3-D LiDAR",
-}
-MOST_NAMED = 40  # topics that an error names
-DEPTH = "/compressedDepth"  # how image_transport names the topics of depth images
+TF, TF_STATIC = "tf2_msgs/msg/TFMessage", "/tf_static"
+METADATA, ZSTD_SUFFIX = "metadata.yaml", ".zstd"
+STORAGE = {".mcap": "mcap", ".db3": "sqlite3", ".bag": "ROS 1"}
+TOOLS = {"mcap": "recover it with `mcap recover`, ", "ROS 1": "mend it with `rosbag reindex`, "}
+# ns, between parts of one recording: a recorder opens the next file where it closes the last one.
+MAX_OVERLAP, MAX_PAUSE = NANOSECONDS, 60 * NANOSECONDS
 YAML_MERGE, YAML_ALIAS, MAX_ALIASES = re.compile(rb"<<\s*:"), re.compile(rb"[\s\[{,:]\*\w"), 10  # no recorder writes either
 
 
@@ -51,27 +43,42 @@ class Topic(NamedTuple):
 class BagFile:
     """An open bag: topics, raw messages, decoding. Not thread-safe. Closes its files on `close` or garbage collection.
 
-    indexed: whether messages of a topic and time are found without reading the others, as in an mcap file with chunks and a
-    summary. Raises BadInputError for whatever is wrong with its files, when opening or when reading.
+    start, stop: recording times of the first message, and after the last, ns. indexed: whether messages of a topic and time are
+    found without reading the others, as in an mcap file with chunks and a summary. remarks: on what is not as a recorder leaves
+    it, for people. incomplete: use what is left of a bag of which parts are missing, empty or damaged.
+
+    Raises BadInputError for whatever is wrong with its files, when opening or when reading.
     """
 
     def __init__(self, path: Path, incomplete: bool = False) -> None:
         self.path = path
-        self.storage = storage_of(_some_file(path))
-        tool = {"mcap": "recover it with `mcap recover`, ", "ROS 1": "mend it with `rosbag reindex`, "}.get(self.storage, "")
-        self._advice = f"{tool}copy it again or record it again"
-        self._types = typestore()
-        with self._readable():
-            _check_metadata(path / METADATA)
-            self._parts = BagParts(path, incomplete)
-        self.close = finalize(self, self._parts.close)
-        self.remarks = tuple(self._parts.remarks)
-        with self._readable():
-            self.topics = _topics(self._parts.connections)
-            self._layouts = {connection.topic: layout_of(connection) for connection in self._parts.connections}
-            self.start, self.stop = self._parts.start, self._parts.stop  # recording times, ns
-            self.duration_s = (self.stop - self.start) / NANOSECONDS
-            self.indexed = self._parts.indexed
+        if not path.exists():
+            raise BadInputError(f"{path} does not exist; give a bag folder, a .mcap, .db3 or .bag file")
+        files = [path] if path.is_file() else _storage_files(path)
+        if not files:
+            raise BadInputError(f"bag {path} has no .mcap, .db3 or .bag file; copy the whole folder")
+        self.storage = _storage_of(files[0])
+        if not self.storage:
+            raise BadInputError(f"{path} is no bag; give a bag folder, a .mcap, .db3 or .bag file")
+        self._advice = f"{TOOLS.get(self.storage, '')}copy it again or record it again"
+        self._types, stack = typestore(), ExitStack()
+        self.close = finalize(self, stack.close)
+        try:
+            with self._readable():
+                _check_metadata(path / METADATA)
+                self._readers, self.remarks = _opened(path, files, incomplete, stack)
+                connections = [connection for reader in self._readers for connection in reader.connections]
+                self.topics = _topics(connections)
+                self._layouts = {connection.topic: layout_of(connection) for connection in connections}
+                filled = [reader for reader in self._readers if reader.message_count]
+                self.start = min((reader.start_time for reader in filled), default=0)
+                self.stop = max((reader.end_time for reader in filled), default=0)
+                self.duration_s = (self.stop - self.start) / NANOSECONDS
+                storages = [storage for reader in self._readers for storage in storages_of(reader)]
+                self.indexed = all(bool(storage.chunks) for storage in storages if isinstance(storage, McapReader))
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def size(self) -> int:
@@ -83,20 +90,37 @@ class BagFile:
         """Mean time between the messages of a topic, ns; the length of the bag where there are none."""
         return round((self.stop - self.start) / max(self.topics[topic].messages, 1))
 
-    def raw(self, topics: Collection[str], start: int | None = None, stop: int | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """(topic, time of recording in ns, CDR bytes) of messages recorded in [start, stop), in order."""
+    def raw(self, topics: Collection[str], start: int | None = None, stop: int | None = None) -> Iterator[Raw]:
+        """(topic, time of recording in ns, CDR bytes) of messages recorded in [start, stop), in order, part by part."""
         with self._readable():
-            yield from self._parts.messages(topics, start, stop)
+            for reader in self._readers:
+                yield from messages(reader, topics, start, stop)
 
-    def heads(self, topics: Collection[str], whole: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+    def heads(self, topics: Collection[str], whole: Collection[str]) -> Iterator[Raw]:
         """As `raw` of all, about in order, and of topics that are not in `whole` maybe no more than the header."""
         with self._readable():
-            yield from self._parts.heads(topics, whole)
+            for reader in self._readers:
+                yield from heads(reader, topics, whole)
+
+    def find(self, topic: str, recorded: int, header: int) -> Any:
+        """The decoded message that was recorded and stamped then, ns: several may have been recorded at the same time."""
+        for _, _, data in self.raw([topic], recorded, recorded + 1):
+            if peek_header(data)[0] == header:
+                return self.decode(topic, data)
+        raise BadInputError(f"bag {self.path}: a message on {topic} is gone; the bag has changed, open it again")
+
+    @property
+    def statics(self) -> list[str]:
+        """Topics of static transforms."""
+        return [topic.name for topic in self.topics.values() if topic.type == TF and topic.name.endswith(TF_STATIC)]
+
+    def transforms(self, start: int | None = None, stop: int | None = None) -> list[tuple[int, Any]]:
+        """Messages of static transforms recorded in [start, stop), with the time of recording, ns."""
+        return [(recorded, self.decode(topic, data)) for topic, recorded, data in self.raw(self.statics, start, stop)]
 
     def decode(self, topic: str, data: bytes) -> Any:
         """CDR bytes -> message of the topic's type, of Livox's own type its PointCloud."""
-        kind = self.topics[topic].type
-        if kind in LIVOX:
+        if self.topics[topic].type in LIVOX:
             return decode_livox(data)
         with self._readable(f"{topic}: "):
             return self._types.deserialize_cdr(data, self._layouts[topic])
@@ -109,20 +133,7 @@ class BagFile:
         except CalibrationError:
             raise
         except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise BadInputError(f"{where}bag {self.path} cannot be read ({reason}); {self._advice}") from error
-
-
-def _some_file(path: Path) -> Path:
-    """A file of a bag, whose ending is its format."""
-    if not path.exists():
-        raise BadInputError(f"{path} does not exist; give a bag folder, a .mcap, .db3 or .bag file")
-    files = [path] if path.is_file() else storage_files(path)
-    if not files:
-        raise BadInputError(f"bag {path} has no .mcap, .db3 or .bag file; copy the whole folder")
-    if not storage_of(files[0]):
-        raise BadInputError(f"{path} is no bag; give a bag folder, a .mcap, .db3 or .bag file")
-    return files[0]
+            raise BadInputError(f"{where}bag {self.path} cannot be read ({_reason(error)}); {self._advice}") from error
 
 
 def peek_header(data: bytes) -> tuple[int, str]:
@@ -132,133 +143,81 @@ def peek_header(data: bytes) -> tuple[int, str]:
     return header.stamp, header.frame_id.lstrip("/")
 
 
-class StaticTransforms:
-    """The tree of /tf_static. As in tf2, the latest transform of a child counts and broken ones are ignored."""
-
-    def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, Matrix]] = {}  # child -> parent, T_parent_child
-
-    def add(self, msg: Any) -> None:
-        """Add all transforms of a TFMessage."""
-        for item in msg.transforms:
-            t, q = item.transform.translation, item.transform.rotation
-            try:
-                rotation = se3.rotation_from_quaternion([q.x, q.y, q.z, q.w])
-            except BadInputError:
-                continue
-            translation = np.array([t.x, t.y, t.z], float)
-            if np.isfinite(translation).all():
-                parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
-                self._parents[child] = (parent, se3.from_parts(rotation, translation))
-
-    def parent(self, child: str) -> str | None:
-        """The parent of a frame; None if it has none, or is unknown."""
-        edge = self._parents.get(child)
-        return None if edge is None else edge[0]
-
-    def lookup(self, target: str, source: str, without: str | None = None) -> Matrix | None:
-        """T_target_source (4, 4) through the tree in either direction; None if the frames are not connected. without: a child
-        whose edge to its parent is left out."""
-        found = self._reached(target, without)
-        return found[source][0] if source in found else None
-
-    def frames(self, target: str) -> dict[str, Matrix]:
-        """T_target_frame (4, 4) of all frames that are connected to `target`, by name."""
-        return {frame: T for frame, (T, _) in self._reached(target).items()}
-
-    def path(self, target: str, source: str) -> list[tuple[str, str]]:
-        """The edges (parent, child) between two frames, from the target on; none if they are not connected."""
-        found, edges = self._reached(target), []
-        while source in found and source != target:
-            before = found[source][1]
-            edges.append((before, source) if self.parent(source) == before else (source, before))
-            source = before
-        return edges[::-1]
-
-    def _reached(self, target: str, without: str | None = None) -> dict[str, tuple[Matrix, str]]:
-        """Every frame that the tree connects to `target`, with T_target_frame (4, 4) and the frame before it."""
-        edges: dict[str, list[tuple[str, Matrix]]] = {}
-        for child, (parent, T_parent_child) in list(self._parents.items()):  # another thread may add
-            if child != without:
-                edges.setdefault(parent, []).append((child, T_parent_child))
-                edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
-        if target not in edges:
-            return {}
-        found = {target: (np.eye(4), target)}
-        queue = deque([target])
-        while queue:
-            frame = queue.popleft()
-            for neighbour, T_frame_neighbour in edges[frame]:
-                if neighbour not in found:
-                    found[neighbour] = (found[frame][0] @ T_frame_neighbour, frame)
-                    queue.append(neighbour)
-        return found
-
-
-def choose_image(bag: BagFile, requested: str | None, option: str = "--image-topic") -> str:
-    """The image topic: the requested one, or the only one. A raw image wins over its compressed transport. option: what to set,
-    if it is not there."""
-    candidates = _with_type(bag, IMAGE, COMPRESSED)
-    if requested is None:
-        candidates = [name for name in candidates if not name.endswith(DEPTH)]
-        transports = {f"{name}/compressed" for name in candidates}
-        candidates = [name for name in candidates if name not in transports]
-    if requested is not None or not candidates:
-        candidates += _with_type(bag, *VIDEO)
-    return _choose(bag, requested, candidates, "Image, CompressedImage or video", option)
-
-
-def choose_points(bag: BagFile, requested: str | None, option: str = "--points-topic") -> str:
-    """The cloud topic: the requested one, or the only one. option: what to set, if it is not there."""
-    candidates = _with_type(bag, POINTS)
-    if requested is not None or not candidates:
-        candidates += _with_type(bag, *LIVOX, COMPRESSED_POINTS)
-    return _choose(bag, requested, candidates, "PointCloud2", option)
-
-
-def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str, option: str = "--camera-info-topic") -> str:
-    """The requested CameraInfo topic, or the one beside the image (image_transport's rule), or the only one. option: what to set,
-    if it is not there."""
-    candidates = _with_type(bag, CAMERA_INFO)
-    beside = re.sub(r"/(compressed|ffmpeg|foxglove)$", "", image_topic).rpartition("/")[0] + "/camera_info"
-    if requested is None and beside in candidates:
-        return beside
-    return _choose(bag, requested, candidates, "CameraInfo", option)
-
-
-def is_rectified(image_topic: str) -> bool:
-    """Whether the name of a topic says rectified, as image_proc names them (image_rect, image_rect_color)."""
-    return re.search(r"(^|[/_])rect(ified)?($|[/_])", image_topic) is not None
-
-
-def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: str, option: str) -> str:
-    if requested is not None:
-        name = "/" + requested.strip("/")
-        for own in (name, name[1:]):  # topics of ROS 1 may have no slash
-            if own in candidates:
-                return own
-        has = f"it has {_named(candidates)}" if candidates else "it has none"
-        raise BadInputError(f"bag {bag.path} has no {kind} messages on topic {name}; {has}; set {option} accordingly")
-    if len(candidates) == 1:
-        return candidates[0]
-    if candidates:
+def _opened(path: Path, files: list[Path], incomplete: bool, stack: ExitStack) -> tuple[list[Any], list[str]]:
+    """Readers of a bag's files, which the stack closes, and remarks. A folder is read by its metadata.yaml, or, where that is
+    missing or does not fit, file by file: of one recording by their times, and, unless `incomplete`, all of it."""
+    if path.is_file():
+        return [_reader(path, stack)], []
+    remarks = []
+    if (path / METADATA).exists():
+        try:
+            return [_reader(path, stack)], []
+        except (ReaderError, AssertionError) as error:
+            why = _reason(error, "a part is empty or damaged")
+            remarks.append(f"bag {path.name}: {METADATA} does not fit its files ({why}), which are read without it")
+    readers, lost = [], []
+    for file in files:
+        try:
+            readers.append(_reader(file, stack))
+        except Exception as error:  # of a damaged file rosbags raises whatever the damaged place leads to
+            lost.append(f"{file.name} ({_reason(error)})")
+    if not readers or (lost and len(files) == 1):
+        raise ReaderError(", ".join(lost))
+    lost += [f"{reader.path.name} (empty)" for reader in readers if len(files) > 1 and not reader.message_count]
+    with suppress(Exception):  # a metadata.yaml that does not tell the names of its files
+        listed = io.load((path / METADATA).read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
+        lost += [f"{name} (missing)" for name in [PurePath(part).name for part in listed] if not (path / name).exists()]
+    if lost and not incomplete:
         raise BadInputError(
-            f"bag {bag.path} has {len(candidates)} topics of type {kind}: {_named(candidates)}; choose one with {option}"
+            f"bag {path}: {len(readers)} parts are there, but not {', '.join(lost)}; copy the whole folder, or use what is "
+            "left by --incomplete"
         )
-    others = _named([f"{topic.name} ({topic.type})" for topic in bag.topics.values()]) or "nothing at all"
-    names = dict.fromkeys(topic.type.rpartition("/")[2] for topic in bag.topics.values() if topic.messages)
-    depth = [f"{shown(topic)} is a depth image, no camera picture" for topic in bag.topics if topic.endswith(DEPTH)]
-    known = [f"{name}: {REMEDIES[name]}" for name in names if name in REMEDIES]
-    advice = "; ".join([*(depth if kind.startswith("Image") else []), *known]) or "record that topic too"
-    raise BadInputError(f"bag {bag.path} has no {kind} messages, only {others}; {advice}")
+    readers.sort(key=lambda reader: int(reader.start_time))
+    for one, other in pairwise([reader for reader in readers if reader.message_count]):
+        pause, shorter = other.start_time - one.end_time, min(one.duration, other.duration)
+        if pause < -min(MAX_OVERLAP, shorter // 2) or (pause > MAX_PAUSE and not incomplete):
+            raise BadInputError(
+                f"bag {path}: {one.path.name} and {other.path.name} are not parts of one recording by their times, and no "
+                f"{METADATA} says so; open one of the files"
+            )
+    return readers, remarks + [f"bag {path.name}: without {part}" for part in lost]
 
 
-def _named(topics: list[str]) -> str:
-    return ", ".join([*(" ".join(topic.split()) for topic in topics[:MOST_NAMED]), *["..."] * (len(topics) > MOST_NAMED)])
+def _reader(path: Path, stack: ExitStack) -> Any:
+    """The open reader of a folder or file. A compressed file is unpacked to disk."""
+    if path.is_file() and path.suffix == ZSTD_SUFFIX:
+        plain = Path(stack.enter_context(TemporaryDirectory())) / path.stem
+        with path.open("rb") as packed, zstd.open(packed, "rb") as source, plain.open("wb") as target:
+            shutil.copyfileobj(source, target)
+        path = plain
+    reader: Any = Ros1Reader(path) if path.is_file() and path.suffix == ".bag" else Reader(path)
+    reader.open()
+
+    def close() -> None:
+        with suppress(Exception):
+            reader.close()
+
+    stack.callback(close)
+    return reader
 
 
-def _with_type(bag: BagFile, *types: str) -> list[str]:
-    return [topic.name for topic in bag.topics.values() if topic.type in types and topic.messages > 0]
+def _storage_files(folder: Path) -> list[Path]:
+    """The files of a folder that hold messages, in order, compressed ones among them."""
+    files = [file for file in sorted(folder.iterdir(), key=lambda file: (len(file.name), file.name)) if file.is_file()]
+    names = {file.name for file in files}
+    # Neither what `rosbag compress` and `reindex` keep of a bag, nor what was decompressed already.
+    again = (".orig.bag", ".orig.active")
+    kept = [file for file in files if not file.name.startswith(".") and not file.name.endswith(again)]
+    return [file for file in kept if _storage_of(file) and not (file.suffix == ZSTD_SUFFIX and file.stem in names)]
+
+
+def _storage_of(file: Path) -> str:
+    """How a file holds messages: "mcap", "sqlite3", "ROS 1", or "" if it holds none."""
+    return STORAGE.get((file.with_suffix("") if file.suffix == ZSTD_SUFFIX else file).suffix, "")
+
+
+def _reason(error: Exception, otherwise: str = "") -> str:
+    return " ".join(str(error).split()) or otherwise or type(error).__name__
 
 
 def _check_metadata(path: Path) -> None:
@@ -270,12 +229,12 @@ def _check_metadata(path: Path) -> None:
 
 def _topics(connections: Collection[Any]) -> dict[str, Topic]:
     """Topics by name. TypeError where metadata.yaml, which rosbags does not check, has no text or no number."""
-    counts: dict[str, int] = {}
+    topics: dict[str, Topic] = {}
     for connection in connections:  # one topic may have several connections, one per publisher's QoS
-        if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
+        name, kind, count = connection.topic, connection.msgtype, connection.msgcount
+        if not isinstance(name, str) or not isinstance(kind, str):
             raise TypeError("a topic without a name or a type")
-        if not isinstance(connection.msgcount, int):
-            raise TypeError(f"{connection.topic} has no number of messages")
-        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-    types = {connection.topic: connection.msgtype for connection in connections}
-    return {name: Topic(name, types[name], count) for name, count in sorted(counts.items())}
+        if not isinstance(count, int):
+            raise TypeError(f"{name} has no number of messages")
+        topics[name] = Topic(name, kind, count + (topics[name].messages if name in topics else 0))
+    return dict(sorted(topics.items()))

@@ -11,7 +11,8 @@ import numpy as np
 
 from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
-from calib_ros.datasets.bag_file import TF, BagFile, StaticTransforms, peek_header
+from calib_ros.datasets.bag_file import BagFile, peek_header
+from calib_ros.datasets.static_transforms import StaticTransforms
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import decode_camera_info
@@ -29,32 +30,31 @@ FEW_TRANSFORMS, BEGINNING = 100, 5 * NANOSECONDS
 
 class BagIndex:
     """What is needed to pair the messages of a bag and to fetch them one by one, with its cameras and static transforms. Nothing
-    is read before `read` or `read_spans`; the messages of the latter are kept, up to MAX_KEPT."""
+    is read before `read` or `read_spans`; the messages of the latter are kept, up to MAX_KEPT.
 
-    def __init__(
-        self, bag: BagFile, image_topic: str, points_topic: str, info_topic: str, rectified: bool, clock: str = "auto"
-    ) -> None:
+    image, cloud, info: of the topics. without_key: pictures of a video before its first key frame, which are left out.
+    clouds_ahead: see `clock_difference`, ns, of which `clock_difference` is taken out of the clouds' stamps.
+    """
+
+    def __init__(self, bag: BagFile, topics: tuple[str, str, str], rectified: bool, clock: str) -> None:
         self._bag, self._rectified, self._clock = bag, rectified, clock
-        self.image, self.cloud, self.info = (TopicIndex(topic) for topic in (image_topic, points_topic, info_topic))
-        self._by_topic = {index.topic: index for index in (self.image, self.cloud, self.info)}
-        self._statics = [t.name for t in bag.topics.values() if t.type == TF and t.name.endswith("/tf_static")]
+        self.image, self.cloud, self.info = indices = tuple(map(TopicIndex, topics))
+        self._by_topic = dict(zip(topics, indices, strict=True))
         self._decoded: dict[bytes, Camera] = {}
-        self._found_cameras: list[Camera] = []
         self._cameras: list[Camera] = []
         self._transforms: list[tuple[int, Any]] = []
         self._kept: dict[tuple[str, int, int], bytes] | None = None
-        self.without_key = 0  # pictures of a video before its first key frame, which are left out
-        self._kept_bytes = 0
+        self.without_key = self._kept_bytes = 0
 
     def read(self, keep: bool = False) -> None:
         """Read the whole bag once. keep: hold messages in memory, as `read_spans` does."""
         if keep:
             self._kept = {}
-        topics, begin = [*self._by_topic, *self._statics], self._first_key()
-        for topic, recorded, data in (
-            self._bag.raw(topics) if keep else self._bag.heads(topics, [self.info.topic, *self._statics])
-        ):
-            if topic in self._statics:
+        begin, statics = self._first_key(), self._bag.statics
+        topics = [*self._by_topic, *statics]
+        whole = [self.info.topic, *statics]
+        for topic, recorded, data in self._bag.raw(topics) if keep else self._bag.heads(topics, whole):
+            if topic in statics:
                 self._transforms.append((recorded, self._bag.decode(topic, data)))
             elif topic == self.image.topic and recorded < begin:
                 self.without_key += 1
@@ -76,17 +76,28 @@ class BagIndex:
     def read_spans(self, spans: list[Span]) -> None:
         """Read only what was recorded in these spans, which neither overlap nor have been read; CameraInfo and static transforms
         also around them, where they are rarer."""
-        if self._kept is None:
-            self._kept = {}
-        info_period = self._bag.period(self.info.topic)
+        self._kept = self._kept or {}
+        period = self._bag.period(self.info.topic)
         for start, stop in spans:
-            rare = info_period > (stop - start) / 2
+            rare = period > (stop - start) / 2
             topics = [self.image.topic, self.cloud.topic] + ([] if rare else [self.info.topic])
             for message in self._bag.raw(topics, start, stop):
                 self._add(*message)
-            for message in self._bag.raw([self.info.topic], start - info_period, stop + info_period) if rare else ():
+            for message in self._bag.raw([self.info.topic], start - period, stop + period) if rare else ():
                 self._add(*message)
-        self._finish(self._read_transforms(spans))
+        statics = self._bag.statics
+        few = sum(self._bag.topics[topic].messages for topic in statics) <= FEW_TRANSFORMS
+        if not self._transforms:
+            self._transforms += self._bag.transforms(*(() if few else (self._bag.start, self._bag.start + BEGINNING)))
+        if not few:
+            before = 2 * max(self._bag.period(topic) for topic in statics)
+            for start, stop in spans:
+                self._transforms += self._bag.transforms(start - before, stop)
+            self._transforms.sort(key=lambda one: one[0])
+        self._finish()
+        if not few and not self._references:  # others may connect camera and LiDAR
+            self._transforms = self._bag.transforms()
+            self._find_references()
 
     def _add(self, topic: str, recorded: int, data: bytes) -> None:
         with located(self._bag.path, topic):
@@ -95,74 +106,57 @@ class BagIndex:
                 content = bytes(data[12:])  # all but the stamp: nearly always the same, so decoded once
                 if content not in self._decoded:
                     self._decoded[content] = decode_camera_info(self._bag.decode(topic, data), self._rectified)
-                self._found_cameras.append(self._decoded[content])
+                self._cameras.append(self._decoded[content])
             elif self._kept is not None and self._kept_bytes + len(data) <= MAX_KEPT:
                 self._kept[topic, recorded, header] = data
                 self._kept_bytes += len(data)
 
-    def _read_transforms(self, spans: list[Span]) -> bool:
-        """Whether there may be more of them than those read."""
-        count = sum(self._bag.topics[topic].messages for topic in self._statics)
-        if count <= FEW_TRANSFORMS:
-            if not self._transforms:
-                self._transforms = self._transforms_within()
-            return False
-        if not self._transforms:
-            self._transforms += self._transforms_within(self._bag.start, self._bag.start + BEGINNING)
-        before = 2 * max(self._bag.period(topic) for topic in self._statics)
-        for start, stop in spans:
-            self._transforms += self._transforms_within(start - before, stop)
-        self._transforms.sort(key=lambda one: one[0])
-        return True
-
-    def _transforms_within(self, start: int | None = None, stop: int | None = None) -> list[tuple[int, Any]]:
-        found = self._bag.raw(self._statics, start, stop)
-        return [(recorded, self._bag.decode(topic, data)) for topic, recorded, data in found]
-
-    def _finish(self, more_transforms: bool = False) -> None:
-        """Put in order what was read. more_transforms: look for others if those read do not connect camera and LiDAR."""
-        self.camera_frame = self.image.frame or self.info.frame
-        self.lidar_frame = self.cloud.frame
+    def _finish(self) -> None:
+        """Put in order what was read."""
+        self.camera_frame, self.lidar_frame = self.image.frame or self.info.frame, self.cloud.frame
         self.use_headers = self._clock != RECORDING and self.image.has_stamps and self.cloud.has_stamps
         for index in self._by_topic.values():
             index.finish(self.use_headers)
         asked = self.use_headers and self._clock == AUTO
         self.clouds_ahead, of_clocks = clock_difference(self.image, self.cloud) if asked else (0, False)
-        self.clock_difference = self.clouds_ahead if of_clocks else 0  # that is taken out
+        self.clock_difference = self.clouds_ahead if of_clocks else 0
         self.cloud.stamps = self.cloud.stamps - self.clock_difference
-        self._cameras = [self._found_cameras[i] for i in self.info.order]
-        self._references = _references(self._transforms, self.camera_frame, self.lidar_frame)
-        if more_transforms and not self._references:
-            self._transforms = self._transforms_within()
-            self._references = _references(self._transforms, self.camera_frame, self.lidar_frame)
+        self._find_references()
+
+    def _find_references(self) -> None:
+        """The tree of all static transforms, and T_camera_lidar with its recording time, ns, whenever one has changed it."""
+        self._tree = StaticTransforms()
+        self._references: list[tuple[int, Matrix]] = []
+        for recorded, message in self._transforms:
+            self._tree.add(message)
+            T = self._tree.lookup(self.camera_frame, self.lidar_frame)
+            if T is not None and not (self._references and np.array_equal(T, self._references[-1][1])):
+                self._references.append((recorded, T))
 
     @property
     def missing(self) -> list[str]:
         """Topics without any message."""
         return [topic for topic, index in self._by_topic.items() if not len(index)]
 
-    def kept(self, topic: str, recorded: int, header: int) -> bytes | None:
-        """A message that is in memory."""
-        return None if self._kept is None else self._kept.get((topic, recorded, header))
+    def message(self, index: TopicIndex, position: int) -> Any:
+        """The decoded message at a position of image or cloud."""
+        recorded, header = int(index.recorded[position]), int(index.headers[position])
+        kept = (self._kept or {}).get((index.topic, recorded, header))
+        return self._bag.find(index.topic, recorded, header) if kept is None else self._bag.decode(index.topic, kept)
 
     def vehicle_frames(self) -> dict[str, Matrix]:
         """T_camera_F (4, 4) of all frames F but camera and LiDAR that the static transforms connect to the camera, by name."""
-        tree = StaticTransforms()
-        for _, message in self._transforms:
-            tree.add(message)
         own = (self.camera_frame, self.lidar_frame)
-        return {name: T for name, T in tree.frames(self.camera_frame).items() if name not in own}
+        return {name: T for name, T in self._tree.frames(self.camera_frame).items() if name not in own}
 
     def camera_at(self, stamp: int) -> Camera:
         """The camera of the CameraInfo nearest to an image's stamp."""
-        return self._cameras[int(nearest_index(self.info.stamps, np.array([stamp]))[0])]
+        return self._cameras[int(self.info.order[nearest_index(self.info.stamps, np.array([stamp]))[0]])]
 
     def reference_at(self, recorded: int) -> Matrix | None:
         """T_camera_lidar (4, 4) as of a recording time, None if unknown; before the first transform the first one."""
-        if not self._references:
-            return None
         known = sum(time <= recorded for time, _ in self._references)
-        return self._references[max(known - 1, 0)][1]
+        return self._references[max(known - 1, 0)][1] if self._references else None
 
 
 class TopicIndex:
@@ -236,18 +230,6 @@ def difference_in_words(ahead: int, of_clocks: bool) -> str:
         )
     exact = "" if scale else "; it is known as well as messages arrive, to some 0.1 s, see motion.max_time_offset_s"
     return f"{found}: {cause_of_difference(seconds)}; paired as recorded{exact}. --clock header pairs by the stamps as they are"
-
-
-def _references(transforms: list[tuple[int, Any]], camera_frame: str, lidar_frame: str) -> list[tuple[int, Matrix]]:
-    """T_camera_lidar after each static transform that changed it, with the recording time, ns."""
-    tree = StaticTransforms()
-    known: list[tuple[int, Matrix]] = []
-    for recorded, message in transforms:
-        tree.add(message)
-        T = tree.lookup(camera_frame, lidar_frame)
-        if T is not None and not (known and np.array_equal(T, known[-1][1])):
-            known.append((recorded, T))
-    return known
 
 
 @contextmanager

@@ -154,31 +154,6 @@ class Timestamps:
             ) from None
 
 
-class Oxts:
-    """Velocities of the GPS/IMU unit as twists of the LiDAR. folder: oxts/data. calibration: calib_imu_to_velo.txt."""
-
-    def __init__(self, folder: Path, calibration: Path) -> None:
-        self.folder = folder
-        self._T_velo_imu = se3.from_parts(np.eye(3), NOMINAL_LEVER_ARM)
-        if calibration.is_file():
-            file = CalibrationFile(calibration)
-            parts = se3.from_parts(file.matrix("R", 3, 3), file.matrix("T", 3, 1)[:, 0])
-            self._T_velo_imu = se3.as_transform(parts, f"the calibration {calibration}")
-
-    def twist(self, number: int) -> Matrix | None:
-        """(rx, ry, rz, tx, ty, tz) of the LiDAR in its frame, rad/s and m/s; None without a file. BadInputError if damaged."""
-        path = self.folder / f"{number:010d}.txt"
-        if not path.is_file():
-            return None
-        try:
-            values = np.array(path.read_text("utf-8", "replace").split(), float)
-        except (OSError, ValueError):
-            values = np.zeros(0)
-        if len(values) != OXTS_FIELDS or not np.isfinite(values).all():
-            raise BadInputError(f"{path} must have {OXTS_FIELDS} numbers, see dataformat.txt; copy it again or delete it")
-        return lidar_twist(values, self._T_velo_imu)
-
-
 def lidar_twist(values: Matrix, T_velo_imu: Transform) -> Matrix:
     """Numbers of an oxts file (30,) -> twist (6,) of the LiDAR in its own frame, rad/s and m/s."""
     # vf, vl, vu are level with the ground (dataformat.txt), wx, wy, wz in the body's frame: roll and pitch separate the two.
@@ -194,19 +169,32 @@ class ScanMotion:
     """Point times and LiDAR velocity of a raw drive's scans. root: the drive. date: the folder of its calibrations."""
 
     def __init__(self, root: Path, date: Path) -> None:
-        folder = root / "velodyne_points"
-        self._start = Timestamps.if_present(folder / "timestamps_start.txt")
-        self._end = Timestamps.if_present(folder / "timestamps_end.txt")
-        self._oxts = Oxts(root / "oxts" / "data", date / "calib_imu_to_velo.txt")
+        self._start = Timestamps.if_present(root / "velodyne_points" / "timestamps_start.txt")
+        self._end = Timestamps.if_present(root / "velodyne_points" / "timestamps_end.txt")
+        self._oxts, calibration = root / "oxts" / "data", date / "calib_imu_to_velo.txt"
+        self._T_velo_imu = se3.from_parts(np.eye(3), NOMINAL_LEVER_ARM)
+        if calibration.is_file():
+            file = CalibrationFile(calibration)
+            parts = se3.from_parts(file.matrix("R", 3, 3), file.matrix("T", 3, 1)[:, 0])
+            self._T_velo_imu = se3.as_transform(parts, f"the calibration {calibration}")
 
     @property
     def has_oxts(self) -> bool:
         """Whether the drive has velocities."""
-        return self._oxts.folder.is_dir()
+        return self._oxts.is_dir()
 
     def twist(self, number: int) -> Matrix | None:
-        """See Oxts.twist."""
-        return self._oxts.twist(number)
+        """(rx, ry, rz, tx, ty, tz) of the LiDAR in its frame, rad/s and m/s; None without a file. BadInputError if damaged."""
+        path = self._oxts / f"{number:010d}.txt"
+        if not path.is_file():
+            return None
+        try:
+            values = np.array(path.read_text("utf-8", "replace").split(), float)
+        except (OSError, ValueError):
+            values = np.zeros(0)
+        if len(values) != OXTS_FIELDS or not np.isfinite(values).all():
+            raise BadInputError(f"{path} must have {OXTS_FIELDS} numbers, see dataformat.txt; copy it again or delete it")
+        return lidar_twist(values, self._T_velo_imu)
 
     def period_s(self, number: int) -> float:
         """Duration of a scan's revolution, s."""

@@ -30,6 +30,21 @@ MAX_GAP_NS = 300_000_000  # between two poses whose difference is a velocity; sc
 SHOWN_SCENES = 10  # all of v1.0-mini
 
 
+class Record(NamedTuple):
+    """A row of sample_data: tokens of its sample and ego pose; channel, T_ego_sensor (4, 4) and camera matrix (3, 3) of its
+    sensor, empty for others than cameras; path below the root, stamp in ns, size in px of images."""
+
+    sample: str
+    pose: str
+    channel: str
+    T_ego_sensor: Transform
+    K: Matrix
+    filename: str
+    stamp: int
+    key: bool
+    size: tuple[int, int]
+
+
 class NuScenesSource:
     """The key frames of a nuScenes scene, for one of its cameras: about 40, half a second apart.
 
@@ -49,13 +64,11 @@ class NuScenesSource:
         folder = tables_folder(Path(text))
         if folder is None:
             raise BadInputError(f"{text} is not a nuScenes folder; looked for {EXPECTED_NUSCENES}")
-        self.path = folder
-        self._tables = SceneTables(folder, scene)
-        self.name = self._tables.scene
-        self.lidar_frame = self._tables.lidar
-        self.recent = Recent(0)  # scans that are kept
-        self.camera_frame = self._tables.choose_camera(camera)
-        found = self._tables.pairs(self.camera_frame)
+        self.path, self.recent = folder, Recent(0)  # scans that are kept
+        self._records = self._read_scene(scene)
+        self.camera_frame = self._choose_camera(camera)
+        scans = {scan.sample: scan for scan in self._of(self.lidar_frame) if scan.key}
+        found = [(image, scans[image.sample]) for image in self._of(self.camera_frame) if image.key and image.sample in scans]
         self._pairs = [pair for pair in found if all((folder.parent / record.filename).is_file() for record in pair)]
         self._left_out = len(found) - len(self._pairs)
         if not self._pairs:
@@ -65,15 +78,61 @@ class NuScenesSource:
             )
         self.camera, self.reference = self._calibration(*self._pairs[0])
 
-    @property
-    def scenes(self) -> list[str]:
-        """Names of all scenes of the dataset."""
-        return self._tables.scenes
+    def _read_scene(self, scene: str | None) -> list[Record]:
+        """The rows of sample_data of a scene, in time; of the large tables no others are kept. Also learns name, scenes, cameras
+        and lidar_frame."""
+        folder = self.path
+        by_name = {shown(row["name"]): row for row in self._rows("scene", ("name", "token"))}
+        self.scenes = list(by_name)
+        if not by_name or (scene is not None and scene not in by_name):
+            has = ", ".join(self.scenes[:SHOWN_SCENES]) + (", ..." if len(by_name) > SHOWN_SCENES else "") or "none"
+            raise BadInputError(f"{folder} has no scene {scene or 'at all'}; it has {has}; choose one by {folder.parent}#NAME")
+        self.name = self.scenes[0] if scene is None else scene
+        token = by_name[self.name]["token"]
+        samples = {row["token"] for row in self._rows("sample", ("token",), lambda row: row.get("scene_token") == token)}
+        sensors = {row["token"]: row for row in self._rows("sensor", ("token", "channel", "modality"))}
+        self.cameras = sorted(shown(row["channel"]) for row in sensors.values() if row["modality"] == "camera")
+        scanners = sorted(shown(row["channel"]) for row in sensors.values() if row["modality"] == "lidar")
+        if not scanners or not self.cameras:
+            raise BadInputError(f"{folder / 'sensor.json'} has no lidar or no camera; download the tables again")
+        self.lidar_frame = LIDAR if LIDAR in scanners else scanners[0]
+        channels = {token: shown(row["channel"]) for token, row in sensors.items()}
+        wanted = {token for token, channel in channels.items() if channel in (self.lidar_frame, *self.cameras)}
+        fields: tuple[str, ...] = ("token", "sensor_token", "translation", "rotation", "camera_intrinsic")
 
-    @property
-    def cameras(self) -> list[str]:
-        """Channels of all cameras."""
-        return self._tables.cameras
+        def sensor(row: Row) -> tuple[str, Transform, Matrix]:
+            return channels[row["sensor_token"]], _pose(row), _numbers(row["camera_intrinsic"])
+
+        rows = self._rows("calibrated_sensor", fields, lambda row: row.get("sensor_token") in wanted)
+        calibrated = {row["token"]: self._typed(row, sensor) for row in rows}
+        fields = ("token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp", "is_key_frame")
+
+        def of_scene(row: Row) -> bool:
+            return row.get("sample_token") in samples and row.get("calibrated_sensor_token") in calibrated
+
+        def record(row: Row) -> Record:
+            channel, T, K = calibrated[row["calibrated_sensor_token"]]
+            size, stamp = (int(row.get("width") or 0), int(row.get("height") or 0)), np.int64(int(row["timestamp"]) * STAMP_NS)
+            tokens = str(row["sample_token"]), str(row["ego_pose_token"])
+            return Record(*tokens, channel, T, K, str(row["filename"]), int(stamp), bool(row["is_key_frame"]), size)
+
+        records = [self._typed(row, record) for row in self._rows("sample_data", fields, of_scene)]
+        return sorted(records, key=lambda own: own.stamp)
+
+    def _choose_camera(self, camera: int | str | None) -> str:
+        """Channel of a camera by its name or position, by default CAM_FRONT. BadInputError if there is none."""
+        if camera is None:
+            return CAMERA if CAMERA in self.cameras else self.cameras[0]
+        if isinstance(camera, int) and 0 <= camera < len(self.cameras):
+            return self.cameras[camera]
+        if camera in self.cameras:
+            return str(camera)
+        listed = ", ".join(f"{k} {name}" for k, name in enumerate(self.cameras))
+        raise BadInputError(f"{self.path} has no camera {camera}; choose one of {listed}")
+
+    def _of(self, channel: str) -> list[Record]:
+        """What a sensor measured, in time."""
+        return [record for record in self._records if record.channel == channel]
 
     def calibration_at(self, index: int) -> tuple[Matrix, Matrix]:
         """Camera matrix (3, 3) and T_camera_lidar (4, 4) of a frame, whose picture and scan are not read."""
@@ -94,13 +153,13 @@ class NuScenesSource:
             cloud_stamp=scan.stamp,
             reference=reference,
             name=str(scan.stamp // STAMP_NS),
-            twist=self._tables.twist(scan),
+            twist=self._twist(scan),
             compensated=True,
         )
 
     def scans(self) -> Timed:
         """All scans of the scene that are there, also between the key frames, with their stamps, ns."""
-        found = [scan for scan in self._tables.of(self.lidar_frame) if (self.path.parent / scan.filename).is_file()]
+        found = [scan for scan in self._of(self.lidar_frame) if (self.path.parent / scan.filename).is_file()]
         return Timed(np.array([scan.stamp for scan in found], np.int64), lambda index: self._cloud(found[index]))
 
     def _cloud(self, scan: Record) -> PointCloud:
@@ -108,13 +167,11 @@ class NuScenesSource:
         return self.recent(path, lambda: read_sweep(path))
 
     def _calibration(self, picture: Record, scan: Record) -> tuple[Camera, Matrix]:
-        camera = Camera(picture.sensor.K, *picture.size)
-        return camera, se3.inverse(picture.sensor.T_ego_sensor) @ scan.sensor.T_ego_sensor
+        return Camera(picture.K, *picture.size), se3.inverse(picture.T_ego_sensor) @ scan.T_ego_sensor
 
     def describe(self) -> dict[str, str]:
         """What the scene holds: label -> text."""
-        tables = self._tables
-        others = [name for name in tables.scenes if name != self.name]
+        others = [name for name in self.scenes if name != self.name]
         some = ", ".join(others[:SHOWN_SCENES]) + (", ..." if len(others) > SHOWN_SCENES else "")
         left_out = f"; left out: {self._left_out} whose files are missing" if self._left_out else ""
         return {
@@ -124,91 +181,14 @@ class NuScenesSource:
             "frames": f"{len(self)} key frames{left_out}",
             "stamps": "of sample_data",
             "motion": "scans are compensated already; from their stamps to the images' by ego_pose",
-            "cameras": ", ".join(f"{name}{' (chosen)' if name == self.camera_frame else ''}" for name in tables.cameras),
+            "cameras": ", ".join(f"{name}{' (chosen)' if name == self.camera_frame else ''}" for name in self.cameras),
             "camera": describe_camera(self.camera),
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,
             "reference": "from calibrated_sensor",
         }
 
-
-class CalibratedSensor(NamedTuple):
-    """A row of calibrated_sensor: channel, T_ego_sensor (4, 4), camera matrix (3, 3) (empty for other sensors)."""
-
-    channel: str
-    T_ego_sensor: Transform
-    K: Matrix
-
-
-class Record(NamedTuple):
-    """A row of sample_data: token of its sample and ego pose, sensor, path below the root, stamp in ns, size in px of images."""
-
-    sample: str
-    pose: str
-    sensor: CalibratedSensor
-    filename: str
-    stamp: int
-    key: bool
-    size: tuple[int, int]
-
-
-class SceneTables:
-    """The rows of the tables that belong to one scene.
-
-    scene: its name. scenes: names of all. cameras: channels. lidar: channel of the scanner. Of the large tables only the rows of
-    the scene are kept. Raises BadInputError for missing or damaged tables, or an unknown scene.
-    """
-
-    def __init__(self, folder: Path, scene: str | None) -> None:
-        self._folder = folder
-        by_name = {shown(row["name"]): row for row in self._rows("scene", ("name", "token"))}
-        self.scenes = list(by_name)
-        if not by_name or (scene is not None and scene not in by_name):
-            has = ", ".join(self.scenes[:SHOWN_SCENES]) + (", ..." if len(by_name) > SHOWN_SCENES else "") or "none"
-            raise BadInputError(f"{folder} has no scene {scene or 'at all'}; it has {has}; choose one by {folder.parent}#NAME")
-        self.scene = self.scenes[0] if scene is None else scene
-        token = by_name[self.scene]["token"]
-        self._samples = {row["token"] for row in self._rows("sample", ("token",), lambda row: row.get("scene_token") == token)}
-        sensors = {row["token"]: row for row in self._rows("sensor", ("token", "channel", "modality"))}
-        self.cameras = sorted(shown(row["channel"]) for row in sensors.values() if row["modality"] == "camera")
-        scanners = sorted(shown(row["channel"]) for row in sensors.values() if row["modality"] == "lidar")
-        if not scanners or not self.cameras:
-            raise BadInputError(f"{folder / 'sensor.json'} has no lidar or no camera; download the tables again")
-        self.lidar = LIDAR if LIDAR in scanners else scanners[0]
-        channels = {token: shown(row["channel"]) for token, row in sensors.items()}
-        wanted = {token for token, channel in channels.items() if channel in (self.lidar, *self.cameras)}
-        fields: tuple[str, ...] = ("token", "sensor_token", "translation", "rotation", "camera_intrinsic")
-        calibrated = {
-            row["token"]: self._typed(
-                row, lambda row: CalibratedSensor(channels[row["sensor_token"]], _pose(row), _numbers(row["camera_intrinsic"]))
-            )
-            for row in self._rows("calibrated_sensor", fields, lambda row: row.get("sensor_token") in wanted)
-        }
-        fields = ("token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp", "is_key_frame")
-
-        def of_scene(row: Row) -> bool:
-            return row.get("sample_token") in self._samples and row.get("calibrated_sensor_token") in calibrated
-
-        records = [self._typed(row, lambda row: _record(row, calibrated)) for row in self._rows("sample_data", fields, of_scene)]
-        self._records = sorted(records, key=lambda record: record.stamp)
-
-    def choose_camera(self, camera: int | str | None) -> str:
-        """Channel of a camera by its name or position, by default CAM_FRONT. BadInputError if there is none."""
-        if camera is None:
-            return CAMERA if CAMERA in self.cameras else self.cameras[0]
-        if isinstance(camera, int) and 0 <= camera < len(self.cameras):
-            return self.cameras[camera]
-        if camera in self.cameras:
-            return str(camera)
-        listed = ", ".join(f"{k} {name}" for k, name in enumerate(self.cameras))
-        raise BadInputError(f"{self._folder} has no camera {camera}; choose one of {listed}")
-
-    def pairs(self, channel: str) -> list[tuple[Record, Record]]:
-        """Image of a camera and scan of each key frame, in time."""
-        scans = {scan.sample: scan for scan in self.of(self.lidar) if scan.key}
-        return [(image, scans[image.sample]) for image in self.of(channel) if image.key and image.sample in scans]
-
-    def twist(self, scan: Record) -> Matrix | None:
+    def _twist(self, scan: Record) -> Matrix | None:
         """(rx, ry, rz, tx, ty, tz) of the LiDAR at a scan's stamp, rad/s and m/s, in its own frame; None without neighbours."""
         stamps, poses = self._lidar_poses
         at = int(np.searchsorted(stamps, scan.stamp))
@@ -221,24 +201,18 @@ class SceneTables:
     @cached_property
     def _lidar_poses(self) -> tuple[NDArray[np.int64], list[Matrix]]:
         """Stamps (n,) in ns, and T_global_lidar, of all scans of the scene."""
-        scans = self.of(self.lidar)
+        scans = self._of(self.lidar_frame)
         wanted = {scan.pose for scan in scans}
         rows = self._rows("ego_pose", ("token", "translation", "rotation"), lambda row: row.get("token") in wanted)
         poses = {row["token"]: self._typed(row, _pose) for row in rows}
         missing = len(wanted - poses.keys())
         if missing:
-            raise BadInputError(
-                f"{self._folder / 'ego_pose.json'} lacks {missing} of {len(scans)} scans; download the tables again"
-            )
-        return np.array([scan.stamp for scan in scans], np.int64), [poses[scan.pose] @ scan.sensor.T_ego_sensor for scan in scans]
-
-    def of(self, channel: str) -> list[Record]:
-        """What a sensor measured, in time."""
-        return [record for record in self._records if record.sensor.channel == channel]
+            raise BadInputError(f"{self.path / 'ego_pose.json'} lacks {missing} of {len(scans)} scans; download the tables again")
+        return np.array([scan.stamp for scan in scans], np.int64), [poses[scan.pose] @ scan.T_ego_sensor for scan in scans]
 
     def _rows(self, table: str, fields: tuple[str, ...], keep: Callable[[Row], bool] = lambda _: True) -> list[Row]:
         """The rows to keep. Rows are dropped while the file is parsed: sample_data of the whole dataset has 2.6 million."""
-        path = self._folder / f"{table}.json"
+        path = self.path / f"{table}.json"
         try:
             with path.open(encoding="utf-8") as file:
                 rows = json.load(file, object_hook=lambda row: row if keep(row) else None)
@@ -260,15 +234,8 @@ class SceneTables:
             return convert(row)
         except (BadInputError, TypeError, ValueError, OverflowError):
             raise BadInputError(
-                f"{self._folder}: the values of row {shown(row['token'])} are unusable; download the tables again"
+                f"{self.path}: the values of row {shown(row['token'])} are unusable; download the tables again"
             ) from None
-
-
-def _record(row: Row, sensors: dict[str, CalibratedSensor]) -> Record:
-    size = (int(row.get("width") or 0), int(row.get("height") or 0))
-    sensor, stamp = sensors[row["calibrated_sensor_token"]], int(row["timestamp"]) * STAMP_NS
-    names = (str(row["sample_token"]), str(row["ego_pose_token"]))
-    return Record(*names, sensor, str(row["filename"]), int(np.int64(stamp)), bool(row["is_key_frame"]), size)
 
 
 def _pose(row: Row) -> Transform:

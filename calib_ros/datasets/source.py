@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
+from calib_ros.datasets.recent import Recent
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.accumulation import Accumulator, Stamped
@@ -71,10 +71,9 @@ class WithMotion:
     ) -> None:
         self._source, self._config, self._warn = source, config, warn
         self._accumulate_s, self._accumulated = accumulate_s, Accumulator()
-        self._cached = CACHED_CLOUDS + round(accumulate_s * SCANS_PER_S)
         self.name, self.camera, self.reference = source.name, source.camera, source.reference
         self.camera_frame, self.lidar_frame = source.camera_frame, source.lidar_frame
-        self._clouds: OrderedDict[int, Stamped | None] = OrderedDict()
+        self._clouds = Recent(CACHED_CLOUDS + round(accumulate_s * SCANS_PER_S))
         self._library_missing = False
 
     def __len__(self) -> int:
@@ -84,7 +83,7 @@ class WithMotion:
         """Frame `index`, with a twist if its neighbours allow one. Raises what the source raises."""
         frame = self._source[index]
         index %= max(len(self), 1)
-        self._keep(index, _stamped(frame))
+        self._clouds(index, lambda: _stamped(frame))
         if self._library_missing:
             return frame
         try:
@@ -121,17 +120,8 @@ class WithMotion:
             yield cloud
 
     def _cloud(self, index: int) -> Stamped | None:
-        """The cloud of a frame with its stamp; None if unusable."""
-        if index not in self._clouds:
-            frame = _readable(self._source, index)  # a damaged neighbour does not make this frame unusable
-            self._keep(index, None if frame is None else _stamped(frame))
-        return self._clouds[index]
-
-    def _keep(self, index: int, cloud: Stamped | None) -> None:
-        self._clouds[index] = cloud
-        self._clouds.move_to_end(index)
-        while len(self._clouds) > self._cached:
-            self._clouds.popitem(last=False)
+        """The cloud of a frame with its stamp; None if unusable: a damaged neighbour does not make a frame unusable."""
+        return self._clouds(index, lambda: None if (frame := _readable(self._source, index)) is None else _stamped(frame))
 
 
 def neighbours(source: Source, positions: Sequence[int]) -> list[Frame]:

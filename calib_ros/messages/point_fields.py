@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,9 +69,7 @@ def decode_cloud(msg: Any) -> PointCloud:
         raise BadInputError(f"PointCloud2: size {width}x{height} is negative; check the LiDAR driver")
     if width * height == 0:
         return PointCloud(np.zeros((0, 3), np.float32))
-    layout = _Layout.of(msg, width, height)
-    columns = {quantity: layout.column(names) for quantity, names in POINT_FIELDS.items()}
-    return _cloud({name: column.ravel() for name, column in columns.items() if column is not None}, stamp_ns(msg.header.stamp))
+    return _cloud(_columns(msg, width, height), stamp_ns(msg.header.stamp))
 
 
 def livox_scan(data: bytes) -> LivoxScan:
@@ -183,55 +180,41 @@ def _time_unit(span: float, units: tuple[int, ...]) -> int | None:
     return units[0] if span * units[0] < shortest else None
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where each field of each point lies in the message's bytes, checked against their number."""
-
-    fields: dict[str, Any]  # the message's PointFields by lower-case name
-    data: NDArray[np.uint8]
-    shape: tuple[int, int]  # height, width
-    strides: tuple[int, int]  # bytes from row to row and from point to point
-    byte_order: str  # of numpy's dtypes
-
-    @classmethod
-    def of(cls, msg: Any, width: int, height: int) -> _Layout:
-        fields: dict[str, Any] = {}
-        for field in msg.fields:
-            fields.setdefault(str(field.name).strip().lower(), field)
-        missing = [name for name in REQUIRED if name not in fields]
-        if missing:
-            raise BadInputError(
-                f"PointCloud2: no field {', '.join(missing)} among ({', '.join(fields) or 'none'}); "
-                "choose the topic of a 3-D LiDAR with x, y, z"
-            )
-        point_step = int(msg.point_step)
-        for name, field in fields.items():
-            _check_field(name, field, point_step)
-        row_bytes = width * point_step
-        # A cloud of one row needs no row_step, and some drivers leave it at 0 or at the size of a full scan.
-        row_step = row_bytes if height == 1 else int(msg.row_step) or row_bytes
-        if row_step < row_bytes:
-            raise BadInputError(
-                f"PointCloud2: row_step {row_step} is shorter than {width} points of {point_step} bytes; check the LiDAR driver"
-            )
-        data = payload(msg.data)
-        if len(data) < height * row_step:
-            raise BadInputError(
-                f"PointCloud2: {len(data)} bytes of data, but {width}x{height} points of {point_step} bytes "
-                f"need {height * row_step}; the message is truncated, check the LiDAR driver or the recording"
-            )
-        return cls(fields, data, (height, width), (row_step, point_step), ">" if msg.is_bigendian else "<")
-
-    def column(self, names: tuple[str, ...]) -> NDArray[Any] | None:
-        """A quantity of all points (height, width) as a view of the first of its fields that the message has, else None. Of an
-        array field the first element."""
-        for name in names:
-            field = self.fields.get(name)
-            if field is not None and int(field.datatype) in DATATYPES:
-                dtype = np.dtype(self.byte_order + DATATYPES[int(field.datatype)])
-                column: NDArray[Any] = np.ndarray(self.shape, dtype, self.data, int(field.offset), self.strides)
-                return column
-        return None
+def _columns(msg: Any, width: int, height: int) -> dict[str, NDArray[Any]]:
+    """The quantities of all points (n,), each by the first of its fields that the message has, whose layout is checked against
+    the number of bytes. Of an array field the first element."""
+    fields: dict[str, Any] = {}
+    for field in msg.fields:
+        fields.setdefault(str(field.name).strip().lower(), field)
+    missing = [name for name in REQUIRED if name not in fields]
+    if missing:
+        raise BadInputError(
+            f"PointCloud2: no field {', '.join(missing)} among ({', '.join(fields) or 'none'}); "
+            "choose the topic of a 3-D LiDAR with x, y, z"
+        )
+    point_step = int(msg.point_step)
+    for name, field in fields.items():
+        _check_field(name, field, point_step)
+    row_bytes = width * point_step
+    # A cloud of one row needs no row_step, and some drivers leave it at 0 or at the size of a full scan.
+    row_step = row_bytes if height == 1 else int(msg.row_step) or row_bytes
+    if row_step < row_bytes:
+        raise BadInputError(
+            f"PointCloud2: row_step {row_step} is shorter than {width} points of {point_step} bytes; check the LiDAR driver"
+        )
+    data, order = payload(msg.data), ">" if msg.is_bigendian else "<"
+    if len(data) < height * row_step:
+        raise BadInputError(
+            f"PointCloud2: {len(data)} bytes of data, but {width}x{height} points of {point_step} bytes "
+            f"need {height * row_step}; the message is truncated, check the LiDAR driver or the recording"
+        )
+    columns = {}
+    for quantity, names in POINT_FIELDS.items():
+        found = next((fields[name] for name in names if name in fields and int(fields[name].datatype) in DATATYPES), None)
+        if found is not None:
+            dtype = np.dtype(order + DATATYPES[int(found.datatype)])
+            columns[quantity] = np.ndarray((height, width), dtype, data, int(found.offset), (row_step, point_step)).ravel()
+    return columns
 
 
 def _check_field(name: str, field: Any, point_step: int) -> None:

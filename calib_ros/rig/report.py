@@ -26,7 +26,6 @@ from calib_ros.rig.moved import RigHypothesis, hypotheses, verdict
 REFERENCE = "reference"
 AXES = "xyz"
 WRITABLE = (*export.DESCRIPTIONS, *export.AUTOWARE)
-CAMCHAIN = "camchain"  # begins the names of Kalibr's files
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,10 @@ class RigReport:
         alone tells), refused (its edges contradict others, or are too uncertain)."""
         if name == self.solution.reference:
             return REFERENCE, "the others are stated in its frame"
-        if name not in self._joined():
+        joined, edges = {self.solution.reference}, [{e.target, e.source} for e in self.solution.edges]
+        for _ in edges:
+            joined |= {n for ends in edges if ends & joined for n in ends}
+        if name not in joined:
             why = [m.reason for m in self.measured if name in (m.target, m.source) and m.edge is None and m.reason]
             return INSUFFICIENT, "no edge joins it to the reference, its pose is the prior" + "".join(f"; {w}" for w in why[:2])
         doubted = [e.name for e in self.solution.doubted if name in (e.target, e.source)]
@@ -86,13 +88,6 @@ class RigReport:
                 f"{self.limits.tolerance_deg:g} deg and {100 * self.limits.tolerance_m:g} cm; give more frames or a better prior"
             )
         return CONVERGED, ""
-
-    def _joined(self) -> set[str]:
-        """Sensors that edges join to the reference."""
-        known = {self.solution.reference}
-        for _ in self.solution.edges:
-            known |= {n for e in self.solution.edges if {e.target, e.source} & known for n in (e.target, e.source)}
-        return known
 
     def _direction(self, name: str, twist: Matrix) -> str:
         """An unobservable direction at the sensor, in the reference's axes."""
@@ -137,7 +132,7 @@ class RigReport:
             "rejected": [e.name for e in s.rejected],
             "doubted": [e.name for e in s.doubted],
             "loops": [loop_dict(loop) for loop in s.loops],
-            **({} if self.before is None else {"changes": [_change(h) for h in self.changes[0]], "change": self.changes[1]}),
+            **({} if self.before is None else {"changes": list(map(_change, self.changes[0])), "change": self.changes[1]}),
             "version": VERSION,
         }
 
@@ -169,16 +164,11 @@ class RigReport:
     def _edge(self, measured: Measurement) -> dict[str, Any]:
         edge = measured.edge
         return {
-            "target": measured.target,
-            "source": measured.source,
-            "kind": measured.kind,
-            "fate": self._fate(measured),
-            "reason": measured.reason,
-            "T_target_source": None if edge is None else edge.T.tolist(),
-            "covariance": None if edge is None else edge.covariance.tolist(),
-            "time_offset_s": None if edge is None else edge.time_offset_s,
-            "time_offset_sigma_s": None if edge is None else edge.time_sigma_s,
-            "frames_used": 0 if edge is None else edge.samples,
+            **{key: getattr(measured, key) for key in ("target", "source", "kind")},
+            **{"fate": self._fate(measured), "reason": measured.reason},
+            **{"T_target_source": edge and edge.T.tolist(), "covariance": edge and edge.covariance.tolist()},
+            **{"time_offset_s": edge and edge.time_offset_s, "time_offset_sigma_s": edge and edge.time_sigma_s},
+            "frames_used": edge.samples if edge else 0,
         }
 
     def dumps(self) -> str:
@@ -207,12 +197,9 @@ class RigReport:
             [", ".join(loop.sensors), _amounts(*loop.size), f"{loop.p_value:.3g}", "yes" if loop.closes else "NO"]
             for loop in self.solution.loops
         ]
+        of_sensors = ["sensor", "status", "x y z, m", "1 sigma", "error", "remarks"]
         return [
-            (
-                f"Sensors in the frame of {self.solution.reference}",
-                ["sensor", "status", "x y z, m", "1 sigma", "error", "remarks"],
-                sensors,
-            ),
+            (f"Sensors in the frame of {self.solution.reference}", of_sensors, sensors),
             ("Edges", ["target", "source", "kind", "", "1 sigma", "remarks"], edges),
             ("Loops", ["sensors", "residual", "p-value", "closes"], loops),
         ]
@@ -221,12 +208,9 @@ class RigReport:
         """For a terminal."""
         lines = []
         for caption, header, rows in self.tables():
-            if not rows:
-                continue
-            widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
-            lines += [caption] + [
-                "  " + "  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)).rstrip() for r in [header, *rows]
-            ]
+            widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+            aligned = ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in [header, *rows]]
+            lines += [caption, *aligned] if rows else []
         return "\n".join([*lines, *([] if self.before is None else [f"Since the former result: {self.changes[1]}"])])
 
     def html(self) -> str:
@@ -260,57 +244,44 @@ class RigReport:
     def has_changed(self, before: RigReport) -> bool:
         """Whether a sensor is elsewhere than before: by more than its standard deviation in one of the six directions."""
         poses, former = self.solution.poses, before.solution.poses
-        if (self.frames, poses.keys()) != (before.frames, former.keys()):
-            return True
-        return any(
-            bool((np.abs(se3.log(T @ se3.inverse(former[n]))) > np.sqrt(np.diag(self.solution.marginal(n)))).any())
-            for n, T in poses.items()
-        )
-
-    def edges_of_frames(self) -> dict[tuple[str, str], Transform]:
-        """T_parent_child (4, 4) by TF frames, of every two sensors, the reference as parent first."""
-        names = [self.solution.reference, *self.solution.columns]
-        poses = self.solution.poses
-        return {(self.frames[a], self.frames[b]): se3.inverse(poses[a]) @ poses[b] for a in names for b in names if a != b}
+        same = (self.frames, poses.keys()) == (before.frames, former.keys())
+        return not same or any(export.moves(T, former[n], self.solution.marginal(n)) for n, T in poses.items())
 
     def write(self, path: str) -> str:
-        """Write to a file of another tool, by its ending: the joints of a robot's description (.urdf, .xacro) or the entries of
-        Autoware's YAML, which change where the file exists; Kalibr's camera chain where the name begins with camchain. Returns
-        which sensors it has no place for, in a line; "" if none."""
+        """Write to a file by its ending: JSON, or of another tool, the joints of a robot's description (.urdf, .xacro) or the
+        entries of Autoware's YAML, which change where the file exists; Kalibr's camera chain where the name begins with camchain.
+        Returns which sensors it has no place for, in a line; "" if none."""
+        suffix, poses, reference = Path(path).suffix.lower(), self.solution.poses, self.solution.reference
+        if suffix == ".json":
+            export.replace_file(path, self.dumps().encode())
+            return ""
         check_out(path)
         frames = sorted(self.frames.values())
         if len(set(frames)) < len(frames) or "" in frames:
             raise BadInputError(f"{path}: sensors share a TF frame or have none ({', '.join(frames)}); set sensors.NAME.frame")
-        edges, name = self.edges_of_frames(), Path(path).name
-        poses = [export.Pose(a, b, T) for (a, b), T in edges.items() if a == self.frames[self.solution.reference]]
-        if name.startswith(CAMCHAIN):
-            cameras = {n: (c, self.solution.poses[n], self.description[n].topic) for n, c in self.cameras.items()}
+        if Path(path).name.startswith(export.CAMCHAIN):
+            cameras = {n: (c, poses[n], self.description[n].topic) for n, c in self.cameras.items()}
             io.write_atomically(path, export.kalibr_camchain(cameras).encode())
             return ""
-        joined = export.write_edges(path, poses, edges)
+        names = [reference, *self.solution.columns]
+        edges = {(self.frames[a], self.frames[b]): se3.inverse(poses[a]) @ poses[b] for a in names for b in names if a != b}
+        joined = export.write_edges(path, edges, {(a, b): T for (a, b), T in edges.items() if a == self.frames[reference]})
         if missing := [name for name, frame in self.frames.items() if frame not in joined]:
-            what = ("joint", "joints") if Path(path).suffix.lower() in export.DESCRIPTIONS else ("entry", "entries")
+            what = ("joint", "joints") if suffix in export.DESCRIPTIONS else ("entry", "entries")
             return f"{path} has no {what[0]} for {', '.join(missing)}, which are not written; add {what[1]} of their frames"
         return ""
+
+
+def _change(found: RigHypothesis) -> dict[str, Any]:
+    names = "kind", "sensors", "posterior", "rotation_deg", "translation_m", "displacement", "p_value"
+    values = found.kind, list(found.sensors), found.posterior, *found.size, found.displacement.tolist(), found.p_value
+    return dict(zip(names, values, strict=True))
 
 
 def loop_dict(loop: Loop) -> dict[str, Any]:
     """Plain numbers, lists and texts of a loop."""
     names = "sensors", "rotation_deg", "translation_m", "p_value", "closes"
     return dict(zip(names, (list(loop.sensors), *loop.size, loop.p_value, loop.closes), strict=True))
-
-
-def _change(found: RigHypothesis) -> dict[str, Any]:
-    deg, m = found.size
-    return {
-        "kind": found.kind,
-        "sensors": list(found.sensors),
-        "posterior": found.posterior,
-        "rotation_deg": deg,
-        "translation_m": m,
-        "displacement": found.displacement.tolist(),
-        "p_value": found.p_value,
-    }
 
 
 def load(path: str | Path) -> RigSolution:
@@ -343,7 +314,9 @@ def load(path: str | Path) -> RigSolution:
 def check_out(path: str) -> None:
     """BadInputError, before the work, for a file that `RigReport.write` has no format for."""
     if Path(path).suffix.lower() not in WRITABLE:
-        raise BadInputError(f"--out {path}: the ending tells the format; give one of {', '.join(WRITABLE)}, or {CAMCHAIN}.yaml")
+        raise BadInputError(
+            f"--out {path}: the ending tells the format; give one of {', '.join(WRITABLE)}, or {export.CAMCHAIN}.yaml"
+        )
 
 
 def _amounts(deg: float, m: float) -> str:

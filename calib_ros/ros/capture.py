@@ -184,7 +184,7 @@ def _types() -> Any:
     """rosbags' message types, with all that writes a bag imported. MissingDependencyError without rosbags."""
     try:
         importlib.import_module("calib_ros.datasets.bag_writer")
-        from calib_ros.datasets.bag_types import typestore
+        from calib_ros.datasets.bag_messages import typestore
     except ImportError:
         raise MissingDependencyError("nothing captured: ~/capture needs rosbags; pip install rosbags") from None
     return typestore()
@@ -194,7 +194,8 @@ def _write_bag(path: Path, frames: list[RawKeyframe], result: Result, rectified:
     types = _types()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    from calib_ros.datasets.bag_writer import BAG_VERSION, LATCHED, TF_STATIC, MessageBuilder
+    from calib_ros.datasets.bag_file import TF_STATIC
+    from calib_ros.datasets.bag_writer import BAG_VERSION, LATCHED, transforms_message
 
     # Whoever reads the bag knows by this name which numbers of CameraInfo count.
     topics = ("/image_rect" if rectified else "/image", "/camera_info", "/points")
@@ -208,12 +209,9 @@ def _write_bag(path: Path, frames: list[RawKeyframe], result: Result, rectified:
             entries += [(at, 0, frame.camera_info), (at, 1, frame.image), (at, 2, frame.cloud)]
         entries.sort(key=lambda entry: entry[:2])
         # The messages' own names of the frames: the node's parameters may name them otherwise.
-        build = MessageBuilder(
-            types,
-            frames[0].image.header.frame_id or result.camera_frame,
-            frames[0].cloud.header.frame_id or result.lidar_frame,
-        )
-        tf = build.static_transform(entries[0][0], result.T_camera_lidar)
+        camera, lidar = frames[0].image.header.frame_id, frames[0].cloud.header.frame_id
+        children = {lidar or result.lidar_frame: result.T_camera_lidar}
+        tf = transforms_message(entries[0][0], camera or result.camera_frame, children)
         writer.write(latched, entries[0][0], types.serialize_cdr(tf, "tf2_msgs/msg/TFMessage"))
         for stamp, role, message in entries:
             writer.write(joined[(1, 0, 2)[role]], stamp, serialize_message(message.message()))

@@ -62,7 +62,7 @@ class RosInterface:
         self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
         self._files = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_files")  # disks may be slow
-        self.write_back = WriteBack(lambda: self.parameters, self.tf.edges, self._files, self.health)
+        self.write_back = WriteBack(lambda: self.parameters, self._files, self.health, self.tf.edges)
         self._export_settings = self._export_parameters()
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
         decode = (frame_from_messages, cloud_from_message) if rig is None else (rig.frame, rig.cloud)

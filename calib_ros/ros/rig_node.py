@@ -57,7 +57,7 @@ from calib_ros.ros.rig_pairs import (
     node_of_pair,
 )
 from calib_ros.ros.tf import LATCHED, StaticTf
-from calib_ros.ros.write_back import RigWriteBack, check_files
+from calib_ros.ros.write_back import WriteBack, check_files
 
 if TYPE_CHECKING:
     from calib_ros.ros.node import RosInterface
@@ -129,7 +129,7 @@ class RigInterface:
         self._edges: list[TransformStamped] = []  # of the newest solution
         self._edges_told = self._edges
         self._files = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_files")  # disks may be slow
-        self._write_back = RigWriteBack(lambda: self.parameters, self._files, self.health)
+        self._write_back = WriteBack(lambda: self.parameters, self._files, self.health)
         self._solver: Worker[tuple[LiveRig, list[PairState], Priors]] = Worker("calib_rig", self._solve, self._failed)
         self.publisher = node.create_publisher(Rig, "~/rig", LATCHED)
         self._diagnostics_pub = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -314,7 +314,7 @@ class RigInterface:
             frames = {own.name: self._frame(own.name) for own in state.sensors}
             of_cameras = {camera: pair.pipeline.camera for (camera, _), pair in self.pairs.items()}
             cameras = {name: camera for name, camera in of_cameras.items() if camera is not None}
-            self._write_back.add(replace(state.report, frames=frames, cameras=cameras, source=self.parameters["vehicle"]))
+            self._write_back.put(replace(state.report, frames=frames, cameras=cameras, source=self.parameters["vehicle"]))
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         with self.health.guard():

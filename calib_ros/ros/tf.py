@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
-from calib_ros.datasets.bag_file import StaticTransforms
+from calib_ros.datasets.static_transforms import StaticTransforms
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.result import Result
 from calib_ros.ros.conversions import transform_message

@@ -2,98 +2,69 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from itertools import permutations
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import numpy as np
 
 from calib_ros.errors import BadInputError
-from calib_ros.export import AUTOWARE, DESCRIPTIONS, Edges, content, has_changed, replace_file, with_edges, write_back
+from calib_ros.export import AUTOWARE, CAMCHAIN, DESCRIPTIONS, Edges, content, has_changed, with_edges, write_back
 from calib_ros.io import check_output
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.rig.description import RigDescription
 from calib_ros.rig.live import Pair, joined_to
-from calib_ros.rig.report import CAMCHAIN, RigReport
+from calib_ros.rig.report import RigReport
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.parameters import Parameters
 
-Known = TypeVar("Known", Result, RigReport)
 
+class WriteBack:
+    """Thread-safe; files are written on the executor's only thread. parameters: gives the current ones. edges: of a single pair,
+    those of the tree of frames, see `calib_ros.export.write_back`."""
 
-class _Files(ABC, Generic[Known]):
-    """Thread-safe; files are written on the executor's only thread. parameters: gives the current ones."""
+    def __init__(
+        self,
+        parameters: Callable[[], Parameters],
+        executor: Executor,
+        health: Health,
+        edges: Callable[[Result], Edges] = lambda _: {},
+    ) -> None:
+        self._parameters, self._executor, self._health, self._edges = parameters, executor, health, edges
+        self._written: dict[tuple[str, str], Result | RigReport] = {}  # by file and joint
 
-    def __init__(self, parameters: Callable[[], Parameters], executor: Executor, health: Health) -> None:
-        self._parameters, self._executor, self._health = parameters, executor, health
-        self._written: dict[tuple[str, str], Known] = {}  # by file and joint
+    def add(self, extrinsic: Extrinsic, stamp: int = 0) -> None:
+        """The current extrinsic of a single pair, whatever its status."""
+        if extrinsic.usable and extrinsic.result.status == CONVERGED:
+            self.put(extrinsic.result)
 
-    def _put(self, known: Known) -> None:
+    def put(self, known: Result | RigReport) -> None:
+        """What has converged: of a pair, or of a rig a solution of which all sensors are usable."""
         if self._parameters()["export.on_converged"]:
             self._executor.submit(self._write, known)
 
-    def _write(self, known: Known) -> None:
+    def _write(self, known: Result | RigReport) -> None:
         parameters = self._parameters()
         for path in parameters["export.on_converged"]:
-            key = path, parameters["export.joint"]
-            if key in self._written and not self._has_changed(known, self._written[key]):
+            told, joint = f"export.on_converged {path}", parameters["export.joint"]
+            before = self._written.get((path, joint))
+            if isinstance(known, Result):
+                same = isinstance(before, Result) and not has_changed(known, before)
+            else:
+                same = isinstance(before, RigReport) and not known.has_changed(before)
+            if same:
                 continue
             try:
-                self._write_to(path, known)
-                self._written[key] = known
+                if isinstance(known, Result):
+                    write_back(path, known, self._edges(known), joint)
+                elif remark := known.write(path):
+                    self._health.error(f"export.on_converged: {remark}", told)
+                self._written[path, joint] = known
             except BadInputError as error:
-                self._health.error(f"export.on_converged: {error}", f"export.on_converged {path}")
+                self._health.error(f"export.on_converged: {error}", told)
             except Exception as error:
                 self._health.unexpected(error)
-
-    @abstractmethod
-    def _has_changed(self, known: Known, before: Known) -> bool:
-        """Whether it is to be written again."""
-
-    @abstractmethod
-    def _write_to(self, path: str, known: Known) -> None:
-        """Raises BadInputError."""
-
-
-class WriteBack(_Files[Result]):
-    """Of a single pair. edges: of the tree of frames, see `calib_ros.export.write_back`."""
-
-    def __init__(
-        self, parameters: Callable[[], Parameters], edges: Callable[[Result], Edges], executor: Executor, health: Health
-    ) -> None:
-        super().__init__(parameters, executor, health)
-        self._edges = edges
-
-    def add(self, extrinsic: Extrinsic, stamp: int = 0) -> None:
-        """The current extrinsic, whatever its status."""
-        if extrinsic.usable and extrinsic.result.status == CONVERGED:
-            self._put(extrinsic.result)
-
-    def _has_changed(self, known: Result, before: Result) -> bool:
-        return has_changed(known, before)
-
-    def _write_to(self, path: str, known: Result) -> None:
-        write_back(path, known, self._edges(known), self._parameters()["export.joint"])
-
-
-class RigWriteBack(_Files[RigReport]):
-    """Of a rig, as `calib-ros rig` writes it."""
-
-    def add(self, report: RigReport) -> None:
-        """A solution of which all sensors are usable."""
-        self._put(report)
-
-    def _has_changed(self, known: RigReport, before: RigReport) -> bool:
-        return known.has_changed(before)
-
-    def _write_to(self, path: str, known: RigReport) -> None:
-        if Path(path).suffix.lower() == ".json":
-            replace_file(path, known.dumps().encode(), content(path))
-        elif remark := known.write(path):
-            self._health.error(f"export.on_converged: {remark}", f"export.on_converged {path}")
 
 
 def check_files(files: Sequence[str], description: RigDescription, pairs: Sequence[Pair]) -> None:

@@ -7,7 +7,7 @@ import re
 import pytest
 from paths import ROOT
 
-from calib_ros.datasets.bag_file import COMPRESSED, REMEDIES
+from calib_ros.datasets.bag_topics import COMPRESSED, REMEDIES
 from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES
 from calib_ros.datasets.folder import IMAGE_SUFFIXES
 from calib_ros.lens import LENSES

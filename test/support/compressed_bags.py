@@ -10,8 +10,9 @@ import numpy as np
 from bag_recorder import MS, START, Recorder
 from ros_messages import Messages
 
-from calib_ros.datasets.bag_file import IMAGE, POINTS, BagFile
-from calib_ros.datasets.bag_parts import zstd
+from calib_ros.datasets.bag_file import BagFile
+from calib_ros.datasets.bag_messages import zstd
+from calib_ros.datasets.bag_topics import IMAGE, POINTS
 from calib_ros.messages import decode_image
 from calib_ros.messages.video import VIDEO
 

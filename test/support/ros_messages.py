@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib_ros.datasets.bag_parts import zstd
-from calib_ros.datasets.bag_types import typestore
+from calib_ros.datasets.bag_messages import typestore, zstd
 
 TYPES = typestore()
 FAMILIES = ("rosbags", "rclpy")

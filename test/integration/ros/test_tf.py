@@ -11,7 +11,7 @@ from tf2_msgs.msg import TFMessage
 from vehicle import off
 
 from calib_ros import se3
-from calib_ros.datasets.bag_file import StaticTransforms
+from calib_ros.datasets.static_transforms import StaticTransforms
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import matrix_from_transform, transform_message
 

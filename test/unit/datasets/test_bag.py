@@ -21,7 +21,8 @@ from calib_ros.cli.main import main
 from calib_ros.config import MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
-from calib_ros.datasets.bag_file import Topic, choose_points
+from calib_ros.datasets.bag_file import Topic
+from calib_ros.datasets.bag_topics import choose_points
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud

@@ -12,7 +12,7 @@ from sample_sources import Listed
 
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
-from calib_ros.datasets.bag_parts import zstd
+from calib_ros.datasets.bag_messages import zstd
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros.messages.point_fields import decode_livox

@@ -14,7 +14,7 @@ from calib_ros import se3
 from calib_ros.cli.calibrate import calibrate, replay
 from calib_ros.config import Config, MotionConfig, SemanticsConfig
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.kitti_files import NOMINAL_LEVER_ARM, Oxts, ScanMotion, image_moment, lidar_twist
+from calib_ros.datasets.kitti_files import NOMINAL_LEVER_ARM, ScanMotion, image_moment, lidar_twist
 from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError, BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -306,7 +306,7 @@ def drive_folder(tmp_path: Path) -> Path:
 
 def test_oxts_velocity_uses_rotation_and_lever_arm(drive_folder):
     """Against two poses of the LiDAR a moment apart; without calibration the axes are aligned."""
-    oxts = Oxts(drive_folder / "oxts/data", drive_folder / "calib_imu_to_velo.txt")
+    oxts = ScanMotion(drive_folder, drive_folder)
     twist = oxts.twist(0)
     assert twist[:3] == pytest.approx([0.01, 0.02, 0.3])
     assert twist[3:] == pytest.approx(np.add([8, 1, 0.5], np.cross(NOMINAL_LEVER_ARM, twist[:3])))
@@ -315,7 +315,7 @@ def test_oxts_velocity_uses_rotation_and_lever_arm(drive_folder):
     T_velo_imu = se3.from_parts(R, [-0.8, 0.3, -0.9])
     rows = "calib_time: x\nR: " + " ".join(f"{v:.12e}" for v in R.ravel()) + "\nT: -0.8 0.3 -0.9\n"
     (drive_folder / "calib_imu_to_velo.txt").write_text(rows)
-    twist = Oxts(drive_folder / "oxts/data", drive_folder / "calib_imu_to_velo.txt").twist(0)
+    twist = ScanMotion(drive_folder, drive_folder).twist(0)
     dt = 1e-3
     T_imu = se3.exp(np.array([0.01, 0.02, 0.3, 8, 1, 0.5]) * dt)  # of the IMU after dt in its frame before
     T_velo = T_velo_imu @ T_imu @ se3.inverse(T_velo_imu)
@@ -334,7 +334,7 @@ def test_damaged_oxts(drive_folder):
     for text in ("", "1 2 3", oxts_line()[:-30], oxts_line().replace("100.", "x."), oxts_line() + "1", "nan " * 30):
         (drive_folder / "oxts/data/0000000001.txt").write_text(text)
         with pytest.raises(BadInputError, match=r"0000000001.txt must have 30 numbers"):
-            Oxts(drive_folder / "oxts/data", drive_folder / "none").twist(1)
+            ScanMotion(drive_folder, drive_folder / "none").twist(1)
 
 
 def test_times_of_a_kitti_scan_and_its_image(drive_folder):

@@ -1,11 +1,13 @@
-"""The beginnings of a bag's messages, without what follows: of a recording of 20 GB some 1 %."""
+"""The messages of a bag as CDR, whole or only their beginnings (of a recording of 20 GB some 1 %), and their types."""
 
 from __future__ import annotations
 
 import heapq
 import os
 import struct
+import sys
 from collections.abc import Collection, Iterator
+from functools import cache
 from typing import Any
 
 from rosbags.rosbag1 import Reader as Ros1Reader
@@ -13,9 +15,19 @@ from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_bytes
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
-from calib_ros.datasets.bag_types import begins_with_header, cdr_of_ros1
+from calib_ros.messages.compressed_points import CLOUD_DEFINITION, COMPRESSED_POINTS
+from calib_ros.messages.point_fields import CUSTOM_MSG, CUSTOM_POINT, LIVOX
+from calib_ros.messages.video import FORMER_DEFINITION, FORMER_PACKET, VIDEO
 
+if sys.version_info >= (3, 14):
+    from compression import zstd as zstd
+else:  # what rosbags itself requires
+    from backports import zstd as zstd
+
+Raw = tuple[str, int, bytes]  # topic, time of recording in ns, CDR
 ZSTD = b"\x28\xb5\x2f\xfd"  # begins what is compressed; a message begins with 0 and its byte order
 HEAD = 512  # bytes: a stamp and a name of a frame
 MESSAGE, MESSAGE_INDEX = 0x05, 0x07  # records of mcap
@@ -24,11 +36,63 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, number, times of recording and
 CHUNK_HEAD = 40  # bytes before the name of its compression, which is empty: times, size, checksum, two lengths
 
 
-def storages_with_heads(reader: Any) -> list[Any] | None:
-    """The files of a reader of rosbags, None if their messages have to be read as a whole, since chunks are compressed."""
+@cache
+def typestore() -> Typestore:
+    """The message types of ROS 2, the same in every release: a bag's own definitions, maybe broken, are not needed."""
+    store = get_typestore(Stores.ROS2_KILTED)
+    for name in LIVOX:
+        package = name.partition("/")[0]
+        store.register(get_types_from_msg(CUSTOM_POINT, f"{package}/msg/CustomPoint"))
+        store.register(get_types_from_msg(CUSTOM_MSG, name))
+    for name, definition in {**VIDEO, FORMER_PACKET: FORMER_DEFINITION, COMPRESSED_POINTS: CLOUD_DEFINITION}.items():
+        store.register(get_types_from_msg(definition, name))
+    return store
+
+
+def layout_of(connection: Any) -> str:
+    """The type of `typestore` by which a connection's messages are decoded: of a name that has had two, by its definition."""
+    former = connection.msgtype.endswith("/FFMPEGPacket") and "img_width" in connection.msgdef.data
+    return FORMER_PACKET if former else str(connection.msgtype)
+
+
+def storages_of(reader: Any) -> list[Any]:
+    """The open files of a reader of rosbags; that of ROS 1 is one."""
     storage: Any = reader.storage if isinstance(reader, Reader) else reader
-    storages = getattr(storage, "storages", [storage])
-    return storages if all(_has_heads(one) for one in storages) else None
+    return list(getattr(storage, "storages", [storage]))
+
+
+def messages(reader: Any, topics: Collection[str], start: int | None = None, stop: int | None = None) -> Iterator[Raw]:
+    """Messages of a reader recorded in [start, stop), in order."""
+    connections = [c for c in reader.connections if c.topic in topics]
+    if not connections:  # rosbags reads an empty list as "all"
+        return
+    is_ros1 = isinstance(reader, Ros1Reader)
+    for connection, time, data in reader.messages(connections, start, stop):
+        yield connection.topic, time, _cdr_of_ros1(data, connection) if is_ros1 else _inflated(data)
+
+
+def heads(reader: Any, topics: Collection[str], whole: Collection[str]) -> Iterator[Raw]:
+    """All `messages`, in about their order: all bytes of topics in `whole` and of what is compressed, of others the beginning;
+    as they are where chunks are compressed, which have to be read as a whole."""
+    storages = storages_of(reader)
+    if not all(map(_has_heads, storages)):
+        yield from messages(reader, topics)
+        return
+    for storage in storages:
+        if isinstance(storage, Ros1Reader):
+            yield from _of_ros1(storage, topics, whole)
+        else:
+            wanted = {c.id: (c.topic, c.topic in whole) for c in storage.connections if c.topic in topics}
+            for topic, time, data in (_of_mcap if isinstance(storage, McapReader) else _of_sqlite)(storage, wanted):
+                yield topic, time, _inflated(data)
+
+
+def _inflated(data: bytes) -> bytes:
+    return zstd.decompress(data) if data[:4] == ZSTD else data
+
+
+def _cdr_of_ros1(data: bytes, connection: Any) -> bytes:
+    return bytes(typestore().ros1_to_cdr(data, layout_of(connection)))
 
 
 def _has_heads(storage: Any) -> bool:
@@ -39,16 +103,7 @@ def _has_heads(storage: Any) -> bool:
     return isinstance(storage, Sqlite3Reader)
 
 
-def heads(storage: Any, topics: Collection[str], whole: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-    """(topic, time of recording in ns, bytes) of messages, in about their order: all bytes of topics in `whole`
-    and of what is compressed, of others the beginning. As CDR, also where a bag of ROS 1 has them otherwise."""
-    if isinstance(storage, Ros1Reader):
-        return _of_ros1(storage, topics, whole)
-    wanted = {c.id: (c.topic, c.topic in whole) for c in storage.connections if c.topic in topics}
-    return _of_mcap(storage, wanted) if isinstance(storage, McapReader) else _of_sqlite(storage, wanted)
-
-
-def _of_mcap(storage: Any, wanted: dict[int, tuple[str, bool]]) -> Iterator[tuple[str, int, bytes]]:
+def _of_mcap(storage: Any, wanted: dict[int, tuple[str, bool]]) -> Iterator[Raw]:
     file = storage.bio.fileno()  # not through its buffer, which would read more
     for chunk in sorted(storage.chunks, key=lambda chunk: int(chunk.message_start_time)):
         begin = chunk.chunk_start_offset + RECORD.size + CHUNK_HEAD
@@ -74,7 +129,7 @@ def _of_mcap(storage: Any, wanted: dict[int, tuple[str, bool]]) -> Iterator[tupl
             yield topic, time, data[content : content + length]
 
 
-def _of_sqlite(storage: Any, wanted: dict[int, tuple[str, bool]]) -> Iterator[tuple[str, int, bytes]]:
+def _of_sqlite(storage: Any, wanted: dict[int, tuple[str, bool]]) -> Iterator[Raw]:
     ids = ",".join(map(str, wanted))
     rows = storage.dbconn.cursor().execute(
         f"SELECT id, topic_id, timestamp FROM messages WHERE topic_id IN ({ids}) ORDER BY timestamp"
@@ -86,7 +141,7 @@ def _of_sqlite(storage: Any, wanted: dict[int, tuple[str, bool]]) -> Iterator[tu
             yield topic, time, data + blob.read() if is_whole or data[:4] == ZSTD else data
 
 
-def _of_ros1(reader: Ros1Reader, topics: Collection[str], whole: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+def _of_ros1(reader: Ros1Reader, topics: Collection[str], whole: Collection[str]) -> Iterator[Raw]:
     wanted = {c.id: c for c in reader.connections if c.topic in topics}
     file = reader.bio
     assert file is not None
@@ -99,9 +154,10 @@ def _of_ros1(reader: Ros1Reader, topics: Collection[str], whole: Collection[str]
         if record.get_uint8("op") != RecordType.MSGDATA or record.get_uint32("conn") not in wanted:
             raise ValueError("an index of messages is damaged")
         connection, size = wanted[record.get_uint32("conn")], read_uint32(file)
-        is_whole = connection.topic in whole or not begins_with_header(connection)
+        fields = typestore().fielddefs[layout_of(connection)][1]
+        is_whole = connection.topic in whole or not fields or fields[0][0] != "header"
         data = read_bytes(file, size if is_whole else min(size, HEAD))
-        yield connection.topic, entry.time, cdr_of_ros1(data, connection) if is_whole else _header_as_cdr(data)
+        yield connection.topic, entry.time, _cdr_of_ros1(data, connection) if is_whole else _header_as_cdr(data)
 
 
 def _header_as_cdr(data: bytes) -> bytes:
