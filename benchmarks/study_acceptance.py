@@ -14,9 +14,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks.records import markdown
-from benchmarks.sources import frames_of
 from benchmarks.study_registration import EXACT_SENSORS, FEW, rigs_of, short, spread, vehicles
-from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant, interval
+from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant, frames_of, interval
 from calib_ros import se3
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
