@@ -13,8 +13,7 @@ covariance    normalised errors squared of estimates from subsets of frames of S
 intrinsics    are right intrinsics ever refused, and wrong ones ever accepted: single frames and sets of SOURCE, or all rigs
 monitor_hours hours of quiet driving and knocks, driving and standing: SOURCE of 10 Hz, or six synthetic rigs, lap after lap
 
---trials: starts of a case, or how many drives. Differences are paired with the first variant; their 95 % intervals are those of a
-bootstrap over cases. The same command goes on with a study that was interrupted where its --csv ends.
+--trials: starts of a case, or how many drives. The same command goes on with a study that was interrupted where its --csv ends.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ import cv2
 from benchmarks import study_acceptance, study_hours, study_intrinsics, study_registration
 from benchmarks.records import append_records, read_records
 from benchmarks.study_registration import SCENES
-from benchmarks.study_runner import Record, Study, run, table
+from benchmarks.study_runner import Record, Study, run
 from calib_ros.errors import CalibrationError
 
 STUDIES: dict[str, Study] = {
@@ -66,7 +65,7 @@ def main() -> int:
             append_records(args.csv, [record])
     except CalibrationError as error:
         parser.error(str(error))
-    print(table(study, records))
+    print(study.table(records))
     return 0
 
 

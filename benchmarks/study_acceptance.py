@@ -133,6 +133,6 @@ def sensitivity_table(records: Sequence[Record]) -> str:
 
 
 STUDIES = {
-    "chance": Study(shuffled, searched, table=chance_table, variants={"": Variant(CLASSES_OFF)}),
-    "sensitivity": Study(vehicles, searched, variants=varied(), table=sensitivity_table),
+    "chance": Study(shuffled, searched, chance_table),
+    "sensitivity": Study(vehicles, searched, sensitivity_table, varied()),
 }

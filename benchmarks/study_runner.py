@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.records import markdown
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, MotionConfig, update
@@ -105,13 +104,13 @@ Estimate = Callable[[Calibrator, Case, FeaturesOf, int], End]
 
 @dataclass(frozen=True)
 class Study:
-    """cases: by the command line. trials: of each case. table: instead of the usual one."""
+    """cases: by the command line. table: of the records, for people. trials: of each case."""
 
     cases: Callable[[argparse.Namespace], Iterable[Case]]
     estimate: Estimate
-    variants: Mapping[str, Variant] = field(default_factory=lambda: {"": Variant()})
+    table: Callable[[Sequence[Record]], str]
+    variants: Mapping[str, Variant] = field(default_factory=lambda: {"": Variant(CLASSES_OFF)})
     trials: int = 1
-    table: Callable[[Sequence[Record]], str] | None = None
 
 
 @dataclass(frozen=True)
@@ -260,34 +259,6 @@ def _tasks(study: Study, args: argparse.Namespace, done: Sequence[Record]) -> It
                 left.append((n, case, [t for t in own if (case.group, name, n, t) not in known]))
             if any(own for _, _, own in left):
                 yield name, left
-
-
-def table(study: Study, records: Sequence[Record]) -> str:
-    """A row for each group and variant, or what the study has instead."""
-    if study.table is not None:
-        return study.table(records)
-    rows = []
-    for group in dict.fromkeys(r.group for r in records):
-        own = [r for r in records if r.group == group]
-        first = {(r.case, r.trial): r.right for r in own if r.variant == own[0].variant}
-        for variant in dict.fromkeys(r.variant for r in own):
-            found = [r for r in own if r.variant == variant]
-            pairs = [(r.case, float(r.right) - first[r.case, r.trial]) for r in found if (r.case, r.trial) in first]
-            rows.append(
-                [
-                    group,
-                    variant,
-                    f"{sum(r.right for r in found)} of {len(found)}",
-                    "{:.3f}, {:.2f}".format(*np.percentile([r.deg for r in found], (50, 90))),
-                    "{:.1f}, {:.1f}".format(*np.percentile([r.cm for r in found], (50, 90))),
-                    sum(r.accepted and not r.right for r in found),
-                    sum(not r.accepted for r in found),
-                    f"{np.median([r.cpu_s for r in found]):.2f}",
-                    "" if variant == own[0].variant else interval(pairs),
-                ]
-            )
-    head = "cases, variant, success, deg: median 90 %, cm: median 90 %, accepted wrong, refused, CPU s, more successes"
-    return markdown(head.split(", "), rows)
 
 
 def interval(pairs: Sequence[tuple[int, float]]) -> str:
