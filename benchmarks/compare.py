@@ -60,7 +60,6 @@ class Outcome(NamedTuple):
     translation: float = NAN
     nees_off: float = NAN
     cpu_s: float = NAN
-    nees: float = NAN
 
 
 MEASURES = (
@@ -93,7 +92,7 @@ def outcome(trial: PairedTrial, answer: dict[str, Any]) -> Outcome:
         off = se3.log(T @ se3.inverse(truth))
         nees = float(off @ np.linalg.solve(np.array(answer["covariance"]), off))
     off_by = math.exp(abs(math.log(nees / USUAL_NEES))) if nees > 0 else NAN
-    return Outcome(success, float(accepted and not right), rotation, translation, off_by, answer["cpu_s"], nees)
+    return Outcome(success, float(accepted and not right), rotation, translation, off_by, answer["cpu_s"])
 
 
 # ------------------------------------------------------------------------------------------------ the two sides

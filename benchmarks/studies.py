@@ -7,7 +7,6 @@ registration  the table by which every change is judged: success and accuracy ov
               synthetic drive; SOURCE: names of its rows
 vehicles      is what is accepted right, and what is right accepted: single frames and sets of SOURCE, of --soft, whose reference
               is known to 0.9 deg / 25 cm only, and of the synthetic --rigs
-sensitivity   the cases of vehicles with each constant of the acceptance test and the covariance 30 % less and more
 chance        images with scans of another place, and mirrored ones: are they accepted as rarely as p values say? SOURCE, --rigs
 covariance    normalised errors squared of estimates from subsets of frames of SOURCE, or synthetic drives and KITTI
 intrinsics    are right intrinsics ever refused, and wrong ones ever accepted: single frames and sets of SOURCE, or all rigs
@@ -33,7 +32,7 @@ from calib_ros.errors import CalibrationError
 
 STUDIES: dict[str, Study] = {
     **study_registration.STUDIES,
-    **study_acceptance.STUDIES,
+    "chance": study_acceptance.STUDY,
     "intrinsics": study_intrinsics.STUDY,
     "monitor_hours": study_hours.STUDY,
 }
