@@ -68,7 +68,7 @@ from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError, CalibrationError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import FrameSemantics
+from calib_ros.registration.classes import MASKS, FrameSemantics
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.motion_guess.guess import motion_guess
@@ -77,7 +77,7 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result, Stamping
 from calib_ros_semantics.models.geometric_classes import cluster_classes
 from calib_ros_semantics.models.onnx_model import Deadline
-from calib_ros_semantics.models.segment_anything import MaskEdges
+from calib_ros_semantics.models.segmentation import load_model
 from calib_ros_synthetic.drive import SyntheticDrive
 
 Matrix = NDArray[np.float64]
@@ -153,7 +153,7 @@ def by_shape(args: argparse.Namespace) -> Iterator[Case]:
 
 def masked(args: argparse.Namespace) -> Iterator[Case]:
     frame = drives(args)[1][1][0]
-    edges = MaskEdges(SemanticsConfig(segment_anything=str(args.kitti / "sam_masks")))(frame, Deadline(60))
+    edges = load_model(MASKS, str(args.kitti / "sam_masks"), SemanticsConfig())(frame, Deadline(60))
     yield Case("odometry 00, 000000", [frame], semantics=[FrameSemantics(edges)])
 
 
