@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +26,7 @@ from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.common import Common
-from calib_ros.online.events import Announcer, Event, FrameIngested, Inputs, IntakeIdle, JobDone, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Problem, Remarks
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
 from calib_ros.online.pairing.pairing import Intake, Pairing
@@ -68,10 +69,12 @@ class Pipeline:
         self.dropped_pairs = 0  # that a newer one replaced before they were ingested
         self.rested_pairs = 0  # that were left out, since there was no need to look at them
         self._lock = threading.Lock()
-        self._announcer = Announcer(sink)
+        self._tell, self._remarks, self._publishing = sink, Remarks(sink), threading.Lock()
+        self._published: Result | None = None
+        self._stamp = 0  # of the newest keyframe, ns
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
         self._handed = -float("inf")  # when the newest pair was handed over to be ingested
-        report = self._announcer.report
+        report = self._remarks.report
         self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, report, on_idle=lambda: sink(IntakeIdle()))
         self._estimator: Worker[None] = Worker("calib_estimate", self._do_what_is_due, report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, report, SEMANTICS_NICE)
@@ -91,7 +94,8 @@ class Pipeline:
         if self.recalibrator is not None:
             self._follow_clocks(self.recalibrator)
         if changed:
-            self._announcer.tell(Announcer.OTHER_CAMERA)
+            message = "the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays"
+            self._tell(Problem(message, "intrinsics"))
 
     def _recalibrator_at(self, camera: Camera, initial: Result, current: Result | None = None) -> Recalibrator:
         """A new one; its frames are those of the initial extrinsic."""
@@ -136,9 +140,10 @@ class Pipeline:
             jumped = self.synchronizer.counts.jumps_back > jumps
             clocks = self.clock_difference if self._pairing.clocks.ahead != ahead else ""
         if jumped:
-            self._announcer.tell(Announcer.JUMPED_BACK)
+            jump = "time stamps jumped back (a looping bag, or a clock was set back)"
+            self._tell(Problem(f"{jump}: messages that waited for a partner were dropped", "stamps"))
         if clocks:
-            self._announcer.tell(Problem(clocks, "clocks"))
+            self._tell(Problem(clocks, "clocks"))
 
     # ---- requests -----------------------------------------------------------------------------------------------------
 
@@ -213,7 +218,14 @@ class Pipeline:
     def read_current(self, reader: Callable[[Extrinsic, int], None], wait: bool = True) -> None:
         """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile. wait:
         until a newer one that is being published is out; else nothing is done then."""
-        self._announcer.read(reader, lambda: self.recalibrator, wait)
+        if not self._publishing.acquire(blocking=wait):
+            return
+        try:
+            recalibrator = self.recalibrator
+            if recalibrator is not None:
+                reader(recalibrator.current, self._stamp or recalibrator.current.estimated_at)
+        finally:
+            self._publishing.release()
 
     def stop(self) -> bool:
         """End all threads, an estimate or job under way included; True if they ended."""
@@ -277,7 +289,9 @@ class Pipeline:
         frame_ids = self._inputs.frame_ids(*pair)
         names = recalibrator.tracker.initial
         if (names.camera_frame, names.lidar_frame) != frame_ids:
-            self._announcer.other_sensors(names, *frame_ids)
+            what = f"a pair of {frame_ids[1]} and {frame_ids[0]} arrived, but this node estimates {names.lidar_frame} to"
+            message = f"{what} {names.camera_frame}; give every camera-LiDAR pair its own node"
+            self._tell(Problem(message, "other sensors"))
             return
         frame = self._inputs.decode(*pair, recalibrator.camera)
         if (ahead := self._pairing.clocks.ahead) and frame.cloud_stamp is not None:
@@ -289,12 +303,12 @@ class Pipeline:
             self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
-            self._announcer.sensors(recalibrator)
+            self._remarks.note_sensors(recalibrator)
         self._learn_sweep(frame.cloud, recalibrator)
         if is_keyframe:
             self.last_keyframe = frame
-            self._announcer.stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
-            self._announcer.note_what_is_missing(recalibrator, frame)
+            self._stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
+            self._remarks.note_what_is_missing(recalibrator, frame)
         meter.switch(Work.INTAKE)
         if is_keyframe and recalibrator.segments_keyframes and self.load.allows_classes(recalibrator.first_guess.needs_classes):
             self._segmenter.put(None)
@@ -302,14 +316,15 @@ class Pipeline:
             self._estimator.put(None)
         newest = recalibrator.newest()  # one that speaks against the extrinsic becomes a keyframe, too
         is_kept = is_keyframe or (newest is not None and newest.stamp == frame.stamp)
-        self._announcer.tell(FrameIngested(frame, is_kept, *pair))
+        self._tell(FrameIngested(frame, is_kept, *pair))
 
     def _prepare(self, intake: Intake) -> Recalibrator | None:
         """The recalibrator to ingest a pair; None while camera or start are unknown, and for messages that do not belong together
         by what this cloud tells of the sweep."""
         camera = self.camera
         if camera is None:
-            self._announcer.tell(Announcer.NO_CAMERA)
+            message = "images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"
+            self._tell(Problem(message, "camera"))
             return None
         recalibrator = self.recalibrator or self._start(camera, *self._inputs.frame_ids(intake.image, intake.cloud))
         if recalibrator is None:
@@ -367,13 +382,8 @@ class Pipeline:
     def _do_job(self) -> None:
         job = self._requests.begin(estimate=False)
         if job is not None and job.work is not None:
-            try:
-                with self.load.counting(Work.CHECKS, charged=False):
-                    outcome = self._requests.run(job, job.work, self._estimator.check_cancelled)
-            except Exception:
-                pass  # who has asked is told
-            else:
-                self._announcer.tell(JobDone(outcome))
+            with suppress(Exception), self.load.counting(Work.CHECKS, charged=False):  # who has asked is told
+                self._requests.run(job, job.work, self._estimator.check_cancelled)
         if self._requests.waiting:
             self._estimator.put(None)
 
@@ -417,7 +427,7 @@ class Pipeline:
             with self._common.classes.mine(self._segmenter.check_cancelled), self.load.counting(Work.CLASSES):
                 problems = recalibrator.segment_keyframe(lambda: self._segmenter.stopping or self.paused)
             for k, problem in enumerate(problems):
-                self._announcer.tell(Problem(problem, f"model {k}"))
+                self._tell(Problem(problem, f"model {k}"))
             if self._is_due(recalibrator):
                 self._estimator.put(None)
 
@@ -425,4 +435,12 @@ class Pipeline:
         return not self.paused and self.load.allows_estimate(recalibrator.ready())
 
     def _publish(self, recalibrator: Recalibrator, again: bool = False) -> None:
-        self._announcer.publish(recalibrator, lambda: recalibrator is self.recalibrator, again)
+        """The current extrinsic, if it or its status differs from the one published last; none of a replaced recalibrator.
+
+        The monitor's assessment of an extrinsic that is right goes to the diagnostics alone.
+        """
+        with self._publishing:
+            extrinsic = recalibrator.current
+            if recalibrator is self.recalibrator and (again or extrinsic.result is not self._published):
+                self._published = extrinsic.result
+                self._tell(ExtrinsicUpdated(extrinsic, self._stamp or extrinsic.estimated_at))
