@@ -17,7 +17,7 @@ from rclpy.timer import Timer
 from calib_ros.errors import CalibrationError
 from calib_ros.extensions import node_services
 from calib_ros.online.black_box import BlackBox, Occasion
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Notice, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
@@ -143,7 +143,7 @@ class PairInterface:
         """
         self.pipeline.pause(INACTIVE)
         self.sensors.stop()
-        self.black_box.flush()
+        self.black_box.check(flush=True)
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._timers = []
@@ -153,7 +153,7 @@ class PairInterface:
         """End all threads, an estimate under way included; files under way are finished. True if they ended."""
         if self._ended is None:
             self._ended = self.pipeline.stop()
-            self.black_box.flush()
+            self.black_box.check(flush=True)
             self._files.shutdown(wait=True)
             for service in self.beside.values():
                 service.stop()
@@ -218,18 +218,18 @@ class PairInterface:
             self.overlay.publish(self.pipeline.recalibrator, event.frame)
         elif isinstance(event, IntakeIdle):
             self.processed.publish()
-        elif isinstance(event, Problem):
-            self.health.error(event.message, event.kind)
-        elif isinstance(event, Notice):
+        elif event.solved:
             self.health.note(event.message, event.kind)
+        else:
+            self.health.error(event.message, event.kind)
         self.black_box.add(event)
-        for service in self.beside.values():
-            service.add(event)
 
-    def _record(self, occasion: Occasion) -> None:
+    def _record(self, occasion: Occasion, events: str) -> None:
         def write() -> None:
             try:
-                self._node.get_logger().info(f"{occasion.kind}: {self.capture.write_occasion(occasion)}")
+                self._node.get_logger().info(
+                    f"{occasion.kind}: {self.capture.write_occasion(occasion.kind, occasion.result, events)}"
+                )
             except CalibrationError as error:
                 self.health.error(str(error), "capture.on")
             except Exception as error:
