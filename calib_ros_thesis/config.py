@@ -8,14 +8,12 @@ from typing import ClassVar
 from calib_ros.config import Config
 from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
-from calib_ros_thesis.completion import check_completion
 
 THESIS_ORDER = (
     ("min_depth", "max_depth"),
     ("min_height", "max_height"),
     ("min_reflectivity", "max_reflectivity"),
 )  # of each pair the first must be less
-MORPHOLOGICAL = "morphological"
 MAX_SMOOTHINGS = 8  # each keeps a map per frame
 
 
@@ -58,11 +56,6 @@ class ThesisConfig(Stage):
     low_reflectivity: float = option(
         0.3, "lower values of the dense reflectivity map are set to 0, share of full scale", low=0.0, high=1.0
     )
-    completion: str = option(
-        MORPHOLOGICAL,
-        "how the sparse depth map becomes dense: morphological = eq. 3.11, network = the completion network of this package, or "
-        "the ONNX file of another one (sparse depth, image -> depth)",
-    )
     normalize: bool = option(
         True, "divide J of eq. 3.12 by the number of LiDAR edges in the image, since a plain sum grows with it"
     )
@@ -87,8 +80,6 @@ class ThesisConfig(Stage):
             )
         if config.refine.objective != "thesis":
             return
-        if self.completion != MORPHOLOGICAL:
-            check_completion(self.completion, config.semantics)
         if config.image.projection == "sphere":
             raise ConfigError("image.projection = sphere does not go with refine.objective = thesis, which needs a pinhole")
         if self.dense_edges == "every_evaluation" and config.refine.optimizer == "levenberg_marquardt":

@@ -21,7 +21,7 @@ _FIELDS = {  # by stage
     "thesis": (
         "class_edge_share ground_tilt_deg ground_share cluster_voxel depth_step reflectivity_step max_discontinuity "
         "first_step_deg ground_distance ground_iterations cluster_eps cluster_min_points cluster_max_depth closing "
-        "canny_low canny_high"
+        "canny_low canny_high completion"
     ),
     "refine": "check_intrinsics iterations max_rotation_deg max_translation_m min_peak_ratio min_distinctness",
     "monitor": "false_alarm_rate window blind_contrast blind_returns",
@@ -35,7 +35,11 @@ _FIELDS = {  # by stage
     "tracker": "max_step_deg max_step_m gate",
 }
 REMOVED = frozenset(f"{stage}.{name}" for stage, names in _FIELDS.items() for name in names.split())
-INSTEAD = {"semantics.first_guess": "initial.method: semantic", "motion.exposure_s": "motion.time_offset_s: minus half of it"}
+INSTEAD = {
+    "semantics.first_guess": "initial.method: semantic",
+    "motion.exposure_s": "motion.time_offset_s: minus half of it",
+    "thesis.completion": "morphology, eq. 3.11",
+}
 
 
 def notices(names: Iterable[str]) -> list[str]:

@@ -185,6 +185,8 @@ def test_removed_options_are_ignored_with_one_warning(read, form):
     assert len(caught) == 1
     with pytest.warns(FutureWarning, match=r"; in place of semantics\.first_guess there is initial\.method: semantic$"):
         Config.from_dict({"semantics": {"first_guess": True, "witness": False}})
+    with pytest.warns(FutureWarning, match=r"; in place of thesis\.completion there is morphology, eq\. 3\.11$"):
+        assert Config.from_dict({"thesis": {"completion": "own.onnx"}}) == Config()
 
 
 def test_all_removed_options_at_once_make_one_warning_a_stage():
