@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -170,6 +171,16 @@ class Normalisation:
         whole = shifted if set(stds) == {"1"} else f"{shifted} / [{', '.join(stds)}]"
         source = "as its YAML says" if self.declared else "assumed; its YAML may say otherwise"
         return f"{whole} of grey levels v in 0..255 ({source})"
+
+
+def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """An image (H, W) or (H, W, 3) at another size (height, width)."""
+    if image.shape[:2] == size:
+        return image
+    # Averaging all pixels when shrinking keeps thin objects.
+    shrinks = size[0] <= image.shape[0] and size[1] <= image.shape[1]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=how), np.uint8)
 
 
 class Deadline:
