@@ -27,7 +27,6 @@ from calib_ros.datasets.capture import BAG, CONFIG, EVENTS, MASK, RESULT
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.io import ABANDONED_S, flush
 from calib_ros.messages import stamp_ns
-from calib_ros.online.black_box import Occasion
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
 from calib_ros.ros.conversions import Serialized
@@ -100,23 +99,23 @@ class Capture:
         result = recalibrator.current.result
         return _write(parameters, "capture_{}", frames, result, _files(parameters, result, events))
 
-    def write_occasion(self, occasion: Occasion) -> str:
+    def write_occasion(self, kind: str, result: Result, events: str) -> str:
         """The same for the black box. The oldest of its captures make room by capture.keep and capture.max_mb; keyframes that do
         not fit, the oldest ones, are left out."""
         parameters, frames = self._parameters(), self._kept()
-        files, most = _files(parameters, occasion.result, occasion.events), parameters["capture.max_mb"] * MEGABYTE
+        files, most = _files(parameters, result, events), parameters["capture.max_mb"] * MEGABYTE
         rest = most - BAG_BYTES - sum(map(len, files.values()))
         while frames and sum(map(_size, frames)) > rest:
             del frames[0]
         if not frames:
             raise BadInputError(
-                f"nothing captured of {occasion.kind}: capture.max_mb = {parameters['capture.max_mb']} is less than a keyframe "
+                f"nothing captured of {kind}: capture.max_mb = {parameters['capture.max_mb']} is less than a keyframe "
                 "takes, or there is none; raise it"
             )
         size = most - rest + sum(map(_size, frames))
         with suppress(OSError):  # said by who writes there
             _make_room(Path(parameters["capture_dir"]), parameters["capture.keep"] - 1, most - size)
-        return _write(parameters, f"event_{{}}_{occasion.kind}", frames, occasion.result, files)
+        return _write(parameters, f"event_{{}}_{kind}", frames, result, files)
 
     def _kept(self) -> list[RawKeyframe]:
         with self._lock:
