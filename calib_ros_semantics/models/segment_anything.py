@@ -21,7 +21,7 @@ from calib_ros_semantics.models.masks import (
     accepted_masks,
     without_duplicates,
 )
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, Tensor
+from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, Tensor, fitted
 
 Points = NDArray[np.float64]
 DEFAULT_SIDE = 1024  # px; size the models were trained at, and the default of graphs of dynamic size
@@ -346,10 +346,8 @@ def _mismatch(decoder: OnnxModel, encoder: OnnxModel, problem: str) -> ModelErro
 
 def to_rgb(image: NDArray[np.uint8], size: tuple[int, int], bgr: bool = False) -> NDArray[np.float32]:
     """Image (H, W) or (H, W, 3) BGR -> (h, w, 3) float32 RGB or BGR, 0..255, at another size."""
-    colour = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
-    shrinks = size[0] < image.shape[0]
-    resized = cv2.resize(colour, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return np.asarray(resized if bgr else resized[:, :, ::-1], np.float32)
+    colour = fitted(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8) if image.ndim == 2 else image, size)
+    return np.asarray(colour if bgr else colour[:, :, ::-1], np.float32)
 
 
 def declared_family(model: OnnxModel) -> str:

@@ -27,11 +27,9 @@ from calib_ros_semantics.models.cloud_classes import (
     CENET,
     RANGE_FIRST,
     XYZ_FIRST,
-    CloudInput,
     classes_of_points,
     range_view,
 )
-from calib_ros_semantics.models.image_classes import ImageInput
 from calib_ros_semantics.models.labels import (
     CAMVID,
     CITYSCAPES,
@@ -39,11 +37,10 @@ from calib_ros_semantics.models.labels import (
     NUMBERS_OF_IMAGES,
     OF_IMAGES,
     SEMANTIC_KITTI,
-    GuessedTable,
     LabelTable,
     lookup,
 )
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
+from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel
 from calib_ros_semantics.models.segmentation import load_model
 from calib_ros_synthetic.drive import SyntheticDrive
 
@@ -210,18 +207,18 @@ def test_the_picture_is_not_turned_and_edges_stay_where_they_are(tmp_path: Path)
 )
 def test_the_size_at_which_a_picture_goes_in(tmp_path: Path, inputs, sizes) -> None:
     """Its own shape in multiples of 32, at most 1024 along the longer side, unless the graph has sizes of its own."""
-    network = ImageInput(OnnxModel(segmentation(tmp_path / "n.onnx", 19, "o ?", inputs=inputs), CONFIG))
+    network = pixel_model(str(segmentation(tmp_path / "n.onnx", 19, "o ?", inputs=inputs)), CONFIG)
     assert {own: network.size(*own) for own in sizes} == sizes
 
 
 def test_label_dataset_is_chosen_once() -> None:
     """34 raw numbers stay raw in a frame whose own would pass for others; one that nobody has spoils all that follow."""
     numbers = np.array([[0, -1, 255], [18, 13, 10]])
-    for table in (GuessedTable(NUMBERS_OF_IMAGES), LabelTable(CITYSCAPES)):
+    for table in (LabelTable(NUMBERS_OF_IMAGES), LabelTable({"": CITYSCAPES})):
         assert table.classes(numbers).tolist() == [[C.GROUND, UNLABELLED, UNLABELLED], [C.CYCLIST, C.VEHICLE, C.SKY]]
     for wrong in (-2, 70000):
         assert "which are no classes" in error_of(lambda wrong=wrong: table.classes(np.array([3, wrong])))
-    table, low = GuessedTable(NUMBERS_OF_IMAGES), np.array([[7, 8], [11, 255]])
+    table, low = LabelTable(NUMBERS_OF_IMAGES), np.array([[7, 8], [11, 255]])
     assert table.classes(low).tolist() == [[C.SIGN, C.VEGETATION], [C.PERSON, UNLABELLED]]
     assert table.guess == "cityscapes"
     table.classes(np.array([26, 33]))
@@ -443,7 +440,7 @@ def test_empty_pixels_are_zero_and_far_points_do_not_hide_near_ones(tmp_path: Pa
     assert np.argwhere(view.index >= 0).tolist() == [[row, 384], [row, 640]]  # 45 deg to the left, and to the right
     assert view.index[row, 384] == 1  # the nearer of two
     many = np.concatenate([ahead, np.tile(ahead[2:], (200, 1))])
-    feeds, _, note = CloudInput(OnnxModel(scan_network(tmp_path, "bonnetal"), CONFIG)).feed(PointCloud(many))
+    feeds, _, note = point_model(str(scan_network(tmp_path, "bonnetal")), CONFIG).feed(PointCloud(many))
     image = feeds["input"][0]
     assert (image[:, view.index < 0] == 0).all()
     expected = [(np.sqrt(50) - 12.12) / 12.32, (5 - 10.88) / 11.47, (5 - 0.23) / 6.91, 1.04 / 0.86, -0.21 / 0.16]
@@ -477,7 +474,7 @@ def test_points_without_a_return_have_no_class(tmp_path: Path) -> None:
 
 def test_the_width_follows_the_scan(tmp_path: Path) -> None:
     """A network of any width runs at that of the scan; one of another width works, and says that it does not fit."""
-    dynamic = CloudInput(OnnxModel(scan_network(tmp_path, "bonnetal", name="any", size=(64, "w")), CONFIG))
+    dynamic = point_model(str(scan_network(tmp_path, "bonnetal", name="any", size=(64, "w"))), CONFIG)
     for columns, width in ((480, 512), (512, 512), (1024, 1024), (1800, 2048), (2048, 2048)):
         feeds, _, note = dynamic.feed(scan(columns))
         assert (feeds["input"].shape[3], note) == (width, "")
@@ -531,14 +528,14 @@ def test_networks_for_scans_that_cannot_be_used(tmp_path: Path) -> None:
     nodes = [helper.make_node("Identity", [f"i{k}"], [f"o{k}"]) for k in (0, 1)]
     usual = scan_network(tmp_path, "bonnetal")
     for path, yaml, says in (
-        (segmentation(tmp_path / "n.onnx"), "", "input has no axis of 5 or 6 channels"),
+        (segmentation(tmp_path / "n.onnx"), "", "takes one range image as 1xCxHxW or 1xHxWxC of 5 or 6 channels"),
         (range_network(tmp_path / "7.onnx", centres(7), 0, [0] * 5, [1] * 5), "", "scores of 7 classes, which are of no known"),
         (save(tmp_path / "mininet.onnx", nodes, inputs, outputs), "", "groups of neighbours, as 3D-MiniNet takes them"),
         (usual, "family: pointnet", "family 'pointnet' is unknown; known are bonnetal"),
         (usual, "channels: rgb", "must be a list of range, x, y, z, remission, mask"),
         (usual, "channels: [range, x, y, z, colour]", "must be a list of range"),
-        (usual, "channels: [range, x, y, z, depth]", "must name each channel once"),
-        (usual, "channels: [range, x, y]", "has no axis of 3 channels"),
+        (usual, "channels: [range, x, y, z, depth]", "must be a list of range, x, y, z, remission, mask, each once"),
+        (usual, "channels: [range, x, y]", "of 3 channels"),
         (usual, "mean: [1, 2, 3]", "'mean:' must have 5 numbers"),
         (usual, "size: [64, 512]", "does not run at the height and width"),
         (usual, "labels: [car]", "names 1 classes"),

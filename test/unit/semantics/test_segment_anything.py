@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import sam_graphs as graphs
 from masks_of_pictures import compared, frame_of, iou, later, picture_of
+from onnx_graphs import segmentation
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.registration.classes import MASKS
-from calib_ros_semantics.models.image_classes import ImageInput
 from calib_ros_semantics.models.masks import Mask, MaskModel
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
+from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.segmentation import load_model
 
 BACKGROUND = (90, 90, 90)
@@ -160,8 +160,10 @@ def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text
     embedded = halves.encoder(image, later())
     cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
     assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
-    network = ImageInput(OnnxModel(encoder, SemanticsConfig())).feed(image)["input_image"]
-    assert network[0, :, 500, 500] == pytest.approx(expected, abs=1e-3)
+    network = segmentation(tmp_path / "net.onnx", 19, "o 1 19 64 64", inputs="1 3 64 64")
+    network.with_suffix(".yaml").write_text(text)
+    fed = load_model("image_classes", str(network), SemanticsConfig()).feed(image)["input"]
+    assert fed[0, :, 50, 50] == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_yaml_that_no_picture_fits(tmp_path: Path) -> None:
