@@ -187,24 +187,17 @@ class KeyframeBuffer:
         self.incomplete = True
 
 
-class MotionMeasurement(NamedTuple):
-    """The newest measurement of odometry or an IMU. stamp: ns. speed: m/s, turn_rate: deg/s, None if the source lacks it."""
-
-    stamp: int
-    speed: float | None
-    turn_rate: float | None
-
-
 class SpeedGate:
     """Rejects frames taken while the vehicle drives or turns too fast for a keyframe.
 
     Uses the newest measurement if it is of the frame's time, else the twist that the frame carries. Thread-safe. config may be
-    replaced at any time. rejected: frames rejected so far. last_rejection: why the newest of them was, for a person.
+    replaced at any time. newest: stamp, ns, speed, m/s, and turn rate, deg/s, of odometry or an IMU, None if the source lacks it.
+    rejected: frames rejected so far. last_rejection: why the newest of them was, for a person.
     """
 
     def __init__(self, config: OnlineConfig) -> None:
         self.config = config
-        self.newest: MotionMeasurement | None = None
+        self.newest: tuple[int, float | None, float | None] | None = None
         self.rejected = 0
         self.last_rejection = ""
         self._lock = threading.Lock()
@@ -212,7 +205,7 @@ class SpeedGate:
     def add_measurement(self, stamp: int, speed: float | None, turn_rate: float | None) -> None:
         """A measurement: stamp in ns, m/s and deg/s; None and values that are not finite are unknown."""
         known = [None if value is None or not math.isfinite(value) else abs(value) for value in (speed, turn_rate)]
-        self.newest = MotionMeasurement(stamp, known[0], known[1])
+        self.newest = stamp, known[0], known[1]
 
     def allows(self, frame: Frame) -> bool:
         """True if the frame is slow enough for a keyframe, or its speed is unknown."""
@@ -231,8 +224,8 @@ class SpeedGate:
     def motion_at(self, frame: Frame) -> tuple[float | None, float | None]:
         """Speed, m/s, and turn rate, deg/s, at a frame; None where unknown."""
         measured, speed, turn_rate = self.newest, None, None
-        if measured is not None and abs(measured.stamp - frame.stamp) <= MAX_MEASUREMENT_AGE_S * NANOSECONDS:
-            speed, turn_rate = measured.speed, measured.turn_rate
+        if measured is not None and abs(measured[0] - frame.stamp) <= MAX_MEASUREMENT_AGE_S * NANOSECONDS:
+            _, speed, turn_rate = measured
         if frame.twist is not None:
             speed = float(np.linalg.norm(frame.twist[3:])) if speed is None else speed
             turn_rate = float(np.rad2deg(np.linalg.norm(frame.twist[:3]))) if turn_rate is None else turn_rate

@@ -113,31 +113,6 @@ class ShiftTest:
         return float(np.linalg.norm(self.shift[3:]))
 
 
-@dataclass(frozen=True)
-class OffsetAtKeyframes:
-    """The time offset of the images against the scans that explains some keyframes best.
-
-    seconds: positive where the images are late. score: with the offset. configured_s: motion.time_offset_s, which is
-    allowed for already.
-    """
-
-    seconds: float
-    score: float
-    configured_s: float = 0.0
-
-    def explains(self, score: float) -> bool:
-        """True if the offset fits the keyframes as well as a displaced mount, which reaches `score`."""
-        return abs(self.seconds) >= MIN_TIME_OFFSET_S and self.score >= EXPLAINED_SHARE * score
-
-    def describe(self) -> str:
-        """What is off and what to do, for a person."""
-        return (
-            f"the images are {1000 * abs(self.seconds):.0f} ms {'late' if self.seconds > 0 else 'early'} against the scans (that "
-            "alone explains the difference): synchronise the clocks, or set motion.time_offset_s to "
-            f"{self.configured_s + self.seconds:.3g}"
-        )
-
-
 class Monitor:
     """Tests the newest keyframe alone, where a mount displacement shows at once, and the newest few together, which show small
     errors.
@@ -241,20 +216,19 @@ class Monitor:
         count, p_value = self._suspects, together.p_value
         evidence = max(self._evidence(together, newest), self._match.evidence)
         if evidence >= self._threshold(MOVED_RARER) and several and count >= self.config.confirm:
-            offset = fit_time_offset(calibrator, newest, T)
-            if offset is not None and offset.explains(together.score):
+            if out_of_sync := clocks_that_explain(calibrator, newest, T, together.score):
                 self._out_of_sync = True
-                return Assessment(Verdict.SUSPECT, offset.describe(), p_value, count)
+                return Assessment(Verdict.SUSPECT, out_of_sync, p_value, count)
             since = window if self._out_of_sync else count
             message = f"the calibration has moved: {self._describe(together, since)}"
             self.reset()
             return Assessment(Verdict.MOVED, message, p_value, since)
         limit = self._threshold() if count >= FAILED_WINDOWS * WINDOW else 0.0  # 0: they rather speak for it
         if together.conclusive and evidence < limit and count >= min(2, self.config.confirm):
-            out_of_sync = max(count - window, 0) if self._out_of_sync else 0
+            without_sync = max(count - window, 0) if self._out_of_sync else 0
             self.reset()
             message = "the extrinsic fits the newest keyframes after all"
-            return Assessment(Verdict.CONSISTENT, message, p_value, count, out_of_sync)
+            return Assessment(Verdict.CONSISTENT, message, p_value, count, without_sync)
         return Assessment(Verdict.SUSPECT, self._describe(together, count), p_value, count)
 
     def _evidence(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> float:
@@ -354,19 +328,27 @@ def normalised_innovation(T_current: Transform, T_estimate: Transform) -> float:
     return rotation + se3.translation_error_m(T_current, T_estimate) / UNIT_TRANSLATION_M
 
 
-def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Transform) -> OffsetAtKeyframes | None:
-    """The time offset with which the keyframes fit T (4, 4) best. None if the vehicle moves in none, or its motion is unknown.
+def clocks_that_explain(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Transform, reached: float) -> str:
+    """What is off and what to do, for a person, if a time offset of the images against the scans fits the keyframes at T (4, 4)
+    as well as a displaced mount, which reaches a score; else "", also where the vehicle moves in none or its motion is unknown.
 
     Keyframes at rest take part: they fit at any offset, and a vehicle that stops behind a late camera keeps its mount.
     At time tau after the image's moment a static point is at exp(twist tau)^-1 of where it was, for all points alike.
     """
     twists = np.array([f.twist for f in keyframes if f.twist is not None])
     if len(twists) < len(keyframes) or not (np.abs(twists) >= MIN_TWIST).any():
-        return None
+        return ""
     try:
         score = calibrator.objectives.of_edges(keyframes, T).score
     except TooFewFeaturesError:
-        return None
+        return ""
     scores = ClockOffset(0.0, twists).scores_at(score, T, TIME_OFFSETS_S)
     best = int(np.argmax(scores))
-    return OffsetAtKeyframes(float(TIME_OFFSETS_S[best]), scores[best], calibrator.config.motion.time_offset_s)
+    seconds = float(TIME_OFFSETS_S[best])
+    if abs(seconds) < MIN_TIME_OFFSET_S or scores[best] < EXPLAINED_SHARE * reached:
+        return ""
+    return (
+        f"the images are {1000 * abs(seconds):.0f} ms {'late' if seconds > 0 else 'early'} against the scans (that "
+        "alone explains the difference): synchronise the clocks, or set motion.time_offset_s to "
+        f"{calibrator.config.motion.time_offset_s + seconds:.3g}"
+    )

@@ -53,14 +53,14 @@ class Pairing:
 
     def add_image(self, stamp: int, message: Any) -> list[Intake]:
         """An image message, stamp in ns."""
-        if self.clocks.add_image(stamp, self.synchronizer.counts.pairs > 0):
+        if self.clocks.add(True, stamp, self.synchronizer.counts.pairs > 0):
             self._begin_anew()
         self._newest_image = message
         return self._to_take_in(self.synchronizer.add_image(stamp, message))
 
     def add_cloud(self, stamp: int, message: Any) -> list[Intake]:
         """A cloud message, stamp in ns, from which the difference of the clocks is taken out."""
-        if self.clocks.add_cloud(stamp, self.synchronizer.counts.pairs > 0):
+        if self.clocks.add(False, stamp, self.synchronizer.counts.pairs > 0):
             self._begin_anew()
         stamp -= self.clocks.ahead
         self._clouds.append((stamp, message))
