@@ -93,9 +93,9 @@ ROOM = "calib_ros.registration."
 CHANCE, CHECKS, COVARIANCE = ROOM + "score.chance.", ROOM + "acceptance.checks.", ROOM + "covariance."
 PARAMETERS, HALVES = ROOM + "nuisance.parameters.", ROOM + "acceptance.split_half."
 CONSTANTS: dict[str, tuple[str, ...]] = {
-    "UNDOUBTED_Z": (CHANCE, CHECKS, ROOM + "acceptance.significance.", ROOM + "search.search.", ROOM + "joint."),
+    "UNDOUBTED_Z": (CHANCE, CHECKS, ROOM + "search.search.", ROOM + "joint."),
     **dict.fromkeys(("HIGHEST_DECOY_Z", "LOWEST_DECOY_Z", "GUMBEL_SCALE", "OUTLIER_SHARE", "MIN_MEDIAN_Z"), (CHANCE,)),
-    "WITH_90_PERCENT": (ROOM + "acceptance.significance.",),
+    "WITH_90_PERCENT": (CHECKS,),
     **dict.fromkeys(("AGREEING", "MOST"), (HALVES,)),
     "SYSTEMATIC_ERROR": (ROOM + "objective.", COVARIANCE, HALVES),
     **dict.fromkeys(("USUAL_NOISE", "USUAL_CELLS", "FEW_POINTS", "LEAST_CURVATURE", "PROFILE_CHANGE"), (COVARIANCE,)),
