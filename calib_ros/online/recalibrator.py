@@ -29,7 +29,7 @@ from calib_ros.online.pacing import LONGEST_REST_S, REST_SPACING_S, Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
-from calib_ros.registration.acceptance.significance import leaves_doubt
+from calib_ros.registration.acceptance.checks import leaves_doubt
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import ALL, CLASSES, Segmentation
 from calib_ros.registration.classes import segmentation as models_of

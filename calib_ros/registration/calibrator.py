@@ -22,9 +22,8 @@ from calib_ros.config.sensors import REFINE
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import RefinedCamera
-from calib_ros.registration.acceptance.checks import Acceptance
+from calib_ros.registration.acceptance.checks import Acceptance, leaves_doubt
 from calib_ros.registration.acceptance.refusal import MAYBE_RAW, joined, semantic_note
-from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.camera_rounds import refined_with_camera
 from calib_ros.registration.classes import ALL, Segmentation, class_models
