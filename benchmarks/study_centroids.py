@@ -63,11 +63,11 @@ def _turned_lidar(rng: np.random.Generator, shift_m: float = 0.0) -> Matrix:
 def from_centroids(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
     """said: error of the consensus of centroids alone, deg and cm."""
     views = [replace(v, xyz=np.asarray(se3.transform(case.lidar, v.xyz), np.float32)) for v in views_of(features())]
-    truth, config, began = case.truth @ se3.inverse(case.lidar), calibrator.config.guess, time.process_time()
+    truth, began = case.truth @ se3.inverse(case.lidar), time.process_time()
     try:
-        alone = End.at(agreed_poses(find_pairs(views, config), config, 0)[0], truth)
+        alone = End.at(agreed_poses(find_pairs(views), 0)[0], truth)
         began = time.process_time()  # which the next line does again
-        guess = End.at(first_guess(views, config, 0, sweep=False)[0].T, truth)
+        guess = End.at(first_guess(views, 0, sweep=False)[0].T, truth)
     except TooFewFeaturesError:
         return End(180.0, 1000.0, INSUFFICIENT, "none")
     return guess._replace(said=f"{alone.deg:.2f} {alone.cm:.1f}", cpu_s=time.process_time() - began)
