@@ -14,9 +14,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks.records import markdown
-from benchmarks.sources import frames_of
 from benchmarks.study_registration import EXACT_SENSORS, FEW, rigs_of, short, spread, vehicles
-from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant, interval
+from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant, frames_of, interval
 from calib_ros import se3
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
@@ -90,15 +89,14 @@ def chance_table(records: Sequence[Record]) -> str:
 
 # Of the acceptance test and the covariance it rests on: those that are read off data instead of derived.
 ROOM = "calib_ros.registration."
-SIGNIFICANCE, CHECKS, COVARIANCE = ROOM + "acceptance.significance.", ROOM + "acceptance.checks.", ROOM + "covariance."
+CHANCE, CHECKS, COVARIANCE = ROOM + "score.chance.", ROOM + "acceptance.checks.", ROOM + "covariance."
 PARAMETERS, HALVES = ROOM + "nuisance.parameters.", ROOM + "acceptance.split_half."
 CONSTANTS: dict[str, tuple[str, ...]] = {
-    "UNDOUBTED_Z": (SIGNIFICANCE, CHECKS, ROOM + "search.search.", ROOM + "joint."),
-    **dict.fromkeys(
-        ("HIGHEST_DECOY_Z", "LOWEST_DECOY_Z", "GUMBEL_SCALE", "WITH_90_PERCENT", "OUTLIER_SHARE", "MIN_MEDIAN_Z"), (SIGNIFICANCE,)
-    ),
+    "UNDOUBTED_Z": (CHANCE, CHECKS, ROOM + "acceptance.significance.", ROOM + "search.search.", ROOM + "joint."),
+    **dict.fromkeys(("HIGHEST_DECOY_Z", "LOWEST_DECOY_Z", "GUMBEL_SCALE", "OUTLIER_SHARE", "MIN_MEDIAN_Z"), (CHANCE,)),
+    "WITH_90_PERCENT": (ROOM + "acceptance.significance.",),
     **dict.fromkeys(("AGREEING", "MOST"), (HALVES,)),
-    "SYSTEMATIC_ERROR": (COVARIANCE, HALVES),
+    "SYSTEMATIC_ERROR": (ROOM + "objective.", COVARIANCE, HALVES),
     **dict.fromkeys(("USUAL_NOISE", "USUAL_CELLS", "FEW_POINTS", "LEAST_CURVATURE", "PROFILE_CHANGE"), (COVARIANCE,)),
     **dict.fromkeys(("SIGNIFICANCE", "GROSSLY", "OPEN_PROBABILITY"), (PARAMETERS,)),
     "SIGNIFICANT_Z": (PARAMETERS, ROOM + "nuisance.time_offset."),

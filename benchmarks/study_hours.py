@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.records import markdown
-from benchmarks.sources import frames_of
-from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
+from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant, frames_of
 from calib_ros import se3
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame

@@ -8,9 +8,6 @@ from typing import ClassVar
 from calib_ros.config import Config
 from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
-from calib_ros_thesis.completion import check_completion
-
-MORPHOLOGICAL = "morphological"
 
 
 @dataclass(frozen=True)
@@ -44,11 +41,6 @@ class ThesisConfig(Stage):
     cluster_max_depth: ClassVar[float] = 40.0
     closing: ClassVar[int] = 9  # of the object map, px: joins the points of an object
     low_reflectivity: ClassVar[float] = 0.3  # share of full scale: borders between dull things are chance
-    completion: str = option(
-        MORPHOLOGICAL,
-        "how the sparse depth map becomes dense: morphological = eq. 3.11, network = the completion network of this package, or "
-        "the ONNX file of another one (sparse depth, image -> depth)",
-    )
     normalize: bool = option(
         True, "divide J of eq. 3.12 by the number of LiDAR edges in the image, since a plain sum grows with it"
     )
@@ -64,8 +56,6 @@ class ThesisConfig(Stage):
         """See Stage."""
         if config.refine.objective != "thesis":
             return
-        if self.completion != MORPHOLOGICAL:
-            check_completion(self.completion, config.semantics)
         if config.image.projection == "sphere":
             raise ConfigError("image.projection = sphere does not go with refine.objective = thesis, which needs a pinhole")
         if self.dense_edges == "every_evaluation" and config.refine.optimizer == "levenberg_marquardt":

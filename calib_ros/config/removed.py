@@ -25,7 +25,7 @@ _FIELDS = {  # by stage
         "azimuth_half_width_deg low_reflectivity evaluations class_edge_share "
         "ground_tilt_deg ground_share cluster_voxel depth_step reflectivity_step max_discontinuity "
         "first_step_deg ground_distance ground_iterations cluster_eps cluster_min_points cluster_max_depth closing "
-        "canny_low canny_high"
+        "canny_low canny_high completion"
     ),
     "refine": "check_intrinsics iterations max_rotation_deg max_translation_m min_peak_ratio min_distinctness",
     "monitor": "false_alarm_rate window blind_contrast blind_returns confirm least_deg least_m frozen_images",
@@ -47,6 +47,7 @@ INSTEAD = {
     "camera.centre_sigma": "camera.focal_sigma, of which it is 0.4",
     "guess.tilt_deg": _ELSEWHERE,
     "guess.distance_m": _ELSEWHERE,
+    "thesis.completion": "morphology, eq. 3.11",
 }
 
 

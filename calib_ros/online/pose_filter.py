@@ -7,7 +7,8 @@ from scipy.special import chdtrc
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, free_axes, fused
+from calib_ros.registration.covariance import distance, free_axes, fused
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 
 # Part of every estimate's covariance. All estimates share it, so that fusing does not lower it.
 SYSTEMATIC_COVARIANCE = np.diag(SYSTEMATIC_ERROR**2)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import SemanticsConfig
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.frame import SemanticClass as C
-
-if TYPE_CHECKING:
-    from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.score.point_score import PointScore
 
 OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters

@@ -27,7 +27,6 @@ from calib_ros.datasets.capture import BAG, CONFIG, EVENTS, MASK, RESULT
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.io import ABANDONED_S, flush
 from calib_ros.messages import stamp_ns
-from calib_ros.online.black_box import Occasion
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
 from calib_ros.ros.conversions import Serialized
@@ -100,20 +99,20 @@ class Capture:
         result = recalibrator.current.result
         return _write(parameters, "capture_{}", frames, result, _files(parameters, result, events))
 
-    def write_occasion(self, occasion: Occasion) -> str:
+    def write_occasion(self, kind: str, result: Result, events: str) -> str:
         """The same for the black box. The oldest of its captures make room by KEPT and MOST_BYTES; keyframes that do
         not fit, the oldest ones, are left out."""
         parameters, frames = self._parameters(), self._kept()
-        files = _files(parameters, occasion.result, occasion.events)
+        files = _files(parameters, result, events)
         rest = MOST_BYTES - BAG_BYTES - sum(map(len, files.values()))
         while frames and sum(map(_size, frames)) > rest:
             del frames[0]
         if not frames:
-            raise BadInputError(f"nothing captured of {occasion.kind}: there is no keyframe, or one takes all that captures may")
+            raise BadInputError(f"nothing captured of {kind}: there is no keyframe, or one takes all that captures may")
         size = MOST_BYTES - rest + sum(map(_size, frames))
         with suppress(OSError):  # said by who writes there
             _make_room(Path(parameters["capture_dir"]), KEPT - 1, MOST_BYTES - size)
-        return _write(parameters, f"event_{{}}_{occasion.kind}", frames, occasion.result, files)
+        return _write(parameters, f"event_{{}}_{kind}", frames, result, files)
 
     def _kept(self) -> list[RawKeyframe]:
         with self._lock:

@@ -17,7 +17,8 @@ from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore, ScoredPoints, SmoothScore
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, Prior
-from calib_ros.registration.search.optimizers import Sobol, levenberg_marquardt
+from calib_ros.registration.search.optimizers import levenberg_marquardt
+from calib_ros.registration.starts import Sobol
 from calib_ros_semantics.first_guess.view import MATCHED, ClassView
 
 Matrix = NDArray[np.float64]

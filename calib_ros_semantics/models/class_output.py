@@ -182,7 +182,7 @@ def best_classes(scores: NDArray[Any], size: Size) -> NDArray[np.int16]:
 def _is_part(cells: Sequence[int], size: Size) -> bool:
     """Whether rows and columns are those of the input, or of a coarser or finer grid over it."""
     finer = any(n > MAX_UPSAMPLING * own for n, own in zip(cells, size, strict=True))
-    if min(cells) < 1 or finer or max(cells) * MAX_STRIDE < max(size):
+    if min(cells) < 2 or finer or max(cells) * MAX_STRIDE < max(size):
         return False
     return abs(cells[0] - size[0] * cells[1] / size[1]) <= 1 or abs(cells[1] - size[1] * cells[0] / size[0]) <= 1
 

@@ -1,24 +1,21 @@
-"""Classes of the points of a frame (thesis 3.5), from a network for range images or from ready labels."""
+"""Classes of the points of a frame (thesis 3.5), from a network for range images."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import SOURCE
 from calib_ros.errors import ModelError
 from calib_ros.frame import UNLABELLED, Frame, PointCloud
 from calib_ros.lidar.range_image import reflectivity
 from calib_ros.lidar.rings import azimuth_step, ring_of_points
 from calib_ros_semantics.models import labels
 from calib_ros_semantics.models.class_output import ClassOutput
-from calib_ros_semantics.models.label_files import LabelScans, SourceClasses
 from calib_ros_semantics.models.labels import SQUEEZESEG, Classes
 from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, SegmentationModel, Tensor
 
@@ -62,37 +59,11 @@ FAMILIES: dict[str, tuple[tuple[str, ...], Statistics]] = {
 }
 
 
-def point_model(path: str, config: SemanticsConfig) -> SegmentationModel:
-    """The model that gives SemanticClass of each point (n,) uint8, UNLABELLED where unknown or without a return.
-
-    path: ONNX file of a network for range images, folder of .label files, or "source" for the labels of the dataset. Raises
-    ModelError if unusable.
-    """
-    if path == SOURCE or Path(path).is_dir():
-        return GivenPoints(SourceClasses("points") if path == SOURCE else LabelScans(path))
-    return CloudNetwork(path, config)
-
-
-class GivenPoints(SegmentationModel):
-    """Classes of points that a folder or the source provides."""
-
-    def __init__(self, read: SourceClasses | LabelScans) -> None:
-        self._read = read
-
-    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Classes:
-        deadline.check()
-        return np.where(frame.cloud.finite_mask(), self._read(frame), np.uint8(UNLABELLED))
-
-    def describe(self) -> str:
-        return self._read.text
-
-
 class CloudNetwork(SegmentationModel):
     """An ONNX network for classes of the pixels of a range image. ModelError if it fits no known convention."""
 
-    def __init__(self, path: str, config: SemanticsConfig) -> None:
-        self.model = OnnxModel(path, config)
-        self.fallback = self.model.fallback
+    def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
+        self.model, self.fallback = model, model.fallback
         self._input = CloudInput(self.model)
         numbers = labels.NUMBERS_OF_CLOUDS
         if self._input.family in ("squeezeseg", "squeezesegv2"):  # its four numbers also fit SemanticKITTI

@@ -1,28 +1,21 @@
-"""Classes of the pixels of a frame (thesis 3.5), from a segmentation network or from ready labels."""
+"""Classes of the pixels of a frame (thesis 3.5), from a segmentation network."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import SOURCE
 from calib_ros.frame import Frame
 from calib_ros_semantics.models import labels
-from calib_ros_semantics.models.class_borders import Map, borders_of_classes, borders_of_scores
+from calib_ros_semantics.models.class_borders import PixelClasses, borders_of_classes, borders_of_scores
 from calib_ros_semantics.models.class_output import ClassOutput
-from calib_ros_semantics.models.label_files import LabelPictures, SourceClasses
-from calib_ros_semantics.models.labels import Classes
-from calib_ros_semantics.models.network_kinds import NetworkKind, kind_of
 from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, SegmentationModel
 from calib_ros_semantics.models.tiles import Tiling
-from calib_ros_semantics.models.weight_sets import file_of
 
 # Exports by the name that a YAML may give as 'family:' (lower case) and as shown.
 FAMILIES = {
@@ -42,54 +35,14 @@ MAX_PIXELS = 2048 * 4096
 EXAMPLE_SIZE = (256, 512)  # px; height and width to try a network of any size at
 
 
-class PixelClasses(NamedTuple):
-    """classes: (H, W) uint8 SemanticClass, UNLABELLED where unknown. borders: (2, H, W), see class_borders, if requested."""
-
-    classes: Classes
-    borders: Map | None
-
-
-def pixel_model(path: str, config: SemanticsConfig) -> SegmentationModel:
-    """The model that gives PixelClasses at the size of the image. ModelError if unusable.
-
-    path: "builtin" for the network of this package, an ONNX file, a folder of label pictures, or "source" for the labels of the
-    dataset.
-    """
-    if path == SOURCE or Path(path).is_dir():
-        return GivenPixels(SourceClasses("pixels") if path == SOURCE else LabelPictures(path))
-    return ImageNetwork(file_of(path), config)
-
-
-class GivenPixels(SegmentationModel):
-    """Classes of pixels that a folder or the source provides."""
-
-    def __init__(self, read: SourceClasses | LabelPictures) -> None:
-        self._read = read
-
-    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> PixelClasses:
-        deadline.check()
-        classes = self._read(frame)
-        return PixelClasses(classes, borders_of_classes(classes) if borders else None)
-
-    def describe(self) -> str:
-        return self._read.text
-
-
 class ImageNetwork(SegmentationModel):
     """An ONNX network for classes of pixels. ModelError if it fits no known convention."""
 
-    def __init__(self, path: str | Path, config: SemanticsConfig) -> None:
-        self.model = OnnxModel(path, config)
-        self.fallback = self.model.fallback
+    def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
+        self.model, self.fallback = model, model.fallback
         family = self.model.sidecar.family
         if family and family.lower() not in FAMILIES:
             raise self.model.error(f"family '{family}' is unknown; known are {', '.join(FAMILIES)}")
-        kind, own = kind_of(self.model), self.model.sidecar
-        if kind not in (NetworkKind.CLASSES, NetworkKind.OTHER) and not own.labels and not own.output:
-            raise self.model.error(
-                f"this looks like {kind.value}; semantics.image_classes takes a network for classes of pixels. If it is one, "
-                f"name its classes by 'labels:' in {self.model.path.with_suffix('.yaml')}"
-            )
         self._input = ImageInput(self.model)
         size = self._input.size(*EXAMPLE_SIZE)
         feeds = self._input.feed(np.zeros((*EXAMPLE_SIZE, 3), np.uint8))

@@ -197,7 +197,10 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
         return GuessedTable(by_number)
     if count not in by_count:
         none = f"which are of no known dataset (these have {', '.join(map(str, sorted(by_count)))})"
-        raise model.error(f"it gives scores of {count} classes, {none}; name them by 'labels:' in {yaml}")
+        raise model.error(
+            f"it gives scores of {count} classes, {none}; name them by 'labels:' in {yaml}. If it is Segment Anything, it goes "
+            "to semantics.segment_anything; detectors of boxes and classifiers of whole pictures are of no use"
+        )
     return LabelTable(by_count[count])
 
 

@@ -28,7 +28,6 @@ class Sidecar:
     size : (height, width) to run at.
     labels : class names by number, or the name of a dataset.
     fov_deg : highest and lowest elevation of a range image. azimuth_deg : angle its columns cover, straight ahead in the middle.
-    depth_scale : of completion networks, units of their depths per metre.
     """
 
     family: str = ""
@@ -41,7 +40,6 @@ class Sidecar:
     fov_deg: tuple[float, float] | None = None
     azimuth_deg: float = 360.0
     output: str = ""
-    depth_scale: float | None = None
 
     @staticmethod
     def beside(path: str | Path) -> Sidecar:
@@ -88,7 +86,6 @@ ENTRIES: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "fov_deg": ("[highest, lowest]", lambda v: _is_list(v, _is_number, 2) and -90 <= v[1] < v[0] <= 90),
     "azimuth_deg": ("an angle above 0, up to 360", lambda v: _is_number(v) and 0 < v <= 360),
     "output": ("a name", _is_text),
-    "depth_scale": ("a number above 0", lambda v: _is_number(v) and v > 0),
 }
 
 

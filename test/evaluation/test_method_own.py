@@ -15,7 +15,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.own import LINEARISATION, Own, _Count

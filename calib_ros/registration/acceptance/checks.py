@@ -25,10 +25,8 @@ from calib_ros.registration.acceptance.refusal import (
 from calib_ros.registration.acceptance.significance import (
     RATIO_CONSISTENT,
     RATIO_INCONSISTENT,
-    UNDOUBTED_Z,
     check_significance,
     check_uncertainty,
-    p_value,
     semantic_likelihood_ratio,
 )
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
@@ -41,6 +39,7 @@ from calib_ros.registration.nuisance.parameters import NuisanceEstimate, estimat
 from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
 from calib_ros.registration.objective import Objective, penalised, trust_region
 from calib_ros.registration.progress import Progress
+from calib_ros.registration.score.chance import UNDOUBTED_Z, p_value
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult, search_decoy
 from calib_ros.result import Evidence

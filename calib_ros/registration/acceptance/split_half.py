@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR, noise_covariance, noise_level, share_of_weight
+from calib_ros.registration.covariance import noise_covariance, noise_level, share_of_weight
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.registration.search.optimizers import levenberg_marquardt

@@ -21,12 +21,12 @@ from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig
 from calib_ros.intrinsics import CENTRE, COEFFICIENTS, FOCAL, RADIAL, IntrinsicEstimate, RefinedCamera, change_between, changed
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.nuisance.lens import CENTRE as CENTRE_VALUES
 from calib_ros.registration.nuisance.lens import FOCAL as FOCAL_VALUES
 from calib_ros.registration.nuisance.lens import Intrinsic
 from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, noise_of
 from calib_ros.registration.nuisance.time_offset import FINE_POINTS
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior
 from calib_ros.registration.search.optimizers import ascend_jointly

@@ -1,4 +1,4 @@
-"""Optimisers of a score over the extrinsic, and the points to start from. All maximise, start at T and return (T, score)."""
+"""Optimisers of a score over the extrinsic. All maximise, start at T and return (T, score)."""
 
 from __future__ import annotations
 
@@ -232,16 +232,3 @@ def barzilai_borwein(
         if value > best_value:
             best, best_value = here, value
     return best, best_value
-
-
-class Sobol:
-    """A scrambled Sobol sequence over [-1, 1]^dimensions."""
-
-    def __init__(self, dimensions: int, seed: int) -> None:
-        from scipy.stats import qmc  # half a second, which a process that searches nothing is spared
-
-        self._sequence = qmc.Sobol(dimensions, seed=seed)
-
-    def next(self, count: int) -> NDArray[np.float64]:
-        """The next points (count, dimensions)."""
-        return np.asarray(self._sequence.random(count) * 2 - 1)

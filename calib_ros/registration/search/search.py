@@ -16,12 +16,13 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import SearchConfig
-from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.registration.score.chance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior, SearchBox
-from calib_ros.registration.search.optimizers import Sobol, levenberg_marquardt, nelder_mead
+from calib_ros.registration.search.optimizers import levenberg_marquardt, nelder_mead
 from calib_ros.registration.search.parallel import SERIAL, Workers
+from calib_ros.registration.starts import Sobol
 
 # What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
 # Seeding. Levels where starts are ranked and optimised first: the two coarsest find 49 of 80 KITTI frames, all three 66; in wide

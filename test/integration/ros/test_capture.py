@@ -24,7 +24,6 @@ from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.capture import read_events
 from calib_ros.errors import BadInputError
-from calib_ros.online.black_box import Occasion
 from calib_ros.result import INITIAL, SUSPECT, Result, load
 from calib_ros.ros import capture as capture_module
 from calib_ros.ros.capture import RawKeyframe, _write_bag
@@ -171,7 +170,7 @@ def test_the_black_box_keeps_to_number_and_size_and_captures_on_request_stay(str
 
         def record() -> tuple[int, Path]:
             """How many keyframes were written where."""
-            words = capture.write_occasion(Occasion(SUSPECT, result, "{}\n")).split()
+            words = capture.write_occasion(SUSPECT, result, "{}\n").split()
             return int(words[0]), Path(words[-1])
 
         monkeypatch.setattr(capture_module, "KEPT", 2)

@@ -77,10 +77,6 @@ def test_a_preset_holds_where_no_parameter_says_otherwise(capfd):
         ({"consumers": [1, 2]}, "consumers = 1 must be of type str"),
         ({"overlay_period_s": "often"}, "overlay_period_s"),
         ({"constraints__sigma_m": [1.0, 2.0]}, "constraints.sigma_m"),
-        (
-            {"refine__objective": "thesis", "thesis__completion": "no.onnx"},
-            "thesis.completion: model no.onnx: there is no such file",
-        ),
     ],
 )
 def test_bad_parameters_at_the_start(wrong, text):
@@ -207,22 +203,6 @@ def test_a_mask_that_cannot_be_used_is_refused_at_run_time_and_nothing_is_lost(v
         assert text in answer.reason
         assert "\n" not in answer.reason
     assert peer.pipeline.config.image.mask == ""
-    vehicle.assert_kept()
-
-
-def test_a_completion_network_that_cannot_be_used_is_refused_at_run_time(vehicle):
-    """In one line; the node keeps its extrinsic and what it had."""
-    peer = vehicle.peer
-    client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
-    peer.change(refine__objective="thesis")
-    wrong = Parameter("thesis.completion", value="no.onnx").to_parameter_msg()
-    answer = peer.call(client, SetParameters.Request(parameters=[wrong])).results[0]
-    assert not answer.successful
-    assert "thesis.completion: model no.onnx: there is no such file" in answer.reason
-    assert "\n" not in answer.reason
-    assert peer.pipeline.config.to_dict()["thesis"]["completion"] == "morphological"
-    vehicle.assert_kept()
-    peer.change(refine__objective="fast")
     vehicle.assert_kept()
 
 

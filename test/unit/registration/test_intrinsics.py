@@ -18,7 +18,7 @@ from calib_ros.registration.camera_rounds import refined_with_camera
 from calib_ros.registration.nuisance.lens import Intrinsic
 from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate, wrong_parameter
 from calib_ros.registration.nuisance.refinement import joint_optimum, lens_parameters
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, SearchBox, unlimited
 from calib_ros.result import CONVERGED, RefusalCode, Result
 

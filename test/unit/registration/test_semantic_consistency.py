@@ -17,7 +17,7 @@ from calib_ros.registration.acceptance.significance import RATIO_CONSISTENT, RAT
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import FrameSemantics, consistency_score, edge_weights
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
 from calib_ros.result import CONVERGED, REFUSED, Evidence, RefusalCode, Result

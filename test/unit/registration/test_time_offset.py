@@ -19,7 +19,7 @@ from calib_ros.registration.features import FeatureExtractor, FrameFeatures, at_
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.parameters import Effect, estimate_parameters, wrong_parameter
 from calib_ros.registration.nuisance.time_offset import ClockOffset, TimeOffset, estimate_time_offset, linearise, scatter_gain
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode, Result
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,6 +21,7 @@ from calib_ros.datasets.kitti import KittiSource
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import UNLABELLED, PointCloud
 from calib_ros.frame import SemanticClass as C
+from calib_ros.registration.classes import CLOUD, IMAGE, MASKS
 from calib_ros_semantics.models.cloud_classes import (
     BONNETAL,
     CENET,
@@ -26,10 +29,9 @@ from calib_ros_semantics.models.cloud_classes import (
     XYZ_FIRST,
     CloudInput,
     classes_of_points,
-    point_model,
     range_view,
 )
-from calib_ros_semantics.models.image_classes import ImageInput, pixel_model
+from calib_ros_semantics.models.image_classes import ImageInput
 from calib_ros_semantics.models.labels import (
     CAMVID,
     CITYSCAPES,
@@ -42,9 +44,11 @@ from calib_ros_semantics.models.labels import (
     lookup,
 )
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
+from calib_ros_semantics.models.segmentation import load_model
 from calib_ros_synthetic.drive import SyntheticDrive
 
 CONFIG = SemanticsConfig()
+pixel_model, point_model = partial(load_model, IMAGE), partial(load_model, CLOUD)
 ROWS, COLUMNS = 3, 7  # blocks of the picture
 DARK = np.zeros((64, 64, 3), np.uint8)
 
@@ -242,8 +246,8 @@ REFUSED = [
     ({"classes": 3, "outputs": "s 1 3 256 512"}, "labels: [object, void, unknown]", "none of its classes is of use here"),
     ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "scores of 7 classes, which are of no known dataset"),
     ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "inputs: input float32 1x3x256x512; outputs: o float32 1x7x256x512"),
-    (MEANS, "", "this looks like a classifier of whole pictures"),
-    ({"classes": 256, "inputs": "1 3 64 64", "outputs": "s 1 256 64 64"}, "", "encoder of Segment Anything, for semantics"),
+    (MEANS, "", "none of its outputs is a map of classes"),
+    ({"classes": 256, "inputs": "1 3 64 64", "outputs": "s 1 256 64 64"}, "", "If it is Segment Anything, it goes to semantics"),
     ({"inputs": "1 5 64 1024", "outputs": "o 1 19 64 1024", "normal": ([0] * 5, [1] * 5)}, "", "takes one picture as 1x3xHxW"),
     (
         {"inputs": "1 3 1024 2048", "outputs": "s 1 19 4096 8192", "enlarged": 4},
@@ -261,6 +265,45 @@ def test_networks_for_pictures_that_cannot_be_used(tmp_path: Path, graph: dict, 
     text = error_of(lambda: pixel_model(str(beside(segmentation(tmp_path / "n.onnx", **graph), yaml)), CONFIG))
     assert says in text
     assert str(tmp_path / "n.") in text
+
+
+def made(path: Path, *outputs: tuple) -> Path:
+    """A graph that takes a picture and gives outputs of these shapes, all of them 0."""
+    names = [f"o{k}" for k in range(len(outputs))]
+    constants = {f"z{k}": np.zeros(shape, np.float32) for k, shape in enumerate(outputs)}
+    nodes = [helper.make_node("ReduceMean", ["i"], ["m"], axes=[0, 1, 2, 3], keepdims=0)]
+    nodes += [helper.make_node("Add", ["m", f"z{k}"], [name]) for k, name in enumerate(names)]
+    declared = [value(name, list(shape)) for name, shape in zip(names, outputs, strict=True)]
+    return save(path, nodes, [value("i", [1, 3, 320, 320])], declared, constants)
+
+
+OTHERS = {
+    "YOLOv8": ((1, 84, 2100),),
+    "YOLOv5": ((1, 6300, 85),),
+    "boxes after NMS": ((1, 300, 6),),
+    "corners and scores": ((100, 4), (100,)),
+    "heads by anchor": ((1, 3, 40, 40, 85), (1, 3, 20, 20, 85)),
+    "heads of COCO": ((1, 255, 40, 40), (1, 255, 20, 20), (1, 255, 10, 10)),
+    "heads of two classes": ((1, 28, 40, 40), (1, 28, 20, 20)),
+    "FastSAM": ((1, 37, 2100), (1, 32, 80, 80)),
+    "encoder of Segment Anything": ((1, 256, 20, 20),),
+    "encoder of SAM2": ((1, 32, 80, 80), (1, 64, 40, 40), (1, 256, 20, 20)),
+    "classifier": ((1, 1000),),
+    "classifier of 19 classes": ((1, 19, 1, 1),),
+    "a network for classes": ((1, 19, 320, 320),),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_networks_of_other_kinds_are_refused(tmp_path: Path, name: str) -> None:
+    """Also where they are meant for the other parameter."""
+    path = str(made(tmp_path / "n.onnx", *OTHERS[name]))
+    if name != "a network for classes":
+        assert re.search("none of its outputs is a map|which are of no known", error_of(lambda: pixel_model(path, CONFIG)))
+    if name not in ("FastSAM", "heads of COCO"):
+        said = error_of(lambda: load_model(MASKS, path, CONFIG))
+        assert "set semantics.segment_anything_decoder" in said
+        assert "networks for classes go to semantics.image_classes" in said
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_what_is_no_network_has_no_metadata(tmp_path: Path, monkeypatch: pytest.
 
 def test_everyone_may_use_the_weights_of_the_package() -> None:
     files, licence = sorted(of_package().parent.glob("*.onnx")), (of_package().parent / "LICENSE").read_text()
-    assert [path.name for path in files] == ["completion.onnx", "streets.onnx"], "no others are installed"
+    assert [path.name for path in files] == ["streets.onnx"], "no others are installed"
     for path in files:
         assert weights_of(path).licence.startswith("Apache-2.0")
         assert path.name in licence
