@@ -233,14 +233,12 @@ class Monitor:
 
     def _evidence(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> float:
         """What the shift of the tested keyframes says against the extrinsic; less than nothing where it cannot count."""
-        counts = test.conclusive and test.significant and not self._is_small(test, keyframes)
-        return test.evidence if counts else min(test.evidence, 0.0)
-
-    def _is_small(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> bool:
-        """Is the shift one that the estimates follow, or that a scan bent by unknown motion may have?"""
+        # A small shift may be one that the estimates follow, or that a scan bent by unknown motion has.
         seconds = max(k.unknown_motion_s for k in keyframes)
         least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
-        return test.deg < least_deg and test.m < max(self.config.least_m, USUAL_SPEED_M_S * seconds)
+        is_small = test.deg < least_deg and test.m < max(self.config.least_m, USUAL_SPEED_M_S * seconds)
+        counts = test.conclusive and test.significant and not is_small
+        return test.evidence if counts else min(test.evidence, 0.0)
 
     def _describe(self, test: ShiftTest, count: int) -> str:
         frames, verb = (f"the newest {count} keyframes", "") if count > 1 else ("the newest keyframe", "es")
