@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from calib_ros.camera import Camera
-from calib_ros.config import MonitorConfig
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.sensor_health import ACCUSTOMED, HISTORY, MIN_HISTORY, SensorFault, SensorHealth
+from calib_ros.online.sensor_health import ACCUSTOMED, FROZEN_IMAGES, HISTORY, MIN_HISTORY, SensorFault, SensorHealth
 
 SHAPE = (120, 160)
 BLACK = np.zeros(SHAPE, np.uint8)
@@ -37,9 +36,9 @@ def check(watch: SensorHealth, image: np.ndarray, k: int = 99, cloud: PointCloud
     return None if problem is None else problem.fault
 
 
-def watched(config: MonitorConfig | None = None, frames: int = 10, shape: tuple[int, ...] = SHAPE) -> SensorHealth:
+def watched(frames: int = 10, shape: tuple[int, ...] = SHAPE) -> SensorHealth:
     """It knows what is usual here."""
-    watch = SensorHealth(config or MonitorConfig())
+    watch = SensorHealth()
     assert [check(watch, street(k, shape=shape), k) for k in range(frames)] == [None] * frames
     return watch
 
@@ -108,7 +107,7 @@ def test_dusk_is_not_reported_as_blind():
 
 @pytest.mark.parametrize("shape", [(240, 320), (60, 80, 3), (1, 1), (1, 9), (7, 3), (2, 2, 3), (8, 8), (9, 17, 3)])
 def test_images_of_any_size_and_colour_are_watched_and_a_change_restarts_the_check(shape):
-    watch = SensorHealth(MonitorConfig())
+    watch = SensorHealth()
     for k in range(8):
         check(watch, np.random.default_rng(k).integers(0, 256, shape).astype(np.uint8), k)
     assert check(watch, np.zeros(shape, np.uint8), 9) is BLIND
@@ -120,13 +119,11 @@ def test_images_of_any_size_and_colour_are_watched_and_a_change_restarts_the_che
 # --- frozen ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("config", "first"), [({}, 5), ({"frozen_images": 2}, 2), ({"frozen_images": 0}, None)])
-def test_a_frozen_image(config, first):
+def test_a_frozen_image():
     """The image stays, the scans do not: reported from a number of repetitions on, until it changes."""
     watch, still = watched(), street(40)
-    watch.config = MonitorConfig(**config)
     faults = [check(watch, still.copy(), 40 + k) for k in range(8)]
-    assert faults == [FROZEN if first is not None and k >= first else None for k in range(8)]
+    assert faults == [FROZEN if k >= 5 else None for k in range(8)]
     assert check(watch, street(41), 60) is None
     assert check(watch, street(41), 61) is None
 
@@ -146,14 +143,14 @@ def test_simulation_at_rest_is_not_frozen(lost):
 @pytest.mark.parametrize("xyz", [np.zeros((0, 3)), np.full((2000, 3), np.nan), np.zeros((2000, 3))], ids=["none", "nan", "zero"])
 def test_no_return_at_all(xyz):
     """Drivers leave lost returns out, or mark them by NaN or by the sensor's own place."""
-    for watch in (SensorHealth(MonitorConfig()), watched()):
+    for watch in (SensorHealth(), watched()):
         assert check(watch, street(40), 40, PointCloud(xyz.astype(np.float32))) is NO_SCAN
         assert check(watch, street(41), 41) is None
 
 
 def test_health_check_adapts_to_a_garage_and_an_open_field():
     """Little contrast and few returns for half a minute are what is usual; a black picture is never."""
-    watch, rng = SensorHealth(MonitorConfig()), np.random.default_rng(0)
+    watch, rng = SensorHealth(), np.random.default_rng(0)
     bright = rng.integers(0, 256, (24, 32, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     garage = (bright // 8 + 20).astype(np.uint8)
 
@@ -176,7 +173,7 @@ def test_health_check_adapts_to_a_garage_and_an_open_field():
 def test_a_frozen_image_is_the_same_problem_at_every_frame():
     watch, still = watched(), street(99)
     camera = Camera(np.eye(3), SHAPE[1], SHAPE[0])
-    problems = [watch.check(Frame(still, scan(k), camera, k)) for k in range(100, 100 + MonitorConfig().frozen_images + 4)]
+    problems = [watch.check(Frame(still, scan(k), camera, k)) for k in range(100, 100 + FROZEN_IMAGES + 4)]
     told = [problem for problem in problems if problem is not None]
     assert len(told) > 2
     assert set(told) == {told[0]}
