@@ -139,7 +139,7 @@ SOFT = (0.9, 25.0)  # deg, cm
 SINGLE, SEVERAL = ((5.0, 0.3),), ((5.0, 0.3), (10.0, 0.5), (20.0, 1.0))  # deg, m
 MOST_SINGLE, MOST, FEW = 12, 12, 5
 # Intrinsics and clocks of rendered drives are exact, and their covariances are to be compared with the errors that remain.
-EXACT_SENSORS = {"camera": {"focal_sigma": 0.0, "centre_sigma": 0.0}, "motion": {"time_offset_sigma_s": 0.0}}
+EXACT_SENSORS = {"camera": {"focal_sigma": 0.0}, "motion": {"time_offset_sigma_s": 0.0}}
 
 
 def vehicles(args: argparse.Namespace) -> Iterator[Case]:

@@ -25,6 +25,7 @@ from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs
 from calib_ros.online.pacing import is_due
 from calib_ros.registration.features import FrameFeatures
 
+MAX_SPEED = 40.0  # m/s: no keyframes above, where a millisecond between the clocks is as much as an estimate scatters by
 INTERVAL_S = 1.0  # without a keyframe, after which any image that has changed becomes one
 STATIC_SIMILARITY = 0.995  # images more similar show the same scene and never become a keyframe
 REMEMBERED_S = 3.0  # a vehicle that moved so long ago may still move
@@ -211,8 +212,8 @@ class SpeedGate:
         """True if the frame is slow enough for a keyframe, or its speed is unknown."""
         speed, turn_rate = self.motion_at(frame)
         problem = ""
-        if speed is not None and speed > self.config.max_speed:
-            problem = f"{speed:.1f} m/s are above online.max_speed = {self.config.max_speed:g}"
+        if speed is not None and speed > MAX_SPEED:
+            problem = f"{speed:.1f} m/s are too fast for a keyframe, at most {MAX_SPEED:g} are allowed"
         elif turn_rate is not None and turn_rate > self.config.max_turn_deg_s:
             problem = f"{turn_rate:.1f} deg/s are above online.max_turn_deg_s = {self.config.max_turn_deg_s:g}"
         if problem:

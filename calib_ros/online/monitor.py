@@ -34,6 +34,8 @@ TESTS_PER_HOUR, MOVED_RARER = 3 * 3600 / EVERY_S, 10.0
 DOUBT = np.log(20.0)  # evidence from which on the next frames are tested as well, whatever they show
 # Of the usual number of edge points in view: a keyframe that has fewer, and fewer than MIN_POINTS, shows next to nothing.
 POOR_SHARE = 0.25
+CONFIRM = 3  # keyframes that confirm a movement: fewer may show one odd scene, more keep a wrong extrinsic in use
+LEAST_DEG, LEAST_M = 0.15, 0.04  # smaller movements are within what estimates scatter by, and these follow them
 # A vehicle in a city, for scans whose motion is unknown. KITTI drive 0005 at 3 to 6 m/s, not de-skewed, fits 0.2 deg / 8 cm
 # beside the extrinsic; with these and its camera 0.22 deg / 11 cm are allowed for.
 USUAL_TURN_DEG_S, USUAL_SPEED_M_S = 20.0, 10.0
@@ -165,12 +167,12 @@ class Monitor:
             self._match.add(alone.z_score, alone.points, same_scene)
         self._suspects = self._suspects + 1 if self._suspects else 0
         window = max(self._suspects, min(WINDOW, len(keyframes)) if not self._suspects else 1)
-        window = min(window, self.config.confirm if self._out_of_sync else FAILED_WINDOWS * WINDOW)
+        window = min(window, CONFIRM if self._out_of_sync else FAILED_WINDOWS * WINDOW)
         newest = keyframes[-window:]
         informative = self.informative(newest, T) or newest[-1:]
         together = alone if window == 1 else shift_of(informative)
         if self._suspects:
-            several = together.keyframes >= min(self.config.confirm, len(newest))  # not one of them, tested again and again
+            several = together.keyframes >= min(CONFIRM, len(newest))  # not one of them, tested again and again
             return self._decide(calibrator, informative, T, together, window, several)
         # What shows in the newest alone began with it: the others in a window that it spoils are still right.
         against = (
@@ -215,7 +217,7 @@ class Monitor:
         keyframes. several: they are enough to confirm a movement."""
         count, p_value = self._suspects, together.p_value
         evidence = max(self._evidence(together, newest), self._match.evidence)
-        if evidence >= self._threshold(MOVED_RARER) and several and count >= self.config.confirm:
+        if evidence >= self._threshold(MOVED_RARER) and several and count >= CONFIRM:
             if out_of_sync := clocks_that_explain(calibrator, newest, T, together.score):
                 self._out_of_sync = True
                 return Assessment(Verdict.SUSPECT, out_of_sync, p_value, count)
@@ -224,7 +226,7 @@ class Monitor:
             self.reset()
             return Assessment(Verdict.MOVED, message, p_value, since)
         limit = self._threshold() if count >= FAILED_WINDOWS * WINDOW else 0.0  # 0: they rather speak for it
-        if together.conclusive and evidence < limit and count >= min(2, self.config.confirm):
+        if together.conclusive and evidence < limit and count >= min(2, CONFIRM):
             without_sync = max(count - window, 0) if self._out_of_sync else 0
             self.reset()
             message = "the extrinsic fits the newest keyframes after all"
@@ -239,8 +241,8 @@ class Monitor:
     def _is_small(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> bool:
         """Is the shift one that the estimates follow, or that a scan bent by unknown motion may have?"""
         seconds = max(k.unknown_motion_s for k in keyframes)
-        least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
-        return test.deg < least_deg and test.m < max(self.config.least_m, USUAL_SPEED_M_S * seconds)
+        least_deg = max(LEAST_DEG, USUAL_TURN_DEG_S * seconds)
+        return test.deg < least_deg and test.m < max(LEAST_M, USUAL_SPEED_M_S * seconds)
 
     def _describe(self, test: ShiftTest, count: int) -> str:
         frames, verb = (f"the newest {count} keyframes", "") if count > 1 else ("the newest keyframe", "es")

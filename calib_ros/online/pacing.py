@@ -22,7 +22,7 @@ from calib_ros.registration.search.parallel import cpu_time
 # a minute's average is at most a twelfth above max_load.
 SAVED_S = 5.0
 # Whatever the budget says, one keyframe is taken in so many seconds, and one estimate made that is due: a node that tests nothing
-# is of no use. The test of a displaced mount takes monitor.confirm keyframes, 15 s at this rate.
+# is of no use. The test of a displaced mount takes three keyframes, 15 s at this rate.
 KEYFRAME_EVERY_S = 5.0
 ESTIMATE_EVERY_S = 30.0
 CLASSES_EVERY_S = 30.0  # of one keyframe

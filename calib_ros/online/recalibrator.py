@@ -90,7 +90,7 @@ class Recalibrator:
         self.config = with_clocks(self._configured, current or start)
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
-        self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
+        self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth()
         self._scans, self._models = scans, models
         in_step = scans is not None
         self.glance, self.selector = Glance(in_step), KeyframeSelector(self.config.online, in_step)
@@ -441,7 +441,7 @@ class Recalibrator:
         """Drop all keyframes and the baselines of the sensor check, and go back to the initial extrinsic."""
         with self._lock:
             self._clear_keyframes()
-            self.sensors = SensorHealth(self.config.monitor)
+            self.sensors = SensorHealth()
             self.glance.reset()
             placeholder = self.first_guess.begin_anew()
             if placeholder is None:
@@ -468,7 +468,7 @@ class Recalibrator:
             features_changed = self.first_guess.configure(config, self.tracker.current.accepted > 0) or features_changed
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
             self.motion.config, self.motion.accumulate_s = config.motion, config.lidar.accumulate_s
-            self.monitor.config = self.sensors.config = config.monitor
+            self.monitor.config = config.monitor
             self.tracker.config = config
             self.keyframes.resize(config.online.buffer_size)
             if not config.monitor.enabled:
