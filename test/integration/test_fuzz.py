@@ -7,14 +7,13 @@ import os
 import subprocess
 import sys
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from paths import ROOT, SUPPORT
 
 RUNNER = SUPPORT / "fuzz_runner.py"
 pytestmark = pytest.mark.usefixtures("ros_in_this_process")
-compression = pytest.mark.skipif(not (find_spec("av") and find_spec("DracoPy")), reason="PyAV or DracoPy is not installed")
 
 
 def fuzz(what: str, count: int) -> dict[str, Any]:
@@ -29,64 +28,46 @@ def fuzz(what: str, count: int) -> dict[str, Any]:
     return report
 
 
-def total(report: dict[str, Any], *kinds: str) -> int:
-    return sum(count for name, count in report["outcomes"].items() if name.rpartition(" ")[0] in kinds)
+class Fuzzed(NamedTuple):
+    """short, long: cases in `make test`, and instead at length in `make test-all`. kinds: of inputs, one in each case. least:
+    outcome -> of so many cases more than one has it: mutations that leave nothing to decode, or nothing to refuse, would show
+    nothing. mib: that a case may take at most."""
+
+    short: int
+    long: int
+    kinds: tuple[str, ...]
+    least: dict[str, int]
+    mib: float = float("inf")
 
 
-def cases(short: int, long: int) -> pytest.MarkDecorator:
-    """So many cases in `make test`, and instead at length in `make test-all`."""
-    return pytest.mark.parametrize(
-        "count", [pytest.param(short, marks=pytest.mark.short), pytest.param(long, marks=pytest.mark.slow)]
-    )
+def both(share: int, *kinds: str) -> dict[str, int]:
+    return {f"{kind} {what}": share for kind in kinds for what in ("taken", "refused")}
 
 
-@cases(300, 1500)
-def test_mutated_messages(count):
-    report = fuzz("messages", count)
-    assert total(report, "cloud", "image", "compressed", "camera_info") == count
-    assert report["most"][0] < 100, "MiB for a message of at most 200 kB"
-    # Mutations that leave nothing to decode, or nothing to refuse, would show nothing.
-    for kind in ("cloud", "image", "compressed", "camera_info", "scan in use", "camera in use"):
-        assert min(report["outcomes"][f"{kind} {what}"] for what in ("taken", "refused")) > count // 200
+MESSAGES, PACKED = ("cloud", "image", "compressed", "camera_info"), ("video", "compressed_cloud")
+TEXTS = ("config", "result", "state")
+FOLDERS = ("bag_mcap", "bag_sqlite3", "bag_ros1", "bag_compressed", "raw", "odometry", "object", "nuscenes", "plain")
+FUZZED = {
+    "messages": Fuzzed(300, 1500, MESSAGES, both(200, *MESSAGES, "scan in use", "camera in use"), mib=100),  # of at most 200 kB
+    "packed": Fuzzed(200, 1500, PACKED, both(10, *PACKED), mib=100),
+    "pipeline": Fuzzed(80, 300, ("pair",), {"pipeline says": 6, "extrinsics": 60}),
+    "texts": Fuzzed(180, 900, TEXTS, {f"{kind} taken": 180 for kind in TEXTS}),
+    "folders": Fuzzed(200, 600, (*FOLDERS, "plain_otherwise"), both(201, *FOLDERS, "plain_otherwise")),
+    "cli": Fuzzed(30, 150, ("code",), {"code 0": 16, "code 2": 16}),
+}
+NEED_CODECS = ("packed", "folders", "cli")
+HAS_CODECS = find_spec("av") and find_spec("DracoPy")
 
 
-@compression
-@cases(200, 1500)
-def test_mutated_videos_and_compressed_clouds(count):
-    report = fuzz("packed", count)
-    assert report["most"][0] < 100, "MiB for a message of at most 200 kB"
-    for kind in ("video", "compressed_cloud"):
-        assert min(report["outcomes"][f"{kind} {what}"] for what in ("taken", "refused")) > count // 10
-
-
-@cases(80, 300)
-def test_mutated_messages_in_the_pipeline(count):
-    report = fuzz("pipeline", count)
-    assert total(report, "pair") == count
-    assert report["outcomes"]["pipeline says"] > count // 6
-    assert report["outcomes"]["extrinsics"] > count // 60
-
-
-@cases(180, 900)
-def test_mutated_texts(count):
-    report = fuzz("texts", count)
-    assert total(report, "config", "result", "state") == count
-    assert min(report["outcomes"][f"{kind} taken"] for kind in ("config", "result", "state")) > count // 180
-
-
-@compression
-@cases(200, 600)
-def test_mutated_bags_and_folders(count):
-    report = fuzz("folders", count)
-    kinds = ("bag_mcap", "bag_sqlite3", "bag_ros1", "bag_compressed", "raw", "odometry", "object", "nuscenes")
-    kinds += ("plain", "plain_otherwise")
-    assert total(report, *kinds) == count
-    assert min(report["outcomes"][f"{kind} {what}"] for kind in kinds for what in ("taken", "refused")) >= count // 200
-
-
-@compression
-@cases(30, 150)
-def test_mutated_files_through_the_command_line(count):
-    report = fuzz("cli", count)
-    assert sum(report["outcomes"][f"code {code}"] for code in (0, 1, 2)) == count
-    assert min(report["outcomes"][f"code {code}"] for code in (0, 2)) >= count // 15
+@pytest.mark.parametrize("length", [pytest.param("short", marks=pytest.mark.short), pytest.param("long", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("what", FUZZED)
+def test_mutated_inputs(what: str, length: str) -> None:
+    if what in NEED_CODECS and not HAS_CODECS:
+        pytest.skip("PyAV or DracoPy is not installed")
+    own = FUZZED[what]
+    count = getattr(own, length)
+    report = fuzz(what, count)
+    outcomes = report["outcomes"]
+    assert report["most"][0] < own.mib
+    assert sum(n for name, n in outcomes.items() if name.rpartition(" ")[0] in own.kinds) == count
+    assert {name: outcomes[name] for name, share in own.least.items() if outcomes[name] <= count // share} == {}
