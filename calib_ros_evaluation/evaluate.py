@@ -11,10 +11,8 @@ import yaml
 
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.cluster import ClusterPool
 from calib_ros_check.jobs.journal import Answer, Journal
-from calib_ros_check.jobs.local import LocalPool
-from calib_ros_check.jobs.pool import Pool, run
+from calib_ros_check.jobs.pool import run
 from calib_ros_evaluation.csv_files import TRIALS, write_trials
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
@@ -115,8 +113,8 @@ def answered(
     about = {"version": __version__, "code": code_fingerprint(), "configuration": options.setup.fingerprint, **about}
     with Journal(options.out, about, options.fresh) as journal:
         same_frames(journal, summaries)
-        workers: Pool = ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers)
-        run(groups(planned), partial(work, options.setup), journal, workers, partial(progress, "trials"))
+        doing, told = partial(work, options.setup), partial(progress, "trials")
+        run(groups(planned), doing, journal, told, options.workers, options.scheduler)
         return dict(journal.done), journal.notes
 
 
