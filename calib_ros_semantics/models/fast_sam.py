@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.frame import Frame
 from calib_ros_semantics.models.masks import NMS_IOU, Mask, MaskModel, found_mask, sample_logits, without_duplicates
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel
-from calib_ros_semantics.models.segment_anything import DEFAULT_SIDE, declared_family, to_rgb
+from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, to_rgb
+from calib_ros_semantics.models.segment_anything import DEFAULT_SIDE, declared_family
 
 Floats = NDArray[np.float32]
 BORDER_GREY = 114.0  # grey level around the letterboxed image
@@ -38,7 +38,8 @@ class FastSam(MaskModel):
         declared = model.sidecar.output
         if declared and declared not in detections:
             raise model.error(f"'{declared}', which 'output:' of the YAML beside it names, is no output with detections 1xCxN")
-        if _says_nms(model.metadata):
+        told = [model.metadata.get(key, "").lower() == "true" for key in ("nms", "end2end")]
+        if any(told) or re.search(r"'nms':\s*True", model.metadata.get("args", "")):
             raise model.error(NMS_INSIDE)
         self._outputs = [declared or detections[0], *maps]
         self._normalised = Normalisation.of(model, Normalisation(1 / 255))
@@ -117,9 +118,3 @@ def _suppress_boxes(boxes: Floats, score: Floats) -> list[int]:
         common = np.clip(high - low, 0, None).prod(axis=1)
         left = left[common <= MAX_BOX_IOU * (area[left] + area[best] - common)]
     return kept
-
-
-def _says_nms(metadata: Mapping[str, str]) -> bool:
-    """Whether the metadata declares NMS or an end-to-end head: keys nms, end2end, or within args."""
-    keys = (metadata.get(key, "").lower() == "true" for key in ("nms", "end2end"))
-    return any(keys) or re.search(r"'nms':\s*True", metadata.get("args", "")) is not None

@@ -126,14 +126,14 @@ class Normalisation:
     declared: bool = False
 
     @staticmethod
-    def of(model: OnnxModel, usual: Normalisation, channels: int = 3) -> Normalisation:
+    def of(model: OnnxModel, usual: Normalisation) -> Normalisation:
         """The normalisation of the YAML beside a model, else the usual one of RGB. ModelError if its numbers do not fit."""
         own = model.sidecar
         if not isinstance(own.channels, str):
             raise model.error("'channels:' of the YAML beside it must be rgb or bgr")
         for name, values in (("mean", own.mean), ("std", own.std)):
-            if len(values) not in (0, 1, channels):
-                raise model.error(f"'{name}:' of the YAML beside it must have 1 or {channels} numbers")
+            if len(values) not in (0, 1, 3):
+                raise model.error(f"'{name}:' of the YAML beside it must have 1 or 3 numbers")
         mean, std, scale = own.mean or (0.0,), own.std or (1.0,), own.scale
         if scale is None:
             if not own.mean and not own.std:
@@ -166,6 +166,12 @@ def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]
     shrinks = size[0] <= image.shape[0] and size[1] <= image.shape[1]
     how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, size[::-1], interpolation=how), np.uint8)
+
+
+def to_rgb(image: NDArray[np.uint8], size: tuple[int, int], bgr: bool = False) -> NDArray[np.float32]:
+    """Image (H, W) or (H, W, 3) BGR -> (h, w, 3) float32 RGB or BGR, 0..255, at another size."""
+    colour = fitted(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8) if image.ndim == 2 else image, size)
+    return np.asarray(colour if bgr else colour[:, :, ::-1], np.float32)
 
 
 class Deadline:

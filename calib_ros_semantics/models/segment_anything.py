@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from calib_ros_semantics.models.masks import (
     accepted_masks,
     without_duplicates,
 )
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, Tensor, fitted
+from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, Tensor, to_rgb
 
 Points = NDArray[np.float64]
 DEFAULT_SIDE = 1024  # px; size the models were trained at, and the default of graphs of dynamic size
@@ -342,12 +341,6 @@ def _mismatch(decoder: OnnxModel, encoder: OnnxModel, problem: str) -> ModelErro
         f"{encoder.path} and {decoder.path} are no pair of Segment Anything: {problem}; the encoder has {encoder.tensors}; "
         f"the decoder has {decoder.tensors}; {KNOWN}"
     )
-
-
-def to_rgb(image: NDArray[np.uint8], size: tuple[int, int], bgr: bool = False) -> NDArray[np.float32]:
-    """Image (H, W) or (H, W, 3) BGR -> (h, w, 3) float32 RGB or BGR, 0..255, at another size."""
-    colour = fitted(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8) if image.ndim == 2 else image, size)
-    return np.asarray(colour if bgr else colour[:, :, ::-1], np.float32)
 
 
 def declared_family(model: OnnxModel) -> str:
