@@ -7,14 +7,12 @@ registration  the table by which every change is judged: success and accuracy ov
               synthetic drive; SOURCE: names of its rows
 vehicles      is what is accepted right, and what is right accepted: single frames and sets of SOURCE, of --soft, whose reference
               is known to 0.9 deg / 25 cm only, and of the synthetic --rigs
-sensitivity   the cases of vehicles with each constant of the acceptance test and the covariance 30 % less and more
 chance        images with scans of another place, and mirrored ones: are they accepted as rarely as p values say? SOURCE, --rigs
 covariance    normalised errors squared of estimates from subsets of frames of SOURCE, or synthetic drives and KITTI
 intrinsics    are right intrinsics ever refused, and wrong ones ever accepted: single frames and sets of SOURCE, or all rigs
 monitor_hours hours of quiet driving and knocks, driving and standing: SOURCE of 10 Hz, or six synthetic rigs, lap after lap
 
---trials: starts of a case, or how many drives. Differences are paired with the first variant; their 95 % intervals are those of a
-bootstrap over cases. The same command goes on with a study that was interrupted where its --csv ends.
+--trials: starts of a case, or how many drives. The same command goes on with a study that was interrupted where its --csv ends.
 """
 
 from __future__ import annotations
@@ -29,12 +27,12 @@ import cv2
 from benchmarks import study_acceptance, study_hours, study_intrinsics, study_registration
 from benchmarks.records import append_records, read_records
 from benchmarks.study_registration import SCENES
-from benchmarks.study_runner import Record, Study, run, table
+from benchmarks.study_runner import Record, Study, run
 from calib_ros.errors import CalibrationError
 
 STUDIES: dict[str, Study] = {
     **study_registration.STUDIES,
-    **study_acceptance.STUDIES,
+    "chance": study_acceptance.STUDY,
     "intrinsics": study_intrinsics.STUDY,
     "monitor_hours": study_hours.STUDY,
 }
@@ -66,7 +64,7 @@ def main() -> int:
             append_records(args.csv, [record])
     except CalibrationError as error:
         parser.error(str(error))
-    print(table(study, records))
+    print(study.table(records))
     return 0
 
 

@@ -150,4 +150,4 @@ def table(records: Sequence[Record]) -> str:
 
 
 # Triggered sensors: laps at one speed do not tell an offset of the clocks.
-STUDY = Study(drives, driven, {"": Variant({**CLASSES_OFF, "motion": {"max_time_offset_s": 0.0}})}, table=table)
+STUDY = Study(drives, driven, table, {"": Variant({**CLASSES_OFF, "motion": {"max_time_offset_s": 0.0}})})

@@ -73,9 +73,7 @@ def searched(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: in
     claimed = Calibrator(case.frames[0].camera, calibrator.config)
     result = claimed.estimate([claimed.extract(frame) for frame in case.frames], start_of(case, trial), BOX)
     T = result.T_camera_lidar if result.optimum is None else result.optimum
-    told = result.intrinsics.get("focal_length_share")
-    said = f"{told.value:.5f} {told.sigma:.5f}" if told is not None else ""
-    return End.at(T, case.truth, result.status, said, result)
+    return End.at(T, case.truth, result.status, result=result)
 
 
 def table(records: Sequence[Record]) -> str:
@@ -95,4 +93,4 @@ def table(records: Sequence[Record]) -> str:
     return markdown(head.split(", "), rows)
 
 
-STUDY = Study(sets, searched, VARIANTS, table=table)
+STUDY = Study(sets, searched, table, VARIANTS)

@@ -7,18 +7,15 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby, islice
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.records import markdown
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, MotionConfig, update
@@ -30,7 +27,6 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import CONVERGED, Result
-from calib_ros_evaluation.compare import paired_change
 
 Matrix = NDArray[np.float64]
 KEPT = 100  # features of frames that are kept for the next cases
@@ -92,11 +88,10 @@ class End(NamedTuple):
 
 
 class Variant(NamedTuple):
-    """Changes of the configuration and of the frames. replaced: by the place of a name, what users have no option for."""
+    """Changes of the configuration and of the frames."""
 
     config: dict[str, Any] = {}  # noqa: RUF012
     frame: Callable[[Frame], Frame] = lambda frame: frame
-    replaced: Mapping[str, object] = {}
 
 
 FeaturesOf = Callable[[], list[FrameFeatures]]
@@ -105,13 +100,13 @@ Estimate = Callable[[Calibrator, Case, FeaturesOf, int], End]
 
 @dataclass(frozen=True)
 class Study:
-    """cases: by the command line. trials: of each case. table: instead of the usual one."""
+    """cases: by the command line. table: of the records, for people. trials: of each case."""
 
     cases: Callable[[argparse.Namespace], Iterable[Case]]
     estimate: Estimate
-    variants: Mapping[str, Variant] = field(default_factory=lambda: {"": Variant()})
+    table: Callable[[Sequence[Record]], str]
+    variants: Mapping[str, Variant] = field(default_factory=lambda: {"": Variant(CLASSES_OFF)})
     trials: int = 1
-    table: Callable[[Sequence[Record]], str] | None = None
 
 
 @dataclass(frozen=True)
@@ -198,16 +193,13 @@ class Worker:
 
     def __call__(self, task: Task) -> list[Record]:
         name, cases = task
-        variant, records = self.study.variants[name], []
+        records = []
         for number, case, trials in cases:
             if name not in self._kept or not self._kept[name].fits(case):
-                self._kept[name] = Prepared(name, variant, case, self.config)
+                self._kept[name] = Prepared(name, self.study.variants[name], case, self.config)
             for trial in trials:
                 try:
-                    with ExitStack() as stack:
-                        for place, value in variant.replaced.items():
-                            stack.enter_context(patch(place, value))
-                        records.append(self._record(self._kept[name], number, case, trial))
+                    records.append(self._record(self._kept[name], number, case, trial))
                 except CalibrationError as error:
                     print(f"{case.group}, {name}: {error}", file=sys.stderr)
         if cases[0][1].source:  # no other task has its frames
@@ -260,41 +252,3 @@ def _tasks(study: Study, args: argparse.Namespace, done: Sequence[Record]) -> It
                 left.append((n, case, [t for t in own if (case.group, name, n, t) not in known]))
             if any(own for _, _, own in left):
                 yield name, left
-
-
-def table(study: Study, records: Sequence[Record]) -> str:
-    """A row for each group and variant, or what the study has instead."""
-    if study.table is not None:
-        return study.table(records)
-    rows = []
-    for group in dict.fromkeys(r.group for r in records):
-        own = [r for r in records if r.group == group]
-        first = {(r.case, r.trial): r.right for r in own if r.variant == own[0].variant}
-        for variant in dict.fromkeys(r.variant for r in own):
-            found = [r for r in own if r.variant == variant]
-            pairs = [(r.case, float(r.right) - first[r.case, r.trial]) for r in found if (r.case, r.trial) in first]
-            rows.append(
-                [
-                    group,
-                    variant,
-                    f"{sum(r.right for r in found)} of {len(found)}",
-                    "{:.3f}, {:.2f}".format(*np.percentile([r.deg for r in found], (50, 90))),
-                    "{:.1f}, {:.1f}".format(*np.percentile([r.cm for r in found], (50, 90))),
-                    sum(r.accepted and not r.right for r in found),
-                    sum(not r.accepted for r in found),
-                    f"{np.median([r.cpu_s for r in found]):.2f}",
-                    "" if variant == own[0].variant else interval(pairs),
-                ]
-            )
-    head = "cases, variant, success, deg: median 90 %, cm: median 90 %, accepted wrong, refused, CPU s, more successes"
-    return markdown(head.split(", "), rows)
-
-
-def interval(pairs: Sequence[tuple[int, float]]) -> str:
-    """Mean of paired differences with its 95 % interval, by a bootstrap over the cases."""
-    if not pairs:
-        return ""
-    cases, differences = zip(*pairs, strict=True)
-    values = np.array([(0.0, difference) for difference in differences])
-    one = paired_change(values, [("", (case,)) for case in cases], "mean", 1)
-    return f"{100 * one.change:+.0f} % ({100 * one.low:+.0f} to {100 * one.high:+.0f})"

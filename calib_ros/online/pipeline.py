@@ -28,11 +28,11 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.common import Common
 from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Problem, Remarks
 from calib_ros.online.keyframes import SpeedGate
-from calib_ros.online.pacing import LoadBudget, Meter, Work
+from calib_ros.online.pacing import LoadBudget, Work
 from calib_ros.online.pairing.pairing import Intake, Pairing
 from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.requests import ESTIMATE, Job, Requests
+from calib_ros.online.requests import ESTIMATE, Pending, Requests
 from calib_ros.online.worker import Worker
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.progress import Callback
@@ -64,7 +64,6 @@ class Pipeline:
         self._scans = None if common is None else common.scans(lidar)
         self.load = LoadBudget(config.online, purse=self._common.purse)
         self._inputs = inputs
-        self._segmentation = self._common.models(config.semantics)
         self._requests = Requests()
         self.dropped_pairs = 0  # that a newer one replaced before they were ingested
         self.rested_pairs = 0  # that were left out, since there was no need to look at them
@@ -99,9 +98,8 @@ class Pipeline:
 
     def _recalibrator_at(self, camera: Camera, initial: Result, current: Result | None = None) -> Recalibrator:
         """A new one; its frames are those of the initial extrinsic."""
-        names = initial.camera_frame, initial.lidar_frame
-        shared = self._scans, self._common.models
-        return Recalibrator(camera, initial, self.config, *names, current, self.speed_gate, self.segmentation, *shared)
+        names, gate, models = (initial.camera_frame, initial.lidar_frame), self.speed_gate, self._common.models
+        return Recalibrator(camera, initial, self.config, *names, current, gate, self._scans, models)
 
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""
@@ -154,11 +152,11 @@ class Pipeline:
         that waited for it; the extrinsic stays. progress: called on the thread of estimates; must not raise.
         """
         with self._lock:
-            future = self._requests.add(Job(ESTIMATE), self._keyframes_seen(), progress)
+            future = self._requests.add(Pending(ESTIMATE), self._keyframes_seen(), progress)
         self._estimator.put(None)
         return future
 
-    def defer(self, job: Job, obstacle: str = "") -> Future[Any]:
+    def defer(self, job: Pending, obstacle: str = "") -> Future[Any]:
         """A job for the thread of estimates, after those under way; its CPU time is not charged to online.max_load. The future
         holds what it returns, or an exception: a CalibrationError where it is not taken, for an obstacle among other reasons."""
         future = self._requests.add(job, obstacle=obstacle)
@@ -198,7 +196,6 @@ class Pipeline:
     def restart(self) -> None:
         """Drop keyframes and extrinsic: the next pair asks for the initial one again."""
         with self._lock:
-            self._segmentation = self.segmentation
             self._requests.close()
             self.recalibrator = None
 
@@ -243,9 +240,8 @@ class Pipeline:
 
     @property
     def segmentation(self) -> Segmentation:
-        """The models, loaded ones where there are some: loading takes seconds."""
-        last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
-        return last if last.config == self.config.semantics else self._common.models(self.config.semantics)
+        """The models."""
+        return self._common.models(self.config.semantics)
 
     @property
     def taking_in(self) -> bool:
@@ -268,14 +264,14 @@ class Pipeline:
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
     def _ingest(self, intake: Intake) -> None:
-        with self._common.intake.mine(self._ingester.check_cancelled) as waited, self.load.counting(Work.INTAKE) as meter:
+        with self._common.intake.mine(self._ingester.check_cancelled) as waited, self.load.counting(Work.INTAKE) as begin:
             newest = self._ingester.newer(intake) if waited else intake
             if newest is not intake:  # of an older one the scan before, which tells the motion, may be gone
                 with self._lock:
                     self.dropped_pairs += intake.paired
-            self._take_in(newest, meter)
+            self._take_in(newest, begin)
 
-    def _take_in(self, intake: Intake, meter: Meter) -> None:
+    def _take_in(self, intake: Intake, begin: Callable[[Work], None]) -> None:
         if self.paused:
             return
         try:
@@ -298,7 +294,7 @@ class Pipeline:
             frame = replace(frame, cloud_stamp=frame.cloud_stamp - ahead)
         try:
             is_keyframe = recalibrator.ingest(
-                frame, lambda since: self._scan_before(frame, since), lambda: self._allows_keyframe(meter)
+                frame, lambda since: self._scan_before(frame, since), lambda: self._allows_keyframe(begin)
             )
             self._received = time.monotonic()
         finally:
@@ -309,7 +305,7 @@ class Pipeline:
             self.last_keyframe = frame
             self._stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
             self._remarks.note_what_is_missing(recalibrator, frame)
-        meter.switch(Work.INTAKE)
+        begin(Work.INTAKE)
         if is_keyframe and recalibrator.segments_keyframes and self.load.allows_classes(recalibrator.first_guess.needs_classes):
             self._segmenter.put(None)
         if self._is_due(recalibrator):
@@ -340,11 +336,11 @@ class Pipeline:
         with self._lock:
             self._hand_over(self._pairing.use_sweep())
 
-    def _allows_keyframe(self, meter: Meter) -> bool:
+    def _allows_keyframe(self, begin: Callable[[Work], None]) -> bool:
         """What comes from now on is the work of a keyframe, if the budget allows for one."""
         allowed = self.load.allows_keyframe()
         if allowed:
-            meter.switch(Work.KEYFRAMES)
+            begin(Work.KEYFRAMES)
         return allowed
 
     def _scan_before(self, frame: Frame, since: int) -> tuple[int, PointCloud] | None:

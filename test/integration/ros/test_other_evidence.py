@@ -125,12 +125,12 @@ def test_a_drive_with_the_attached_form():
         assert peer.calibration.health.errors == 0
 
 
-def test_the_objective_changes_at_run_time(street, drive):
+def test_the_objective_changes_at_run_time(street, drive, monkeypatch):
     def kinds() -> list[type]:
         return [type(f.own) for f in peer.recalibrator.buffer]
 
-    quick = {"thesis__evaluations": 30, "online__mode": "manual"}
-    with Peer(**start_parameters(near(drive.reference)), **REFINE_ONLY, **quick) as peer:
+    monkeypatch.setattr("calib_ros_thesis.config.ThesisConfig.evaluations", 30)
+    with Peer(**start_parameters(near(drive.reference)), **REFINE_ONLY, online__mode="manual") as peer:
         peer.drive(street[:2])
         assert kinds() == 2 * [type(None)]
         peer.change(refine__objective="thesis")
@@ -143,7 +143,7 @@ def test_the_objective_changes_at_run_time(street, drive):
         # What cannot be is refused, and loses nothing.
         assert "thesis.dense_edges: once_per_level" in peer.set(refine__optimizer="levenberg_marquardt")
         assert kinds() == 2 * [ThesisFeatures]
-        peer.change(thesis__smoothing=[3.0, 1.0])
+        peer.change(thesis__operator="canny")
         assert kinds() == []
         peer.publish(street[4])
         assert [len(f.own.image_edges) for f in peer.recalibrator.buffer] == [2]

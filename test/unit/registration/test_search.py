@@ -16,7 +16,7 @@ from calib_ros import se3
 from calib_ros.config import Config, ScoreConfig, SearchConfig, update
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import ConfigError
-from calib_ros.registration.acceptance.significance import check_uncertainty
+from calib_ros.registration.acceptance.checks import check_uncertainty
 from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import SILENT, Progress

@@ -11,6 +11,7 @@ import pytest
 from masks_of_pictures import assert_lies_on_edges, frame_of, later
 from onnx_graphs import segmentation
 from scenes import RenderedDrive
+from thesis_constants import with_constants
 
 from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.errors import BudgetError
@@ -283,8 +284,8 @@ def test_a_share_of_masks_is_blended_in_before_the_blur(frame: Frame, edges_of: 
 def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, share: float) -> None:
     assert CLASS_EDGE_SHARE == 0.1
     semantics = {"image_classes": "source", "cloud_classes": "source"}
-    thesis = {"semantic_share": 0.2}
-    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics, "thesis": thesis})
+    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics})
+    config = with_constants(config, semantic_share=0.2)
     calibrator = Calibrator(frame.camera, config)
     seen = replace(calibrator.segmentation(frame), edges_of=edges_of)
     assert semantic_share(thesis_of(config), edges_of) == share
