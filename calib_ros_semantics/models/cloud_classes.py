@@ -14,9 +14,9 @@ from calib_ros.frame import UNLABELLED, Frame, PointCloud
 from calib_ros.lidar.range_image import reflectivity
 from calib_ros.lidar.rings import azimuth_step, ring_of_points
 from calib_ros_semantics.models import labels
-from calib_ros_semantics.models.class_output import ClassOutput, InputImage
+from calib_ros_semantics.models.class_output import ClassOutput
 from calib_ros_semantics.models.labels import SQUEEZESEG, Classes
-from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, SegmentationModel, Tensor
+from calib_ros_semantics.models.onnx_model import Array, Deadline, InputImage, OnnxModel, SegmentationModel, Tensor
 
 Statistics = Mapping[str, tuple[float, float]]  # mean and standard deviation of each channel
 CONVENTIONS = (

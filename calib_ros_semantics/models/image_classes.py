@@ -9,8 +9,17 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.frame import Frame
 from calib_ros_semantics.models import labels
 from calib_ros_semantics.models.class_borders import PixelClasses, borders_of_classes, borders_of_scores
-from calib_ros_semantics.models.class_output import ClassOutput, InputImage
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, SegmentationModel, fitted, to_rgb
+from calib_ros_semantics.models.class_output import ClassOutput
+from calib_ros_semantics.models.onnx_model import (
+    Array,
+    Deadline,
+    InputImage,
+    Normalisation,
+    OnnxModel,
+    SegmentationModel,
+    fitted,
+    to_rgb,
+)
 from calib_ros_semantics.models.tiles import Tiling
 
 # Exports by the name that a YAML may give as 'family:' (lower case) and as shown.

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -114,6 +114,33 @@ class Tensor:
     def __str__(self) -> str:
         sizes = "x".join("?" if n is None else str(n) for n in self.shape) or "scalar"
         return f"{self.name} {np.dtype(self.dtype).name} {sizes}"
+
+
+class InputImage(NamedTuple):
+    """The input of a network that takes an image: its tensor, axis of the channels, and their number."""
+
+    tensor: Tensor
+    axis: int
+    channels: int
+
+    @staticmethod
+    def of(tensors: Sequence[Tensor], counts: Sequence[int]) -> InputImage | None:
+        """The only one of the tensors that takes one image of so many channels, first or last; None if there is no such one."""
+        found = []
+        for tensor in tensors:
+            shape, first = tensor.shape, len(tensor.shape) - 3
+            if not shape:  # unknown rank: the usual layout
+                found.append(InputImage(tensor, 1, counts[0]))
+            elif len(shape) == 3 or (len(shape) == 4 and shape[0] in (None, 1)):
+                axis = next((axis for axis in (first, len(shape) - 1) if shape[axis] in counts), first)
+                if shape[axis] in (*counts, None):
+                    found.append(InputImage(tensor, axis, shape[axis] or counts[0]))
+        return found[0] if len(found) == 1 else None
+
+    def arranged(self, image: NDArray[Any]) -> Array:
+        """An image (h, w, channels) as the network takes it."""
+        batch = image if len(self.tensor.shape) == 3 else image[None]
+        return np.ascontiguousarray(np.moveaxis(batch, -1, self.axis), self.tensor.dtype)
 
 
 @dataclass(frozen=True)

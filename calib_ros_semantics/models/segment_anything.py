@@ -20,7 +20,7 @@ from calib_ros_semantics.models.masks import (
     accepted_masks,
     without_duplicates,
 )
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, Tensor, to_rgb
+from calib_ros_semantics.models.onnx_model import Array, Deadline, InputImage, Normalisation, OnnxModel, Tensor, to_rgb
 
 Points = NDArray[np.float64]
 DEFAULT_SIDE = 1024  # px; size the models were trained at, and the default of graphs of dynamic size
@@ -78,16 +78,17 @@ class Encoder:
         """efficient: whether the decoder is that of EfficientSAM."""
         self.model = model
         features = sum(len(t.shape) == 4 for t in model.outputs)
-        if len(model.inputs) != 1 or not _is_picture(model.inputs[0]) or not features:
+        found = InputImage.of(model.inputs, (3,))
+        if found is None or len(model.inputs) != 1 or not features:
             raise model.error("this is no encoder, which takes a picture and gives an embedding")
-        self.input = model.inputs[0]
-        self._channels_last = self.input.shape[-1] == 3 and self.input.shape[-3] != 3
+        self._input, self._size = found, model.size_of(found.tensor, found.axis)
+        self._channels_last = found.axis == len(found.tensor.shape) - 1
         self.family = declared_family(model)
         if self.family and self.family not in FAMILIES:
             raise model.error(f"family '{self.family}' in its YAML is unknown; known are {', '.join(FAMILIES)}, fastsam")
         if not self.family:
-            self.family = "samexporter" if self._channels_last or np.issubdtype(self.input.dtype, np.integer) else "sam"
-            if efficient or self.input.name.startswith("batched"):
+            self.family = "samexporter" if self._channels_last or np.issubdtype(found.tensor.dtype, np.integer) else "sam"
+            if efficient or found.tensor.name.startswith("batched"):
                 self.family = "efficientsam"
             elif features >= 3:
                 self.family = "sam2"
@@ -101,8 +102,7 @@ class Encoder:
         inner = _scaled((height, width), min(size[0] / height, size[1] / width)) if self._padded else size
         whole = np.zeros((*size, 3), np.float32)
         whole[: inner[0], : inner[1]] = self.normalised(to_rgb(image, inner, self.model.sidecar.channels == "bgr"))
-        tensor = whole if self._channels_last else whole.transpose(2, 0, 1)
-        outputs = self.model.run({self.input.name: tensor if len(self.input.shape) == 3 else tensor[None]}, deadline)
+        outputs = self.model.run({self._input.tensor.name: self._input.arranged(whole)}, deadline)
         features = dict(zip((t.name for t in self.model.outputs), outputs, strict=True))
         coarsest = min((a.shape[-2:] for a in outputs if a.ndim == 4), key=lambda s: s[0] * s[1])
         frame = float(CELL_PX * coarsest[0]), float(CELL_PX * coarsest[1])
@@ -112,9 +112,7 @@ class Encoder:
 
     def _input_size(self, height: int, width: int) -> tuple[int, int]:
         """Height and width of the input for an image of this size."""
-        if self.model.sidecar.size:
-            return self.model.sidecar.size
-        rows, columns = self.input.shape[-3:-1] if self._channels_last else self.input.shape[-2:]
+        rows, columns = self._size
         if rows and columns:
             return rows, columns
         if self._own_pixels:
@@ -351,12 +349,6 @@ def declared_family(model: OnnxModel) -> str:
 def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
     height, width = (max(int(n * factor + 0.5), 1) for n in size)
     return height, width
-
-
-def _is_picture(tensor: Tensor) -> bool:
-    shape = tensor.shape
-    channels = shape[-3::2] if len(shape) in (3, 4) else ()  # first or last after the batch
-    return 3 in channels or (len(shape) == 4 and shape[1] is None)
 
 
 def _coarse(size: tuple[float, float]) -> tuple[int, int]:
