@@ -32,7 +32,7 @@ from calib_ros.datasets.bag_writer import DESCRIPTION, write_rig_bag
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.pacing import Work
 from calib_ros.ros.bags import message_class
-from calib_ros.ros.tf import LATCHED
+from calib_ros.ros.dds import LATCHED
 from calib_ros_synthetic.rig import SyntheticRig
 
 DRIVE = "synthetic:rig=six_cameras_two_lidars,seed=3,frames=4,width=480,clocks=0,speed=4"
