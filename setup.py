@@ -27,8 +27,8 @@ EXTRAS = {
     "fleet": ["Jinja2", "pyarrow"],
     # `calib-ros view`: the page in the browser.
     "view": ["nicegui"],
-    # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
-    "evaluation": ["Jinja2", "matplotlib"],
+    # `calib-ros evaluate` and `calib-ros steps`: reports, tables, pages and plots.
+    "evaluation": ["Jinja2", "matplotlib", "pandas"],
 }
 EXTRAS["all"] = sorted({library for libraries in EXTRAS.values() for library in libraries})
 EXTRAS |= {
