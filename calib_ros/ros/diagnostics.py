@@ -17,11 +17,10 @@ from calib_ros.config.sensors import REFINE
 from calib_ros.errors import defect, raised_at
 from calib_ros.extensions import NodeService
 from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, RefinedCamera
-from calib_ros.online.events import ExtrinsicUpdated, Problem
+from calib_ros.online.events import ExtrinsicUpdated, Problem, QuietLog
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
 from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
-from calib_ros.online.quiet_log import QuietLog
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
 from calib_ros.ros.publishers import STARVED
