@@ -27,8 +27,8 @@ EXTRAS = {
     "fleet": ["Jinja2", "pyarrow"],
     # `calib-ros view`: the page in the browser.
     "view": ["nicegui"],
-    # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
-    "evaluation": ["Jinja2", "matplotlib"],
+    # `calib-ros evaluate` and `calib-ros steps`: reports, tables, pages and plots.
+    "evaluation": ["Jinja2", "matplotlib", "pandas"],
 }
 EXTRAS["all"] = sorted({library for libraries in EXTRAS.values() for library in libraries})
 EXTRAS |= {
@@ -92,7 +92,7 @@ setup(
     packages=find_packages(include=[pattern for name in PACKAGES for pattern in (name, f"{name}.*")]),
     package_data={name: ["py.typed"] for name in PACKAGES}
     | {
-        f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/*.yaml", "models/weights/LICENSE"],
+        f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/LICENSE"],
         f"{PACKAGE}_thesis": ["py.typed", "presets/*.yaml"],
     },
     data_files=[

@@ -7,7 +7,7 @@ The core imports none of them. What is not installed is missing as if it had nev
 ``calib_ros.sources``             a kind of dataset, opened as ``NAME`` or ``NAME:...``: a callable, text -> `Source`; with
                                   the camera, name or number, as second argument where one is asked for
 ``calib_ros.rigs``                one of several sensors, opened likewise: a callable, text -> `RecordedRig`, None = a pair
-``calib_ros.objectives``          a score by the name of ``refine.objective``: an `ObjectiveKind` of registration/objective.py
+``calib_ros.objectives``          a score by the name of ``refine.objective``: an `ObjectiveKind` of registration/features.py
 ``calib_ros.classes``             what recognises classes of points and pixels: a `ClassModels` of registration/classes.py
 ``calib_ros.stages``              a stage of the configuration: a frozen dataclass made with `calib_ros.config.options`
 ``calib_ros.presets``             configurations by one word: the YAML files that they are made of, in this order

@@ -17,7 +17,7 @@ from calib_ros.config.sensors import REFINE
 from calib_ros.errors import defect, raised_at
 from calib_ros.extensions import NodeService
 from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, RefinedCamera
-from calib_ros.online.events import ExtrinsicUpdated, Notice, Problem
+from calib_ros.online.events import ExtrinsicUpdated, Problem
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
 from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
@@ -89,9 +89,7 @@ class Health(NodeService):
         if isinstance(event, ExtrinsicUpdated):
             self._add_extrinsic(event.extrinsic)
         elif isinstance(event, Problem):
-            self.error(event.message, event.kind)
-        elif isinstance(event, Notice):
-            self.note(event.message, event.kind)
+            (self.note if event.solved else self.error)(event.message, event.kind)
 
     def _add_extrinsic(self, extrinsic: Extrinsic) -> None:
         before, self.extrinsic = self.extrinsic, extrinsic
@@ -225,7 +223,7 @@ class Diagnostics:
             "the newest of them": gate.last_rejection or "none",
             "motion from scans": _motion(recalibrator),
             "keyframes left out, motion unknown": str(recalibrator.motion.left_out if recalibrator else 0),
-            "semantics": recalibrator.segmenter.describe(recalibrator.segmentation) if recalibrator else "none yet",
+            "semantics": recalibrator.describe_semantics() if recalibrator else "none yet",
             "worker load": f"{intake + estimates:.2f}",
             "estimate load": f"{estimates:.2f}",
             **self._budget(),
