@@ -117,26 +117,7 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats) -> Motion:
             return Motion(None, "the alignment of the scans diverged")
         # T_before_now of a LiDAR with a constant twist is exp(twist gap).
         twist = se3.log(T) / gap_s
-    return _validated(twist, found, len(scan[0]))
-
-
-def align(target: Floats, source: Floats, T: Floats, reach_m: float) -> Any:
-    """small_gicp's result of GICP from T_target_source (4, 4): points (n, 3) m, matched up to reach_m apart. Its H is of a right
-    twist. Raises MissingDependencyError without the library."""
-    gicp = _library()
-    clouds = [gicp.PointCloud(points) for points in (target, source)]
-    trees = [gicp.KdTree(cloud, 1) for cloud in clouds]
-    for cloud, tree in zip(clouds, trees, strict=True):
-        gicp.estimate_covariances(cloud, tree, NEIGHBOURS, 1)
-    # One thread: sums in another order would make results differ from run to run.
-    return gicp.align(
-        *clouds, trees[0], init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach_m,
-        num_threads=1, max_iterations=30, rotation_epsilon=MIN_STEP, translation_epsilon=MIN_STEP,
-    )  # fmt: skip
-
-
-def _validated(twist: Floats, found: Any, n: int) -> Motion:
-    matched = found.num_inliers / n
+    matched = found.num_inliers / len(scan[0])
     speed, rate = float(np.linalg.norm(twist[3:])), float(np.linalg.norm(twist[:3]))
     curvature = float(np.linalg.eigvalsh(found.H[3:, 3:])[0]) / max(found.num_inliers, 1)
     problem = ""
@@ -151,9 +132,19 @@ def _validated(twist: Floats, found: Any, n: int) -> Motion:
     return Motion(None if problem else twist, problem, matched)
 
 
-def _library() -> Any:
+def align(target: Floats, source: Floats, T: Floats, reach_m: float) -> Any:
+    """small_gicp's result of GICP from T_target_source (4, 4): points (n, 3) m, matched up to reach_m apart. Its H is of a right
+    twist. Raises MissingDependencyError without the library."""
     try:
-        import small_gicp
+        import small_gicp as gicp
     except ImportError:
         raise MissingDependencyError(MISSING) from None
-    return small_gicp
+    clouds = [gicp.PointCloud(points) for points in (target, source)]
+    trees = [gicp.KdTree(cloud, 1) for cloud in clouds]
+    for cloud, tree in zip(clouds, trees, strict=True):
+        gicp.estimate_covariances(cloud, tree, NEIGHBOURS, 1)
+    # One thread: sums in another order would make results differ from run to run.
+    return gicp.align(
+        *clouds, trees[0], init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach_m,
+        num_threads=1, max_iterations=30, rotation_epsilon=MIN_STEP, translation_epsilon=MIN_STEP,
+    )  # fmt: skip

@@ -142,8 +142,12 @@ def isolated_returns(ranges: Ranges) -> Mask:
     for aside in (-2, 2):
         diagonal |= _near(R, ranges[row, (column + aside) % columns], own)
     left, right = ranges[row, (column + 1) % columns], ranges[row, (column - 1) % columns]
+    middle, step = (
+        0.5 * (1 / left + 1 / right),
+        np.abs(1 / left - 1 / right),
+    )  # inverse ranges: linear on a plane, in small angles
     with np.errstate(invalid="ignore"):
-        mixed = ((left - R) * (right - R) < 0) & ~_on_one_plane(R, left, right)
+        mixed = ((left - R) * (right - R) < 0) & ~(np.abs(1 / R - middle) < 0.2 * step)
     alone[row, column] = ~upright & (mixed | ~diagonal)
     return alone
 
@@ -173,7 +177,10 @@ def _from_rings(
     hit = index >= 0
     ranges[hit] = distance[index[hit]]
     index[isolated_returns(ranges)] = -1
-    _fill_single_holes(ranges)
+    left, right = np.roll(ranges, 1, 1), np.roll(ranges, -1, 1)
+    with np.errstate(invalid="ignore"):
+        hole = np.isnan(ranges) & (np.abs(left - right) < HOLE_JUMP)
+    ranges[hole] = 0.5 * (left[hole] + right[hole])
     cones = ring_cones(row, own, len(row_elevation))
     return RangeImage(ranges, index, row_elevation, step, cloud, reflectivity(cloud.intensity), cones, None, pose)
 
@@ -188,13 +195,6 @@ def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> 
     row_of_name = np.empty(len(names), np.int32)
     row_of_name[from_top] = np.arange(len(names), dtype=np.int32)
     return row_of_name[np.searchsorted(names, ring)], medians[from_top]
-
-
-def _fill_single_holes(ranges: NDArray[np.float32]) -> None:
-    left, right = np.roll(ranges, 1, 1), np.roll(ranges, -1, 1)
-    with np.errstate(invalid="ignore"):
-        hole = np.isnan(ranges) & (np.abs(left - right) < HOLE_JUMP)
-    ranges[hole] = 0.5 * (left[hole] + right[hole])
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,12 +322,6 @@ def _fill(ranges: Ranges) -> None:
 def _near(a: Ranges, b: Ranges, limit: Ranges) -> Mask:
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(a - b) < limit)
-
-
-def _on_one_plane(R: Ranges, left: Ranges, right: Ranges) -> Mask:
-    """Whether three neighbours lie on one plane, along which the inverse range is linear in small angles."""
-    middle, step = 0.5 * (1 / left + 1 / right), np.abs(1 / left - 1 / right)
-    return np.asarray(np.abs(1 / R - middle) < 0.2 * step)
 
 
 def _too_few(usable: int) -> TooFewFeaturesError:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.scanner_pose import CLOUD_FRAME, RingFit, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit, stays
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit, stays
 
 Angles = NDArray[np.floating]
 MIN_RINGS, MAX_RINGS = 4, 256
@@ -56,8 +56,10 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
     if len(xyz) < FEWEST_POINTS:
         return ring, CLOUD_FRAME
     known = None if ring is None else ring_fit(xyz, ring)
-    if ring is not None and known is not None and (_in_own_frame(known) or stays(xyz, ring, MUCH_SHARPER * known.spread)):
-        return ring, CLOUD_FRAME
+    if ring is not None and known is not None:
+        in_own_frame = known.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * known.spacing)
+        if in_own_frame or stays(xyz, ring, MUCH_SHARPER * known.spread):
+            return ring, CLOUD_FRAME
     for candidate, apart in ((_ring_field(cloud), FIELD_APART), (_runs(*angles(xyz)), RUNS_APART)):
         if candidate is not None:
             fit = fitted_pose(xyz, candidate)
@@ -70,10 +72,6 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
         if rough is not None:
             return _settled(replace(cloud, ring=None), rough) or (None, rough)  # its ring numbers are none
     return ring, CLOUD_FRAME
-
-
-def _in_own_frame(fit: RingFit) -> bool:
-    return fit.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * fit.spacing)
 
 
 def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], ScannerPose] | None:
@@ -169,7 +167,13 @@ def _best_runs(
     azimuth: Angles, sign: float, starts: Sequence[float], cost: Callable[[NDArray[np.int32]], float], limit: float
 ) -> NDArray[np.int32] | None:
     """Of the runs of azimuths that begin at each of the starts, those of the least cost below the limit."""
-    tried = [ring for start in starts if (ring := _runs_from(start, sign, azimuth)) is not None]
+    tried = []
+    for start in starts:
+        angle = np.mod(sign * (azimuth - start), 2 * np.pi)
+        span = float(np.ptp(angle))
+        ring = np.concatenate([[0], np.cumsum(np.diff(angle) < -0.5 * span)]).astype(np.int32)
+        if MIN_RINGS <= int(ring[-1]) + 1 <= MAX_RINGS and span >= 0.1:
+            tried.append(ring)
     least, best = min(((cost(ring), k) for k, ring in enumerate(tried)), default=(np.inf, 0))
     return tried[best] if least < limit else None
 
@@ -180,14 +184,6 @@ def _turns(azimuth: Angles) -> tuple[Angles | None, float]:
     turn -= (2 * np.pi * np.rint(turn / (2 * np.pi))).astype(turn.dtype)
     sign = 1.0 if np.count_nonzero(turn > 0) >= np.count_nonzero(turn < 0) else -1.0
     return (None if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn) else turn), sign
-
-
-def _runs_from(start: float, sign: float, azimuth: Angles) -> NDArray[np.int32] | None:
-    """Number (n,) of the run of azimuths that begin at `start` and turn by `sign`; None if there are too few or too many."""
-    angle = np.mod(sign * (azimuth - start), 2 * np.pi)
-    span = float(np.ptp(angle))
-    ring = np.concatenate([[0], np.cumsum(np.diff(angle) < -0.5 * span)]).astype(np.int32)
-    return ring if MIN_RINGS <= int(ring[-1]) + 1 <= MAX_RINGS and span >= 0.1 else None
 
 
 def _cut(azimuth: Angles, step: Angles, turn: float) -> float:
@@ -211,7 +207,11 @@ def rings_by_elevation(xyz: NDArray[np.floating], elevation: Angles) -> NDArray[
     peaks. xyz: (n, 3) m."""
     sample = xyz[:: max(len(xyz) // HISTOGRAM_POINTS, 1)].astype(np.float64)
     distance, height = np.hypot(sample[:, 0], sample[:, 1]), sample[:, 2]
-    sharp = [_histogram_sharpness(np.arctan2(height - z, distance)) for z in APEX_HEIGHTS]
+    sharp = []
+    for z in APEX_HEIGHTS:
+        count = np.bincount(((np.arctan2(height - z, distance) + np.pi / 2) / HISTOGRAM_BIN).astype(np.intp))
+        smooth = np.convolve(count, [0.25, 0.5, 0.25])  # a ring on the border of two bins is as sharp as one within a bin
+        sharp.append(float((smooth**2).sum()))
     best = int(np.argmax(sharp))
     if sharp[best] < MIN_SHARPENING * sharp[len(APEX_HEIGHTS) // 2]:
         return _histogram_peaks(elevation)
@@ -259,12 +259,6 @@ def _ring_spread(ring: NDArray[np.int32], elevation: Angles) -> float:
     mean = np.bincount(ring, elevation) / np.maximum(count, 1)
     deviation = np.bincount(ring, np.abs(elevation - mean[ring])) / np.maximum(count, 1)
     return float(np.median(np.repeat(deviation, count)))
-
-
-def _histogram_sharpness(elevation: Angles) -> float:
-    count = np.bincount(((elevation + np.pi / 2) / HISTOGRAM_BIN).astype(np.intp))
-    smooth = np.convolve(count, [0.25, 0.5, 0.25])  # a ring on the border of two bins is as sharp as one within a bin
-    return float((smooth**2).sum())
 
 
 def _histogram_peaks(elevation: Angles) -> NDArray[np.int32] | None:

@@ -117,8 +117,13 @@ def noise_covariance(score: PointScore, T: Transform, level: int, axes: NDArray[
     units = np.outer(UNKNOWN[axes], UNKNOWN[axes])
     scale = score.at(level).linearise(T)[1][np.ix_(axes, axes)] * units
     least = USUAL_NOISE / len(score.frames)
-    bread = units * _inverse(curvature(score, T, level)[np.ix_(axes, axes)] * units, scale, least)
-    return bread * (noise_level(score, T, level, bread, axes) if noise is None else noise)
+    # The inverse of a curvature that may be indefinite: its eigenvalues relative to the scale rise to LEAST_CURVATURE.
+    values, vectors = np.linalg.eigh(scale)
+    root = vectors / np.sqrt(np.maximum(values, 0) + least)
+    values, vectors = np.linalg.eigh(root.T @ (curvature(score, T, level)[np.ix_(axes, axes)] * units) @ root)
+    half = root @ vectors
+    bread = units * ((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)
+    return np.asarray(bread * (noise_level(score, T, level, bread, axes) if noise is None else noise))
 
 
 def noise_level(score: PointScore, T: Transform, level: int, bread: Matrix, axes: NDArray[np.intp]) -> float:
@@ -128,7 +133,9 @@ def noise_level(score: PointScore, T: Transform, level: int, bread: Matrix, axes
     bread: inverse curvature (k, k) of the axes (k,). Frames of one place count as fewer.
     """
     frames = score.frames
-    cell = np.searchsorted(frames, score.frame) * REGIONS + _regions(score, T)
+    p = T[:3, :3] @ score.points + T[:3, 3:]
+    region = share_of_weight(np.arctan2(p[0], p[2]), score.weights, REGIONS)  # from left to right in the image
+    cell = np.searchsorted(frames, score.frame) * REGIONS + region
     J = (score.jacobian(T, level % score.n_levels) * score.weights)[axes]
     slopes = np.stack([np.bincount(cell, row, len(frames) * REGIONS) for row in J], axis=1)
     cells = int(np.count_nonzero(np.bincount(cell)))
@@ -154,12 +161,6 @@ def effective_frames(score: PointScore) -> float:
         return float(len(frames))
     correlation = score.atlas.correlation(min(DUPLICATE_LEVEL, score.n_levels - 1))
     return float(len(frames) ** 2 / correlation[np.ix_(frames, frames)].sum())
-
-
-def _regions(score: PointScore, T: Transform) -> NDArray[np.intp]:
-    """Region (n,) of every point, 0..REGIONS - 1 from left to right in the image."""
-    p = T[:3, :3] @ score.points + T[:3, 3:]
-    return share_of_weight(np.arctan2(p[0], p[2]), score.weights, REGIONS)
 
 
 def share_of_weight(values: Matrix, weights: NDArray[np.float32], parts: int) -> NDArray[np.intp]:
@@ -245,12 +246,3 @@ def _information(covariance: Covariance) -> Matrix:
     free = free_axes(covariance)
     sigma = np.where(free, np.sqrt(np.maximum(np.diag(covariance), LEAST_VARIANCE)), np.inf)
     return np.asarray(np.linalg.pinv(covariance / np.outer(sigma, sigma), rcond=1e-12, hermitian=True) / np.outer(sigma, sigma))
-
-
-def _inverse(H: Matrix, scale: Matrix, least: float) -> Matrix:
-    """Inverse of a curvature that may be indefinite: its eigenvalues relative to `scale` plus `least` rise to LEAST_CURVATURE."""
-    values, vectors = np.linalg.eigh(scale)
-    root = vectors / np.sqrt(np.maximum(values, 0) + least)
-    values, vectors = np.linalg.eigh(root.T @ H @ root)
-    half = root @ vectors
-    return np.asarray((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)

@@ -38,7 +38,7 @@ from calib_ros.registration.objective import Objective, penalised, trust_region
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, UNDOUBTED_Z, null_extrinsics, p_value
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.constraints import NEARLY, SearchBox
 from calib_ros.registration.search.search import SearchResult, search_decoy
 from calib_ros.result import Evidence, RefusalCode, Result
 
@@ -85,9 +85,12 @@ class Acceptance:
         if wrong is not None:
             return wrong
         reached, region = found.alignment.T, limits.trust_region
-        if region is not None and limits.at_trust_region(reached):  # at its end the score still rises
-            off = se3.error(found.initial, reached)
-            return too_far_from_start(*off, float(np.rad2deg(region.half[0])), float(region.half[3]))
+        # At its end the score still rises: no optimum, or one that the start does not justify.
+        if region is not None:
+            moved = np.abs(se3.log(reached @ se3.inverse(region.T)))
+            if (moved >= NEARLY * region.half)[limits.open_axes].any():
+                off = se3.error(found.initial, reached)
+                return too_far_from_start(*off, float(np.rad2deg(region.half[0])), float(region.half[3]))
         wrong = self._check_match(found)
         # Only of a search: a refinement has a start to rely on, and is fused with it. What intrinsics and clocks leave open is
         # not asked: more scenes would not help.

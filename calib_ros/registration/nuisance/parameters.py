@@ -16,6 +16,7 @@ from scipy.special import ndtr, stdtr
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.intrinsics import IntrinsicEstimate
 from calib_ros.registration.acceptance.refusal import Refusal, left_open
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.covariance import NO_NOISE, REGIONS, effective_frames, noise_covariance, noise_level
@@ -143,6 +144,12 @@ class NuisanceEstimate:
     def is_observable(self) -> bool:
         """Whether the scenes tell more of it than is known in advance."""
         return self.sigma < self.parameter.sigma
+
+    @property
+    def in_files(self) -> IntrinsicEstimate:
+        """The same in the unit of files."""
+        unit = self.parameter.unit
+        return IntrinsicEstimate(unit * self.value, unit * self.sigma, self.is_observable)
 
     @property
     def deviations(self) -> float:

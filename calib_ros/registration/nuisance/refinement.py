@@ -227,12 +227,39 @@ def joint_optimum(
 
 
 def _spread(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
-    """Covariance (n, n) of a change at the optimum T (4, 4), and the twist of the extrinsic (6, n) per unit of it."""
-    H, directions = _profile(joint, T, change, top)
-    known = 1 / np.sqrt(joint.advance.information(change))
+    """Covariance (n, n) of a change at the optimum T (4, 4), and the twist of the extrinsic (6, n) per unit of it: by how the
+    score bends down around it, the extrinsic refined anew for each, by differences of STEP, without the prior of the change."""
+    n = len(change)
+
+    def costs(T: Transform, change: Matrix) -> tuple[float, float]:
+        """Of both priors together, and of that of the extrinsic."""
+        prior = joint.prior.value(T) if joint.prior else 0.0
+        return joint.known(change)[0] + prior, prior
+
+    def at(off: Matrix, begin: Transform) -> tuple[Matrix, float]:
+        end, _, value = joint.ascend(begin, change + off, NEAR_LEVELS, np.zeros(n, bool))
+        both, prior = costs(end, change + off)
+        return end, value + both - prior
+
+    axes, H, directions = STEP * np.eye(n), np.zeros((n, n)), np.zeros((6, n))
+    both, prior = costs(T, change)
+    top += both - prior
+    for k in range(n):
+        (ahead, high), (behind, low) = (at(sign * axes[k], T) for sign in (1, -1))
+        directions[:, k] = np.where(joint.limits.open_axes, se3.log(ahead @ se3.inverse(behind)), 0.0) / (2 * STEP)
+        H[k, k] = (2 * top - high - low) / STEP**2
+    for i, j in combinations(range(n), 2):
+        off = axes[i] + axes[j]
+        ends = [at(sign * off, se3.exp(sign * directions @ off) @ T)[1] for sign in (1, -1)]
+        along = (2 * top - sum(ends)) / STEP**2
+        H[i, j] = H[j, i] = 0.5 * (along - H[i, i] - H[j, j])
+    known, camera = 1 / np.sqrt(joint.advance.information(change)), joint.score.camera
     values, vectors = np.linalg.eigh(H / joint.noise * np.outer(known, known))
     covariance = (vectors / (np.maximum(values, 0) + 1)) @ vectors.T * np.outer(known, known)  # bent upward, it tells nothing
-    covariance += np.diag(_systematic(joint.score.camera, joint.parameters) ** 2)
+    # What shifts the border of the image as far as the systematic error of a rotation does.
+    px = SYSTEMATIC_ERROR[0] * camera.K[0, 0]
+    systematic = np.array([px / camera.width * (1.0 if own.name in CENTRE else 2.0) for own in joint.parameters])
+    covariance += np.diag(systematic**2)
     return 0.5 * (covariance + covariance.T), directions
 
 
@@ -264,39 +291,3 @@ def _turned(T: Transform, change: Matrix, camera: Camera, parameters: Sequence[L
             angle = value * camera.width / camera.K[0, 0]
             turn[:2] += (0.0, -angle) if own.name == CENTRE[0] else (angle, 0.0)
     return np.asarray(se3.exp(turn) @ T)
-
-
-def _profile(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
-    """How the score bends down (n, n) around a change, the extrinsic refined anew for each, by differences of STEP, without the
-    prior of the change; and the twist of the extrinsic (6, n) per unit of each."""
-    n = len(change)
-
-    def costs(T: Transform, change: Matrix) -> tuple[float, float]:
-        """Of both priors together, and of that of the extrinsic."""
-        prior = joint.prior.value(T) if joint.prior else 0.0
-        return joint.known(change)[0] + prior, prior
-
-    def at(off: Matrix, begin: Transform) -> tuple[Matrix, float]:
-        end, _, value = joint.ascend(begin, change + off, NEAR_LEVELS, np.zeros(n, bool))
-        both, prior = costs(end, change + off)
-        return end, value + both - prior
-
-    axes, H, directions = STEP * np.eye(n), np.zeros((n, n)), np.zeros((6, n))
-    both, prior = costs(T, change)
-    top += both - prior
-    for k in range(n):
-        (ahead, high), (behind, low) = (at(sign * axes[k], T) for sign in (1, -1))
-        directions[:, k] = np.where(joint.limits.open_axes, se3.log(ahead @ se3.inverse(behind)), 0.0) / (2 * STEP)
-        H[k, k] = (2 * top - high - low) / STEP**2
-    for i, j in combinations(range(n), 2):
-        off = axes[i] + axes[j]
-        values = [at(sign * off, se3.exp(sign * directions @ off) @ T)[1] for sign in (1, -1)]
-        along = (2 * top - sum(values)) / STEP**2
-        H[i, j] = H[j, i] = 0.5 * (along - H[i, i] - H[j, j])
-    return H, directions
-
-
-def _systematic(camera: Camera, parameters: Sequence[LensParameter]) -> Matrix:
-    """Standard deviations (n,) that shift the border of the image as far as the systematic error of a rotation does."""
-    px = SYSTEMATIC_ERROR[0] * camera.K[0, 0]
-    return np.array([px / camera.width * (1.0 if own.name in CENTRE else 2.0) for own in parameters])

@@ -93,7 +93,7 @@ def search(
     another score that ranks starts of a strategy of its own.
     Deterministic for a given config.seed, whatever config.threads.
     """
-    with _workers(score, config) as workers:
+    with Workers(config.threads) as workers:
         space = SearchSpace(score, T_prior, box, config, limits, user_prior, guide, workers)
         optima = Optima(space)
         decoy_z: float | None = None
@@ -131,15 +131,10 @@ def search_decoy(
 ) -> float:
     """z-score of the best extrinsic that a round of the same search finds in a decoy, the mirrored maps: no true alignment."""
     decoy = score.mirrored()
-    with _workers(score, config) as workers:
+    with Workers(config.threads) as workers:
         optima = Optima(SearchSpace(decoy, T, box, config, limits, user_prior, workers=workers))
         optima.add_round()
         return null_distribution(decoy, optima.best()[0]).z_score
-
-
-def _workers(score: PointScore, config: SearchConfig) -> Workers:
-    """One thread where somebody watches: an observer is told of every evaluation when it is made, one after the other."""
-    return Workers(config.threads if score.observer is None else 1)
 
 
 @dataclass(frozen=True, eq=False)
