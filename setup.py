@@ -92,7 +92,7 @@ setup(
     packages=find_packages(include=[pattern for name in PACKAGES for pattern in (name, f"{name}.*")]),
     package_data={name: ["py.typed"] for name in PACKAGES}
     | {
-        f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/*.yaml", "models/weights/LICENSE"],
+        f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/LICENSE"],
         f"{PACKAGE}_thesis": ["py.typed", "presets/*.yaml"],
     },
     data_files=[

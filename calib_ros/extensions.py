@@ -43,7 +43,7 @@ class Command(Protocol):
 
 
 class NodeService:
-    """A service of the node, to be inherited from. Used on the executor's thread, but for add."""
+    """A service of the node, to be inherited from. Used on the executor's thread."""
 
     def stop(self) -> None:
         """The node ends: no thread of the service's own may go on. Called once, after the pipeline's threads have ended."""
@@ -53,9 +53,6 @@ class NodeService:
 
     def status(self) -> Any:
         """A diagnostic_msgs/DiagnosticStatus for /diagnostics, asked for every second; None = nothing to say."""
-
-    def add(self, event: Any) -> None:
-        """Any event of the pipeline (calib_ros/online/events.py); on any thread."""
 
 
 @cache

@@ -99,7 +99,7 @@ class Certify:
 
     def run(self, args: argparse.Namespace) -> int:
         """Certify and tell; the exit code."""
-        from calib_ros_check.certify.cli import certify_many
+        from calib_ros_check.fleet.cli import certify_many
 
         return certify_many(args)
 

@@ -195,7 +195,7 @@ class Calibrator:
         try:
             if models is None:
                 raise TooFewFeaturesError(self.segmentation.missing())
-            hypotheses = models.first_guess(views, self.config.guess, self.config.search.seed, method != CENTROIDS)
+            hypotheses = models.first_guess(views, self.config.search.seed, method != CENTROIDS)
         except TooFewFeaturesError as error:
             return insufficient(error, nominal(), len(features), notes)
         result, tried = best_registration(

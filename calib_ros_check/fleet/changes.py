@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from calib_ros.arrays import Covariance, Matrix
+from calib_ros.arrays import Matrix
 from calib_ros_check.fleet.sequence import Extrinsics
 
 FALSE_ALARMS = 0.001  # per recording
@@ -25,34 +25,19 @@ BATCH = 2_000_000  # numbers held at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
-    """The extrinsic changed. before, after: positions of the last recording before and the first after it, outliers left out.
-
-    value: (6,), rotation vector and shift, rad and m; covariance: (6, 6). gain: by which the division explains the two segments
-    better, to be compared with the penalty.
-    """
-
-    before: int
-    after: int
-    value: Matrix
-    covariance: Covariance
-    gain: float
-
-
-@dataclass(frozen=True, eq=False)
 class Segments:
     """What a sequence comes to.
 
     labels: (n,) number of each recording's segment, also of an outlier, which lies within it. outliers: positions. means: (k, 6)
-    and covariances: (k, 6, 6) of the segments.
+    and covariances: (k, 6, 6) of the segments. changes: positions of the last recording before each and the first after it,
+    outliers left out.
     """
 
     labels: NDArray[np.intp]
     outliers: tuple[int, ...]
     means: Matrix
     covariances: Matrix
-    changes: tuple[Change, ...]
-    penalty: float
+    changes: tuple[tuple[int, int], ...]
 
 
 def segments(sequence: Extrinsics, false_alarms: float = FALSE_ALARMS, seed: int = 0) -> Segments:
@@ -63,7 +48,7 @@ def segments(sequence: Extrinsics, false_alarms: float = FALSE_ALARMS, seed: int
     """
     n = len(sequence)
     if not n:
-        return Segments(np.zeros(0, np.intp), (), np.zeros((0, 6)), np.zeros((0, 6, 6)), (), 0.0)
+        return Segments(np.zeros(0, np.intp), (), np.zeros((0, 6)), np.zeros((0, 6, 6)), ())
     penalty = change_penalty(sequence.covariances, false_alarms, seed)
     outlier_penalty = float(chi2.isf(false_alarms, 6))
     outliers: list[int] = []
@@ -79,13 +64,9 @@ def segments(sequence: Extrinsics, false_alarms: float = FALSE_ALARMS, seed: int
     # An outlier between two segments belongs to the earlier one.
     labels = np.searchsorted(kept[starts], np.arange(n), side="right") - 1
     fits = [sums.mean(start, end) for start, end in zip(starts, ends, strict=True)]
-    changes = tuple(
-        Change(int(kept[own - 1]), int(kept[own]), fits[k + 1][0] - fits[k][0], fits[k + 1][1] + fits[k][1], gain)
-        for k, own in enumerate(starts[1:])
-        for gain in [sums.gain(starts[k], own, ends[k + 1])]
-    )
     means, covariances = (np.array(own) for own in zip(*fits, strict=True))
-    return Segments(np.maximum(labels, 0), tuple(sorted(outliers)), means, covariances, changes, penalty)
+    changes = tuple((int(kept[own - 1]), int(kept[own])) for own in starts[1:])
+    return Segments(np.maximum(labels, 0), tuple(sorted(outliers)), means, covariances, changes)
 
 
 class _Sums:

@@ -1,9 +1,11 @@
-"""What the recordings of each vehicle tell together: when its extrinsic changed, and by how much."""
+"""What is known of each recording of a fleet, and what the recordings of a vehicle tell together: when its extrinsic changed, and
+by how much."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
@@ -11,11 +13,99 @@ from scipy.special import erfcinv
 from scipy.stats import chi2
 
 from calib_ros.arrays import Covariance, Matrix
+from calib_ros.frame import NANOSECONDS
 from calib_ros_check.fleet.changes import FALSE_ALARMS, Segments, segments
-from calib_ros_check.fleet.rows import Row
+from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.fleet.sequence import Extrinsics, extrinsics, scatter
+from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.outcome import CheckVerdict
+from calib_ros_check.tolerance import AXES
 
+ERROR = "error"  # the verdict where a recording could not be checked
+# What wants attention first.
+VERDICTS = (CheckVerdict.FAIL.value, ERROR, CheckVerdict.INCONCLUSIVE.value, CheckVerdict.PASS.value)
+EARLIEST = 946_684_800 * NANOSECONDS  # 2000: what is stamped before has a clock that was never set
+UNITS = {axis: "deg" if axis[0] == "r" else "m" for axis in AXES}
+# Columns of the errors: in all, and along every axis.
+ERRORS = tuple(
+    f"{name}_{end}" for name, unit in {"rotation": "deg", "translation": "m", **UNITS}.items() for end in (unit, "low", "high")
+)
 MOST_SIGMAS = 38.0  # where probabilities end
+OWN = ("of", "result")  # of a row, no columns
+
+
+@dataclass
+class Row:
+    """What is known of a recording. None where it is not.
+
+    time_ns: of its data, or, where that is not stamped by a clock that was set, of its files. errors: by column, `*_low` and
+    `*_high` where one lies with 95 %. drift_*: against the same vehicle's recordings since its last change, before this one;
+    `drift_sigma` by how many standard deviations (of one number) that is unlikely. changed: the first recording after a change.
+    outlier: off, while those before and after it agree. of: what was checked. result: as of `CheckResult.to_dict`, empty for an
+    error.
+    """
+
+    recording: str
+    vehicle: str
+    time: str
+    verdict: str
+    cause: str | None = None
+    errors: Mapping[str, float | None] = field(default_factory=lambda: dict.fromkeys(ERRORS))
+    time_offset_s: float | None = None
+    time_offset_sigma_s: float | None = None
+    drift_deg: float | None = None
+    drift_m: float | None = None
+    drift_sigma: float | None = None
+    changed: bool = False
+    outlier: bool = False
+    frames: int = 0
+    cpu_s: float = 0.0
+    bytes_read: int = 0
+    peak_bytes: int = 0
+    message: str = ""
+    path: str = ""
+    time_ns: int = 0
+    of: Recording = field(default_factory=lambda: Recording(""))
+    result: Mapping[str, Any] = field(default_factory=dict)
+
+    def values(self) -> dict[str, Any]:
+        """By column of the tables."""
+        columns: dict[str, Any] = {}
+        for own in fields(self):
+            columns |= self.errors if own.name == "errors" else {own.name: getattr(self, own.name)}
+        return {name: value for name, value in columns.items() if name not in OWN}
+
+
+def row_of(recording: Recording, answer: Answer) -> Row:
+    """The row of a recording with its answer; what its vehicle's other recordings tell is added by `vehicles`."""
+    result: Mapping[str, Any] = answer.get("result") or {}
+    stamp = int(result.get("data_stamp") or 0)
+    time_ns = stamp if stamp >= EARLIEST else recording.modified_ns
+    row = Row(
+        recording.name,
+        recording.vehicle,
+        utc(time_ns),
+        result.get("verdict", ERROR),
+        **{name: answer[name] for name in ("cpu_s", "bytes_read", "peak_bytes") if name in answer},
+        message=answer.get("error") or result.get("reason", ""),
+        path=recording.path,
+        time_ns=time_ns,
+        of=recording,
+        result=result,
+    )
+    if result:
+        row.cause, row.frames = result["cause"], result["frames_used"]
+        row.time_offset_s, row.time_offset_sigma_s = result["time_offset_s"], result["time_offset_sigma_s"]
+        deviations = (result["rotation"], result["translation"], *result["axes"])
+        row.errors = dict(zip(ERRORS, (own[end] for own in deviations for end in ("error", "low", "high")), strict=True))
+    return row
+
+
+def utc(time_ns: int) -> str:
+    """ISO 8601 to the second; empty for 0."""
+    if not time_ns:
+        return ""
+    return datetime.fromtimestamp(time_ns // NANOSECONDS, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,46 +154,48 @@ class Vehicle:
     changes: Sequence[VehicleChange]
 
 
-def vehicles(
-    rows: Sequence[Row], results: Mapping[str, Mapping[str, Any]], false_alarms: float = FALSE_ALARMS
-) -> tuple[list[Vehicle], Matrix]:
+def vehicles(rows: Sequence[Row], false_alarms: float = FALSE_ALARMS) -> tuple[list[Vehicle], Matrix]:
     """Histories of all vehicles, by name, and the variances (6,) by which their recordings scatter, rad^2 and m^2.
 
-    rows: of all recordings; their drift, and whether they changed or are outliers, is set here. results: as of
-    `CheckResult.to_dict`, by path. false_alarms: changes reported per recording where there is none.
+    rows: of all recordings; their drift, and whether they changed or are outliers, is set here. false_alarms: changes reported
+    per recording where there is none.
     """
-    names = sorted({row.vehicle for row in rows})
-    ordered = {name: sorted((r for r in rows if r.vehicle == name), key=lambda r: (r.time_ns, r.path)) for name in names}
-    estimated = {path for path, own in results.items() if own and own["T_estimated"] and own["covariance"]}
-    known = {name: [row for row in own if row.path in estimated] for name, own in ordered.items()}
+    ordered: dict[str, list[Row]] = {name: [] for name in sorted({row.vehicle for row in rows})}
+    for row in sorted(rows, key=lambda row: (row.time_ns, row.path, row.of.key)):
+        ordered[row.vehicle].append(row)
+    known = {
+        name: [row for row in own if row.result and row.result["T_estimated"] and row.result["covariance"]]
+        for name, own in ordered.items()
+    }
     sequences = {
-        name: extrinsics(*([results[row.path][part] for row in own] for part in ("T_estimated", "covariance")))
+        name: extrinsics(*([row.result[part] for row in own] for part in ("T_estimated", "covariance")))
         for name, own in known.items()
     }
     variances = scatter(list(sequences.values()))
     out = []
-    for name in names:
+    for name, own in known.items():
         sequence = sequences[name].with_scatter(variances)
         found = segments(sequence, false_alarms)
-        _mark(known[name], sequence, found)
-        out.append(Vehicle(name, ordered[name], known[name], sequences[name], found, _changes(name, known[name], found)))
+        _mark(own, sequence, found)
+        out.append(Vehicle(name, ordered[name], own, sequences[name], found, _changes(name, own, found)))
     return out, variances
 
 
 def _changes(name: str, known: Sequence[Row], found: Segments) -> list[VehicleChange]:
     newest_is_alone = np.count_nonzero(found.labels == len(found.means) - 1) == 1
-    return [
-        VehicleChange(name, known[own.before], known[own.after], own.value, own.covariance, not (at_end and newest_is_alone))
-        for own in found.changes
-        for at_end in [own.after == len(known) - 1]
-    ]
+    out = []
+    for k, (before, after) in enumerate(found.changes):
+        value, covariance = found.means[k + 1] - found.means[k], found.covariances[k + 1] + found.covariances[k]
+        confirmed = not (after == len(known) - 1 and newest_is_alone)
+        out.append(VehicleChange(name, known[before], known[after], value, covariance, confirmed))
+    return out
 
 
 def _mark(known: Sequence[Row], sequence: Extrinsics, found: Segments) -> None:
     """Set what the others tell of each recording: its drift against those since the last change before it."""
     for k, row in enumerate(known):
         row.outlier = k in found.outliers
-        row.changed = any(change.after == k for change in found.changes)
+        row.changed = any(after == k for _, after in found.changes)
         label = found.labels[k]
         earlier = [i for i in range(k) if i not in found.outliers]
         same = [i for i in earlier if found.labels[i] == label] or [i for i in earlier if found.labels[i] == label - 1]

@@ -10,7 +10,7 @@ import resource
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from calib_ros.config import SemanticsConfig
@@ -18,34 +18,13 @@ from calib_ros.datasets.nuscenes import split_scene
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
 from calib_ros.rig.description import read_rig
+from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.recording import REFERENCE, TF, CheckOptions, check_source
 from calib_ros_check.rig.check import as_given, as_row, check_recording
 
 # What an error comes from: the recording, which stays as it is until its files change, or anything else, which is tried again.
 INPUT, OTHER = "input", "other"
-
-
-@dataclass(frozen=True)
-class CheckJob:
-    """path: the recording. fingerprint: of its files. options: of the check, see `options_key`. camera, frames: instead of those
-    of the options, where they differ between recordings."""
-
-    path: str
-    fingerprint: str
-    options: str
-    camera: str = ""
-    frames: str = ""
-
-    @property
-    def key(self) -> str:
-        """Other for a recording that has changed, and for other options."""
-        own = f"|{self.camera}|{self.frames}" if self.camera or self.frames else ""
-        return f"{self.path}|{self.fingerprint}|{self.options}{own}"
-
-    def of(self, options: CheckOptions) -> CheckOptions:
-        """Options with what is the job's own."""
-        return replace(options, camera=self.camera or options.camera, frames=self.frames or options.frames)
 
 
 def _weights(config: SemanticsConfig) -> list[str | None]:
@@ -77,51 +56,42 @@ def options_key(options: CheckOptions) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def run_checks(options: CheckOptions, jobs: Sequence[CheckJob]) -> list[Answer]:
+def run_checks(options: CheckOptions, jobs: Sequence[Recording]) -> list[Answer]:
     """Check recordings: `result` as of `CheckResult.to_dict`, or `error` and where it comes from; `cpu_s`, `bytes_read` and
-    `peak_bytes` of the process.
+    `peak_bytes` of the process, 0 where the system does not tell.
 
     Raises MissingDependencyError and ImportError only: no recording would fare better.
     """
-    return [_checked(job, job.of(options)) for job in jobs]
+    answers = []
+    for job in jobs:
+        with contextlib.suppress(OSError):  # no Linux, or forbidden: the peak is then that of all jobs until now
+            Path("/proc/self/clear_refs").write_text("5")
+        cpu, read = time.process_time(), _bytes_read()
+        answer = _checked(job, replace(options, camera=job.camera or options.camera, frames=job.frames or options.frames))
+        used = {"cpu_s": round(time.process_time() - cpu, 3), "bytes_read": _bytes_read() - read, "peak_bytes": _peak()}
+        answers.append(answer | used)
+    return answers
 
 
-def lost(jobs: Sequence[CheckJob], how: str) -> list[Answer]:
+def lost(jobs: Sequence[Recording], how: str) -> list[Answer]:
     """Answers of recordings whose workers ended."""
     advice = "out of memory? use fewer --workers, or give them more"
     return [{"error": f"the check of {job.path} did not end: {how}; {advice}", "from": OTHER} for job in jobs]
 
 
-def _checked(job: CheckJob, options: CheckOptions) -> Answer:
-    usage = Usage()
-    answer: Answer
+def _checked(job: Recording, options: CheckOptions) -> Answer:
     try:
-        found = as_row(check_recording(job.path, options)) if options.rig else check_source(job.path, options).result.to_dict()
-        answer = {"result": found}
+        if options.rig:
+            return {"result": as_row(check_recording(job.path, options))}
+        return {"result": check_source(job.path, options).result.to_dict()}
     except (MissingDependencyError, ImportError):
         raise
     except CalibrationError as error:
         if job.fingerprint and not Path(split_scene(job.path)[0]).exists():
-            answer = {"error": f"{job.path} is not there on {socket.gethostname()}; mount it on all workers", "from": OTHER}
-        else:
-            answer = {"error": str(error), "from": INPUT}
+            return {"error": f"{job.path} is not there on {socket.gethostname()}; mount it on all workers", "from": OTHER}
+        return {"error": str(error), "from": INPUT}
     except Exception as error:
-        answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}", "from": OTHER}
-    return answer | usage.since()
-
-
-class Usage:
-    """What the process has used since this object was made."""
-
-    def __init__(self) -> None:
-        with contextlib.suppress(OSError):  # no Linux, or forbidden: the peak is then that of all jobs until now
-            Path("/proc/self/clear_refs").write_text("5")
-        self._cpu, self._bytes = time.process_time(), _bytes_read()
-
-    def since(self) -> dict[str, float | int]:
-        """cpu_s, bytes_read, peak_bytes of memory; 0 where the system does not tell."""
-        used = {"cpu_s": round(time.process_time() - self._cpu, 3), "bytes_read": _bytes_read() - self._bytes}
-        return used | {"peak_bytes": _peak()}
+        return {"error": f"{type(error).__name__}: {' '.join(str(error).split())}", "from": OTHER}
 
 
 def _bytes_read() -> int:

@@ -1,29 +1,35 @@
-"""The page of a fleet: verdicts and changed vehicles first, then all recordings, then each vehicle over time."""
+"""The page of a fleet: what wants attention first, then all recordings or calibrations, then each vehicle over time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
 
+from calib_ros.errors import CalibrationError
 from calib_ros.io import write_atomically
-from calib_ros_check.fleet.history import VehicleChange
+from calib_ros_check.fleet.certificates import Certificate
+from calib_ros_check.fleet.fleet import Fleet, FleetOptions
+from calib_ros_check.fleet.history import ERROR, VERDICTS, Row, VehicleChange
 from calib_ros_check.fleet.plot import HEIGHT, LEFT, RIGHT, TOP, WIDTH, plots
-from calib_ros_check.fleet.rows import VERDICTS, Row
 from calib_ros_check.page import page_template
+from calib_ros_check.recording import CheckOptions, opened, positions_of, read_frames
+from calib_ros_check.report import DEVIATIONS, SHEET, STYLE, deviation_rows, picture_of
 from calib_ros_check.tolerance import AXES, amount, signed
-
-if TYPE_CHECKING:
-    from calib_ros_check.fleet.fleet import Fleet, FleetOptions
 
 # A browser sorts a few thousand rows at once, and draws some hundred plots; the rest is in the CSV file.
 MOST_ROWS, MOST_VEHICLES = 3000, 60
+PICTURES = 2  # of each calibration
 TOLD = 3.0  # standard deviations from which an axis of a change is named
-# Colours of verdicts, tiles and plots.
-STYLE = """\
+PLOT_SIZE = {"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": WIDTH - RIGHT, "top": TOP}
+Cell = tuple[str, object, str]  # text, value to sort by, class
+TEMPLATE = (
+    f"{{% block style %}}\n{STYLE}"
+    + """\
 :root { --pass: #1d7a3a; --fail: #b3261e; --inconclusive: #8a6d00; --error: #6b4fa0; }
 @media (prefers-color-scheme: dark) { :root { --pass: #5cc27c; --fail: #ff8a80; --inconclusive: #e0bd3c; --error: #b9a1ea; } }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(8.5rem, 1fr)); gap: .8rem; margin: 0 0 1.2rem; }
@@ -42,11 +48,72 @@ STYLE = """\
 .plots .grid-line { stroke: var(--line); } .plots .mean { stroke: var(--accent); stroke-width: 1.5; }
 .plots .change { stroke: var(--fail); stroke-dasharray: 4 3; stroke-width: 1.5; }
 .point { stroke: currentColor; fill: currentColor; } .point.outlier circle { fill: var(--card); stroke-width: 1.5; }
+.table { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
+.table .scroll { padding: 0 .9rem .8rem; max-height: 80vh; overflow: auto; }
+.table th { position: sticky; top: 0; background: var(--card); z-index: 1; padding-top: .6rem; }
+.table td.words { min-width: 80rem; } td.number { text-align: right; }
+.table td.name, .table th:first-child { position: sticky; left: 0; background: var(--card); }
+.table th:first-child { z-index: 2; }
+.table td.name { max-width: 18rem; overflow: hidden; text-overflow: ellipsis; }
+th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid var(--accent); }
+th[aria-sort=ascending] button::after { content: " ▲"; } th[aria-sort=descending] button::after { content: " ▼"; }
+@media (max-width: 600px) { .table td.name { max-width: 7.5rem; } }
+h3 { font-size: 1.1rem; margin: 2rem 0 .4rem; overflow-wrap: anywhere; }
+.verdict.error { background: var(--error); }
+.changes { list-style: none; margin: 0 0 1rem; padding: 0; }
+.changes li { background: var(--card); border: 1px solid var(--line); border-left: 6px solid var(--accent); border-radius: 8px; }
+.changes li { padding: .5rem .9rem; margin: 0 0 .5rem; overflow-wrap: anywhere; }
+.changes span { display: block; color: var(--soft); font-size: .92rem; }
+{% endblock %}
+{% block contents %}{% endblock %}
+{% macro table(rows) %}
+<div class="table"><div class="scroll"><table>
+<thead><tr>{% for name in rows[0] %}<th scope="col"><button type="button">{{ name }}</button></th>
+{% endfor %}</tr></thead><tbody>
+{% for cells in rows %}
+<tr>{% for text, value, kind in cells.values() %}<td class="{{ kind }}" data-v="{{ value }}"
+{%- if kind == "name" %} title="{{ value }}"{% endif %}>{{ text }}</td>{% endfor %}</tr>
+{% endfor %}
+</tbody></table></div></div>
+{% endmacro %}
+{% macro listed(entries) %}
+<ul class="changes">
+{% for name, said, more in entries %}<li><b>{{ name }}</b> {{ said }} <span>{{ more }}</span></li>
+{% endfor %}
+</ul>
+{% endmacro %}
+{% block main %}
+<h2 id="summary">Summary</h2>
+<div class="tiles">
+{% for kind, count, meaning in tiles %}<div class="tile {{ kind }}"><b>{{ count }}</b>{{ meaning }}</div>
+{% endfor %}
+</div>
+{% if doubtful %}{{ listed(doubtful) }}{% else %}<p>{{ nothing }}</p>{% endif %}
+<h2 id="all">All {{ what }}</h2>
+<p class="intro">Errors of the extrinsic: median, and where it lies with 95 %. Drift is against the same vehicle's recordings
+before, back to its last change. A click on a column's name sorts by it.
+{% if left_out %}{{ left_out }} more {{ what }} are in {{ csv }}.{% endif %}</p>
+{{ table(lines) }}
+<h2 id="vehicles">{{ caption }}</h2>
+<p class="intro">Plots: the extrinsic that each recording shows, against the mean of the first ones, with two standard deviations;
+in blue the mean between changes; a dashed line where it changed. Hollow: outliers.
+{% if vehicles_left_out %}{{ vehicles_left_out }} more are in {{ csv }}.{% endif %}</p>
+{% for vehicle, certificate, figures, rows, changes, recordings, pictures in vehicles %}
+<h3>{{ vehicle.name }}</h3>
+{% if certificate %}
+<p><span class="verdict {{ certificate.verdict }}">{{ certificate.verdict }}</span></p>
+<p class="said">{{ certificate.reason }}</p>
+{% endif %}
+{% if rows %}
 """
-PLOT_SIZE = {"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": WIDTH - RIGHT, "top": TOP}
-# Of a `vehicle`, its `figures` and `plot`, PLOT_SIZE.
-PLOTS = """\
-<div class="plots">
+    + DEVIATIONS
+    + """\
+{% endif %}
+<p class="intro">{{ vehicle.rows|length }} recordings, {{ vehicle.known|length }} with an estimate;
+{{ vehicle.changes|length or "no" }} change{{ "s" if vehicle.changes|length != 1 }}</p>
+{% if recordings %}{{ listed(changes) }}{{ table(recordings) }}{% endif %}
+{% if figures %}
+<figure class="wide"><div class="plots">
 {% for own in figures %}
 <svg viewBox="0 0 {{ plot.width }} {{ plot.height }}" role="img" aria-label="{{ own.axis }} of {{ vehicle.name }} over time">
 <text class="axis" x="{{ plot.left }}" y="12">{{ own.axis }}, {{ own.unit }}</text>
@@ -59,7 +126,7 @@ PLOTS = """\
 {% endfor %}
 {% for a, b, y in own.means %}<line class="mean" x1="{{ a }}" x2="{{ b }}" y1="{{ y }}" y2="{{ y }}"/>{% endfor %}
 {% for p in own.points %}
-<g class="point verdict-{{ p.verdict }}{{ ' outlier' if p.outlier }}"><title>{{ p.title }}</title>
+<g class="point verdict-{{ p.row.verdict }}{{ ' outlier' if p.row.outlier }}"><title>{{ p.title }}</title>
 <line x1="{{ p.x }}" x2="{{ p.x }}" y1="{{ p.low }}" y2="{{ p.high }}"/><circle cx="{{ p.x }}" cy="{{ p.y }}" r="2.6"/></g>
 {% endfor %}
 {% if vehicle.known[0].time %}
@@ -68,85 +135,15 @@ PLOTS = """\
 {% endif %}
 </svg>
 {% endfor %}
-</div>
-"""
-TEMPLATE = (
-    """\
-{% block style %}
-"""
-    + STYLE
-    + """\
-.sheet { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
-.sheet .scroll { padding: 0 .9rem .8rem; max-height: 80vh; overflow: auto; }
-.sheet th { position: sticky; top: 0; background: var(--card); z-index: 1; padding-top: .6rem; }
-td.words { white-space: normal; min-width: 80rem; } td.number { text-align: right; }
-#recordings td.name, #recordings th:first-child { position: sticky; left: 0; background: var(--card); }
-#recordings th:first-child { z-index: 2; }
-#recordings td.name { max-width: 12rem; overflow: hidden; text-overflow: ellipsis; }
-th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid var(--accent); }
-th[aria-sort=ascending] button::after { content: " ▲"; } th[aria-sort=descending] button::after { content: " ▼"; }
-.more { color: var(--soft); }
-@media (max-width: 600px) { #recordings td.name { max-width: 7.5rem; } }
-nav { display: none; }
-.changes { list-style: none; margin: 0 0 1rem; padding: 0; }
-.changes li { background: var(--card); border: 1px solid var(--line); border-left: 6px solid var(--accent); border-radius: 8px; }
-.changes li { padding: .5rem .9rem; margin: 0 0 .5rem; overflow-wrap: anywhere; }
-.changes span { display: block; color: var(--soft); font-size: .92rem; }
-{% endblock %}
-{% block contents %}{% endblock %}
-{% block main %}
-<h2 id="summary">Summary</h2>
-<div class="tiles">
-{% for verdict, count in counts %}<div class="tile {{ verdict }}"><b>{{ count }}</b>{{ verdict }}</div>
-{% endfor %}
-<div class="tile changed"><b>{{ changes|map(attribute="vehicle")|unique|list|length }}</b>vehicles changed</div>
-</div>
-{% if changes %}
-<ul class="changes">
-{% for change in changes %}
-<li><b>{{ change.vehicle }}</b> by {{ change|size }}
-<span>between {{ change.before.recording }}, {{ change.before.time|when }}, and {{ change.after.recording }},
-{{ change.after.time|when }}
-{%- if not change.confirmed %}; not confirmed: only the newest recording shows it{% endif %}</span></li>
-{% endfor %}
-</ul>
-{% else %}<p>No vehicle changed.</p>
+</div></figure>
 {% endif %}
-{% if outliers %}
-<p>Off, while the recordings before and after agree:
-{% for row in outliers %}{{ row.recording }} ({{ row.vehicle }}){{ ", " if not loop.last }}{% endfor %}.</p>
-{% endif %}
-<h2 id="all">Recordings</h2>
-<p class="intro">Errors of the extrinsic, with where they lie with 95 %; drift against the same vehicle's recordings before,
-back to its last change. A click on a column's name sorts by it.
-{% if left_out %}{{ left_out }} more recordings are in fleet.csv.{% endif %}</p>
-<div class="sheet"><div class="scroll"><table id="recordings">
-<thead><tr>
-{% for name in ["recording", "verdict", "vehicle", "time (UTC)", "cause", "rotation, deg", "translation, cm",
-"rx, deg", "ry, deg", "rz, deg", "tx, cm", "ty, cm", "tz, cm", "time offset, ms", "drift", "frames", "CPU, s", "read, MB",
-"memory, MB", "message"] %}
-<th scope="col"><button type="button">{{ name }}</button></th>
-{% endfor %}
-</tr></thead><tbody>
-{% for one in rows %}
-<tr>{% for text, value, kind in one|row %}<td class="{{ kind }}" data-v="{{ value }}"
-{%- if kind == "name" %} title="{{ one.path }}"{% endif %}>{{ text }}</td>{% endfor %}</tr>
-{% endfor %}
-</tbody></table></div></div>
-<h2 id="vehicles">Vehicles</h2>
-<p class="intro">The extrinsic that each recording shows, against the mean of the first ones, with two standard deviations; in
-blue the mean between changes; a dashed line where it changed. Hollow: outliers.
-{% if vehicles_left_out %}{{ vehicles_left_out }} more vehicles are in fleet.csv.{% endif %}</p>
-{% for vehicle, figures in vehicles %}
-<figure class="wide sheet">
-<figcaption><b>{{ vehicle.name }}</b>{{ vehicle.rows|length }} recordings, {{ vehicle.known|length }} with an estimate;
-{{ vehicle.changes|length or "no" }} change{{ "s" if vehicle.changes|length != 1 }}</figcaption>
-{% if figures %}
+{% if pictures %}
+<p class="intro">{{ "Before: as it comes with the data. After: as the scenes show it." if certificate.T_found is not none
+else "As it comes with the data." }} Points are coloured by depth, near ones warm.</p>
 """
-    + PLOTS
+    + SHEET
     + """\
 {% endif %}
-</figure>
 {% endfor %}
 <h2 id="how">How it was checked</h2>
 <dl>
@@ -154,9 +151,10 @@ blue the mean between changes; a dashed line where it changed. Hollow: outliers.
 {% endfor %}
 </dl>
 <script>
-document.querySelectorAll("#recordings th").forEach((head, column) => head.addEventListener("click", () => {
-  const up = head.getAttribute("aria-sort") !== "ascending", body = document.querySelector("#recordings tbody");
-  document.querySelectorAll("#recordings th").forEach(other => other.removeAttribute("aria-sort"));
+document.querySelectorAll(".table table").forEach(table => table.querySelectorAll("th").forEach((head, column) =>
+head.addEventListener("click", () => {
+  const up = head.getAttribute("aria-sort") !== "ascending", body = table.querySelector("tbody");
+  table.querySelectorAll("th").forEach(other => other.removeAttribute("aria-sort"));
   head.setAttribute("aria-sort", up ? "ascending" : "descending");
   const value = row => row.cells[column].dataset.v, rows = [...body.rows];
   const numbers = rows.every(row => value(row) === "" || !isNaN(value(row)));
@@ -167,45 +165,98 @@ document.querySelectorAll("#recordings th").forEach((head, column) => head.addEv
     return up ? order : -order;
   });
   body.append(...rows);
-}));
+})));
 </script>
 {% endblock %}
 """
 )
 
 
+def page_of_fleet() -> Any:
+    """The template. MissingDependencyError without Jinja2."""
+    return page_template(TEMPLATE)
+
+
 def write_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[str, str]) -> None:
-    """Write the page, atomically. facts: further ones for its head. MissingDependencyError without Jinja2."""
-    checks, rows, counts = options.options, fleet.rows, fleet.counts
-    shown = sorted(fleet.vehicles, key=lambda own: (not own.changes, not any(row.outlier for row in own.rows), own.name))
-    first = sorted(rows, key=lambda row: VERDICTS.index(row.verdict))[:MOST_ROWS]
-    count = len({row.vehicle for row in rows if row.verdict != "error"})  # a folder without anything readable is none
-    listed = set(map(id, first))
+    """Write the page, atomically. facts: further ones for its end. Frames that cannot be read here make no pictures."""
+    checks, rows, certificates = options.options, fleet.rows, fleet.certificates
+    tiles = [(verdict, count, verdict) for verdict, count in fleet.counts.items()]
+    if certificates:
+        what, title, caption = "calibrations", f"Certificates of {_many(len(certificates), 'calibration')}", "Calibrations"
+        lines = [_certificate_cells(own) for own in certificates]
+        doubtful = [(f"{own.vehicle.name}:", own.reason, "") for own in certificates if own.verdict != "pass"]
+        sections = [_certified(own, fleet, checks) for own in certificates[:MOST_VEHICLES]]
+    else:
+        count = len({row.vehicle for row in rows if row.verdict != ERROR})  # a folder without anything readable is none
+        what, caption = "recordings", "Vehicles"
+        title = f"Check of {_many(len(rows), 'recording')} of {_many(count, 'vehicle')}"
+        tiles.append(("changed", len({change.vehicle for change in fleet.changes}), "vehicles changed"))
+        first = {id(row) for row in sorted(rows, key=lambda row: VERDICTS.index(row.verdict))[:MOST_ROWS]}
+        lines = [_cells(row) for row in rows if id(row) in first]
+        off = "is off, while the recordings before and after agree"
+        doubtful = [*map(_told, fleet.changes), *((f"{row.recording} ({row.vehicle})", off, "") for row in rows if row.outlier)]
+        shown = sorted(fleet.vehicles, key=lambda own: (not own.changes, not any(row.outlier for row in own.rows), own.name))
+        sections = [(own, None, plots(own, fleet.variances), [], [], [], []) for own in shown[:MOST_VEHICLES]]
     page = page_of_fleet().render(
-        command="check",
-        title=f"Check of {len(rows)} recordings of {count} vehicle{'s' if count != 1 else ''}",
+        command="certify" if certificates else "check",
+        title=title,
         facts={"Tolerance": f"{checks.tolerance.deg:g} deg, {100 * checks.tolerance.m:g} cm", "Extrinsic": checks.extrinsic},
         details={**_details(fleet, options.false_alarms), **facts},
         configuration=yaml.safe_dump(checks.config.to_dict(), sort_keys=False),
-        counts=[(verdict, counts[verdict]) for verdict in ("pass", "fail", "inconclusive", "error")],
-        changes=fleet.changes,
-        outliers=[row for row in rows if row.outlier],
-        rows=[row for row in rows if id(row) in listed],
-        left_out=len(rows) - len(listed),
-        vehicles=[(own, plots(own, fleet.scatter**2)) for own in shown[:MOST_VEHICLES]],
-        vehicles_left_out=len(shown[MOST_VEHICLES:]),
+        what=what,
+        caption=caption,
+        csv=path.with_suffix(".csv").name,
+        tiles=tiles,
+        doubtful=doubtful,
+        nothing="None is doubtful." if certificates else "No vehicle changed.",
+        lines=lines,
+        left_out=len(certificates or rows) - len(lines),
+        vehicles=sections,
+        vehicles_left_out=len(fleet.vehicles) - len(sections),
         plot=PLOT_SIZE,
     )
     write_atomically(path, page.encode("utf-8", "backslashreplace"))
 
 
-def page_of_fleet() -> Any:
-    """The template. MissingDependencyError without Jinja2."""
-    return page_template(TEMPLATE, size=change_size, row=_cells, when=_when)
+def _certified(own: Certificate, fleet: Fleet, checks: CheckOptions) -> tuple[Any, ...]:
+    """What is shown of a calibration."""
+    vehicle = own.vehicle
+    figures = plots(vehicle, fleet.variances) if len(vehicle.known) > 1 else []
+    deviations = [] if own.verdict == ERROR else deviation_rows(own.judgement, checks.tolerance)
+    recordings = [_cells(row) for row in vehicle.rows] if len(vehicle.rows) > 1 else []
+    return vehicle, own, figures, deviations, [*map(_told, vehicle.changes)], recordings, pictures_of(own, checks)
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}{'s' if count != 1 else ''}"
+
+
+def pictures_of(own: Certificate, options: CheckOptions) -> list[tuple[str, bytes]]:
+    """Name and JPEG of a few frames."""
+    if own.shown is None or own.T_checked is None:
+        return []
+    job = own.shown.of
+    options = replace(options, camera=job.camera or options.camera, frames=job.frames or options.frames)
+    try:
+        source = opened(job.path, options)
+        positions = positions_of(source, options)
+        n = min(PICTURES, len(positions))
+        few = [positions[int((k + 0.5) * len(positions) / n)] for k in range(n)]
+        frames = read_frames(source, few, options.config, lambda share: None, None)[0]
+        return [(frame.name, picture_of(frame, own.T_checked, own.T_found, options.config)) for frame in frames]
+    except CalibrationError:
+        return []
 
 
 def _when(time: str) -> str:
     return time.replace("T", " ").rstrip("Z")
+
+
+def _told(change: VehicleChange) -> tuple[str, str, str]:
+    """Vehicle, size and place of a change."""
+    before, after = (f"{row.recording}, {_when(row.time)}" for row in (change.before, change.after))
+    doubt = "" if change.confirmed else "; not confirmed: only the newest recording shows it"
+    return change.vehicle, f"by {change_size(change)}", f"between {before}, and {after}{doubt}"
 
 
 def change_size(change: VehicleChange) -> str:
@@ -218,7 +269,8 @@ def change_size(change: VehicleChange) -> str:
 
 
 def _details(fleet: Fleet, false_alarms: float) -> dict[str, str]:
-    scatter = [f"{value:.2f}" for value in (*np.rad2deg(fleet.scatter[:3]), *(100 * fleet.scatter[3:]))]
+    sigmas = np.sqrt(fleet.variances)
+    scatter = [f"{value:.2f}" for value in (*np.rad2deg(sigmas[:3]), *(100 * sigmas[3:]))]
     used = [row for row in fleet.rows if row.cpu_s]
     costs = "not measured"
     if used:
@@ -236,38 +288,56 @@ def _details(fleet: Fleet, false_alarms: float) -> dict[str, str]:
     }
 
 
-def _cells(row: Row) -> list[tuple[str, object, str]]:
-    """Text, value to sort by, and class of the cells of a row."""
+def _interval(scale: float, digits: int, *known: float | None) -> Cell:
+    """An error, and where it lies with 95 %."""
+    if any(own is None or np.isnan(own) for own in known):
+        return "-", "", "number"
+    error, low, high = (scale * (own or 0.0) for own in known)
+    return f"{error:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})", error, "number"
 
-    def number(value: float | None, form: str, scale: float = 1.0) -> tuple[str, object, str]:
+
+def _verdict(verdict: str) -> Cell:
+    return verdict, VERDICTS.index(verdict), f"verdict-{verdict}"
+
+
+def _certificate_cells(own: Certificate) -> dict[str, Cell]:
+    """By caption of the column."""
+    rotation, translation = ((x.error, x.low, x.high) for x in (own.judgement.rotation, own.judgement.translation))
+    counts = {"recordings": len(own.vehicle.rows), "frames": own.frames, "changes": len(own.vehicle.changes)}
+    return {
+        "calibration": (own.vehicle.name, own.vehicle.name, "name"),
+        "verdict": _verdict(own.verdict),
+        "rotation, deg": _interval(1.0, 2, *rotation),
+        "translation, cm": _interval(100.0, 1, *translation),
+        **{name: (str(count), count, "number") for name, count in counts.items()},
+    }
+
+
+def _cells(row: Row) -> dict[str, Cell]:
+    """By caption of the column."""
+
+    def number(value: float | None, form: str, scale: float = 1.0) -> Cell:
         return ("-", "", "number") if value is None else (form.format(scale * value), scale * value, "number")
 
-    def interval(name: str, unit: str, scale: float, digits: int) -> tuple[str, object, str]:
-        known = [scale * own for end in (unit, "low", "high") if (own := row.errors[f"{name}_{end}"]) is not None]
-        if not known:
-            return ("-", "", "number")
-        error, low, high = known
-        return (f"{error:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})", error, "number")
-
-    drift = (
-        "-" if row.drift_deg is None else f"{row.drift_deg:.2f} deg, {100 * (row.drift_m or 0):.1f} cm ({row.drift_sigma:.1f} σ)"
-    )
+    sizes, drift = list(row.errors.values()), "-"
+    if row.drift_deg is not None:
+        drift = f"{row.drift_deg:.2f} deg, {100 * (row.drift_m or 0):.1f} cm ({row.drift_sigma:.1f} σ)"
     notes = " changed" if row.changed else " outlier" if row.outlier else ""
-    return [
-        (row.recording, row.recording, "name"),
-        (row.verdict, VERDICTS.index(row.verdict), f"verdict-{row.verdict}"),
-        (row.vehicle, row.vehicle, ""),
-        (_when(row.time), row.time_ns, "number"),
-        ((row.cause or "-").replace("_", " "), row.cause or "", ""),
-        interval("rotation", "deg", 1.0, 2),
-        interval("translation", "m", 100.0, 1),
-        *(number(row.errors[f"{axis}_deg"], "{:+.2f}") for axis in AXES[:3]),
-        *(number(row.errors[f"{axis}_m"], "{:+.1f}", 100.0) for axis in AXES[3:]),
-        number(row.time_offset_s, "{:+.1f}", 1000.0),
-        (drift + notes, row.drift_sigma or 0, "number"),
-        (str(row.frames), row.frames, "number"),
-        number(row.cpu_s, "{:.1f}"),
-        number(row.bytes_read, "{:.0f}", 1e-6),
-        number(row.peak_bytes, "{:.0f}", 1e-6),
-        (row.message, row.message, "words"),
-    ]
+    return {
+        "recording": (row.recording, row.path, "name"),
+        "verdict": _verdict(row.verdict),
+        "vehicle": (row.vehicle, row.vehicle, ""),
+        "time (UTC)": (_when(row.time), row.time_ns, "number"),
+        "cause": ((row.cause or "-").replace("_", " "), row.cause or "", ""),
+        "rotation, deg": _interval(1.0, 2, *sizes[:3]),
+        "translation, cm": _interval(100.0, 1, *sizes[3:6]),
+        **{f"{axis}, deg": number(row.errors[f"{axis}_deg"], "{:+.2f}") for axis in AXES[:3]},
+        **{f"{axis}, cm": number(row.errors[f"{axis}_m"], "{:+.1f}", 100.0) for axis in AXES[3:]},
+        "time offset, ms": number(row.time_offset_s, "{:+.1f}", 1000.0),
+        "drift": (drift + notes, row.drift_sigma or 0, "number"),
+        "frames": (str(row.frames), row.frames, "number"),
+        "CPU, s": number(row.cpu_s, "{:.1f}"),
+        "read, MB": number(row.bytes_read, "{:.0f}", 1e-6),
+        "memory, MB": number(row.peak_bytes, "{:.0f}", 1e-6),
+        "message": (row.message, row.message, "words"),
+    }

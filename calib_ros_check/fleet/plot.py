@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -19,41 +18,23 @@ SCALES = np.r_[np.rad2deg([1.0] * 3), [100.0] * 3]  # to deg and cm
 SMALLEST = (0.1, 1.0)  # half of the range that is shown at least, deg and cm
 
 
-@dataclass(frozen=True)
-class Point:
-    """A recording in a plot, px. low, high: two standard deviations to either side, cut off at the edges."""
+def plots(vehicle: Vehicle, variances: Matrix) -> list[dict[str, Any]]:
+    """Six plots, one per axis, against the mean of the first segment; none without an estimate. variances: (6,) between
+    recordings.
 
-    x: float
-    y: float
-    low: float
-    high: float
-    verdict: str
-    outlier: bool
-    title: str
-
-
-@dataclass(frozen=True)
-class AxisPlot:
-    """One axis of a vehicle, px. means: (x from, x to, y) of the segments. changes: x of each. ticks: (y, text)."""
-
-    axis: str
-    unit: str
-    points: Sequence[Point]
-    means: Sequence[tuple[float, float, float]]
-    changes: Sequence[float]
-    ticks: Sequence[tuple[float, str]]
-
-
-def plots(vehicle: Vehicle, variances: Matrix) -> list[AxisPlot]:
-    """Six plots, against the mean of the first segment; none without an estimate. variances: (6,) between recordings."""
+    Of each, px: points, with two standard deviations to either side (low, high), cut off at the edges; means: (x from, x to, y)
+    of the segments; changes: x of each; ticks: (y, text).
+    """
     if not vehicle.known:
         return []
     own, found = vehicle.sequence.with_scatter(variances), vehicle.segments
-    x = _places(np.array([row.time_ns for row in vehicle.known], float))
+    x = _places(np.array([row.time_ns for row in vehicle.known], float)).tolist()
     values = (own.values - found.means[0]) * SCALES
     bars = 2 * np.sqrt(np.diagonal(own.covariances, axis1=1, axis2=2)) * SCALES
     means = (found.means - found.means[0]) * SCALES
     inside = np.array([k not in found.outliers for k in range(len(values))])
+    spans = [np.flatnonzero(found.labels == label) for label in range(len(means))]
+    divisions = [(x[span[0]] + x[before[-1]]) / 2 for before, span in pairwise(spans)]
     out = []
     for axis, name in enumerate(AXES):
         unit = "deg" if axis < 3 else "cm"
@@ -62,20 +43,17 @@ def plots(vehicle: Vehicle, variances: Matrix) -> list[AxisPlot]:
         half = max(float(np.quantile(reach, 0.95)), float(np.abs(means[:, axis]).max()) * 1.2, SMALLEST[axis // 3]) * 1.1
         at = partial(_height, half)
         points = [
-            Point(
-                *(float(x[k]), at(values[k, axis])),
-                *(at(values[k, axis] - bars[k, axis]), at(values[k, axis] + bars[k, axis])),
-                *(row.verdict, row.outlier),
-                f"{row.recording}, {row.time}: {values[k, axis]:+.2f} +- {bars[k, axis]:.2f} {unit}",
-            )
-            for k, row in enumerate(vehicle.known)
+            {
+                **{"x": x[k], "y": at(value), "low": at(value - bar), "high": at(value + bar), "row": row},
+                "title": f"{row.recording}, {row.time}: {value:+.2f} +- {bar:.2f} {unit}",
+            }
+            for k, (row, value, bar) in enumerate(zip(vehicle.known, values[:, axis], bars[:, axis], strict=True))
         ]
-        spans = [np.flatnonzero(found.labels == label) for label in range(len(means))]
-        lines = [(float(x[span[0]]) - 4, float(x[span[-1]]) + 4, at(means[k, axis])) for k, span in enumerate(spans)]
-        divisions = [float(x[span[0]] + x[before[-1]]) / 2 for before, span in pairwise(spans)]
+        lines = [(x[span[0]] - 4, x[span[-1]] + 4, at(mean)) for mean, span in zip(means[:, axis], spans, strict=True)]
         tick = _round(half / 1.5)
         ticks = [(at(value), f"{value:+g}" if value else "0") for value in (-tick, 0.0, tick)]
-        out.append(AxisPlot(name, unit, points, lines, divisions, ticks))
+        drawn = {"points": points, "means": lines, "changes": divisions, "ticks": ticks}
+        out.append({"axis": name, "unit": unit, **drawn})
     return out
 
 

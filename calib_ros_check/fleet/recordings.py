@@ -1,4 +1,4 @@
-"""The recordings of a fleet: found below folders, each of a vehicle."""
+"""The recordings of a fleet: found below folders, each of a vehicle, and to be checked by itself."""
 
 from __future__ import annotations
 
@@ -24,18 +24,31 @@ UNKNOWN = "unknown"
 
 @dataclass(frozen=True)
 class Recording:
-    """path: as `open_dataset` takes it. vehicle: name of the vehicle that it is of. modified_ns: when its files were last
-    written, 0 if unknown. fingerprint: other where its files are; empty without files."""
+    """A recording, and the job of checking it.
+
+    path: as `open_dataset` takes it. vehicle: name of the vehicle, or the calibration, that it is of. modified_ns: when its files
+    were last written, 0 if unknown. fingerprint: other where its files are; empty without files. camera, frames: instead of those
+    of the options of the check, where recordings differ in them. options: see `options_key`.
+    """
 
     path: str
     vehicle: str = ""
     modified_ns: int = 0
     fingerprint: str = ""
+    camera: str = ""
+    frames: str = ""
+    options: str = ""
 
     @property
     def name(self) -> str:
         """Its own name, of the file or folder."""
         return Path(self.path).name or self.path
+
+    @property
+    def key(self) -> str:
+        """Of the job: other for a recording that has changed, and for other options."""
+        own = f"|{self.camera}|{self.frames}" if self.camera or self.frames else ""
+        return f"{self.path}|{self.fingerprint}|{self.options}{own}"
 
 
 def find_recordings(sources: Sequence[str], vehicle_pattern: str | None = None) -> list[Recording]:

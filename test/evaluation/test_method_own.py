@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes import NEAR, Scene
+from thesis_constants import with_constants
 
 from calib_ros import se3
 from calib_ros.config import Config, preset
@@ -25,7 +26,7 @@ from calib_ros_thesis.score import ThesisScore
 # The features of these scenes were made without semantics: what is compared with them has none either.
 NONE = {"semantics": {"segmentation": "none"}}
 PLAIN = Config.from_dict(NONE)
-THESIS = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"evaluations": 60}, **NONE})
+THESIS = with_constants(Config.from_dict({"refine": {"objective": "thesis"}, **NONE}), evaluations=60)
 CLASSES = {"semantics": {"cloud_classes": "geometric"}}
 
 

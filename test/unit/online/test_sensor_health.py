@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from calib_ros.camera import Camera
-from calib_ros.config import MonitorConfig
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.sensor_health import ACCUSTOMED, HISTORY, MIN_HISTORY, SensorFault, SensorHealth
+from calib_ros.online.sensor_health import ACCUSTOMED, FROZEN_IMAGES, HISTORY, MIN_HISTORY, SensorFault, SensorHealth
 
 SHAPE = (120, 160)
 BLACK = np.zeros(SHAPE, np.uint8)
@@ -37,9 +36,9 @@ def check(watch: SensorHealth, image: np.ndarray, k: int = 99, cloud: PointCloud
     return None if problem is None else problem.fault
 
 
-def watched(config: MonitorConfig | None = None, frames: int = 10, shape: tuple[int, ...] = SHAPE) -> SensorHealth:
+def watched(frames: int = 10, shape: tuple[int, ...] = SHAPE) -> SensorHealth:
     """It knows what is usual here."""
-    watch = SensorHealth(config or MonitorConfig())
+    watch = SensorHealth()
     assert [check(watch, street(k, shape=shape), k) for k in range(frames)] == [None] * frames
     return watch
 
@@ -100,7 +99,7 @@ def test_colour_and_grey_images_of_any_size_are_watched_alike(shape):
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 3), (2, 2, 3), (8, 8), (9, 17, 3)])
 def test_tiny_images_are_no_error(shape):
-    watch, rng = SensorHealth(MonitorConfig()), np.random.default_rng(0)
+    watch, rng = SensorHealth(), np.random.default_rng(0)
     for k in range(8):
         check(watch, rng.integers(0, 256, shape).astype(np.uint8), k)
     assert check(watch, np.zeros(shape, np.uint8), 9) is BLIND
@@ -115,12 +114,11 @@ def test_changed_image_size_or_colours_restart_the_check():
 # --- frozen ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("config", "first"), [({}, 5), ({"frozen_images": 2}, 2), ({"frozen_images": 0}, None)])
-def test_a_frozen_image(config, first):
+def test_a_frozen_image():
     """The image stays, the scans do not: reported from a number of repetitions on, until it changes."""
-    watch, still = watched(MonitorConfig(**config)), street(40)
+    watch, still = watched(), street(40)
     faults = [check(watch, still.copy(), 40 + k) for k in range(8)]
-    assert faults == [FROZEN if first is not None and k >= first else None for k in range(8)]
+    assert faults == [FROZEN if k >= 5 else None for k in range(8)]
     assert check(watch, street(41), 60) is None
     assert check(watch, street(41), 61) is None
 
@@ -149,7 +147,7 @@ def test_few_returns(returns, frames, fault):
 @pytest.mark.parametrize("xyz", [np.zeros((0, 3)), np.full((2000, 3), np.nan), np.zeros((2000, 3))], ids=["none", "nan", "zero"])
 def test_no_return_at_all(xyz):
     """Drivers leave lost returns out, or mark them by NaN or by the sensor's own place."""
-    for watch in (SensorHealth(MonitorConfig()), watched()):
+    for watch in (SensorHealth(), watched()):
         assert check(watch, street(40), 40, PointCloud(xyz.astype(np.float32))) is NO_SCAN
         assert check(watch, street(41), 41) is None
 
@@ -158,16 +156,9 @@ def test_camera_is_named_first_when_both_sensors_are_blind():
     assert check(watched(), dark(), 40, scan(0, 0)) is BLIND
 
 
-def test_new_configuration_takes_effect_at_once():
-    watch, still = watched(), street(40)
-    watch.config = MonitorConfig(frozen_images=2)
-    faults = [check(watch, still.copy(), 40 + k) for k in range(3)]
-    assert [fault is None for fault in faults] == [True, True, False]
-
-
 def test_health_check_adapts_to_a_garage_and_an_open_field():
     """Little contrast and few returns for half a minute are what is usual; a black picture is never."""
-    watch, rng = SensorHealth(MonitorConfig()), np.random.default_rng(0)
+    watch, rng = SensorHealth(), np.random.default_rng(0)
     bright = rng.integers(0, 256, (24, 32, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     garage = (bright // 8 + 20).astype(np.uint8)
 
@@ -190,7 +181,7 @@ def test_health_check_adapts_to_a_garage_and_an_open_field():
 def test_a_frozen_image_is_the_same_problem_at_every_frame():
     watch, still = watched(), street(99)
     camera = Camera(np.eye(3), SHAPE[1], SHAPE[0])
-    problems = [watch.check(Frame(still, scan(k), camera, k)) for k in range(100, 100 + MonitorConfig().frozen_images + 4)]
+    problems = [watch.check(Frame(still, scan(k), camera, k)) for k in range(100, 100 + FROZEN_IMAGES + 4)]
     told = [problem for problem in problems if problem is not None]
     assert len(told) > 2
     assert set(told) == {told[0]}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,17 +21,15 @@ from calib_ros.datasets.kitti import KittiSource
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import UNLABELLED, PointCloud
 from calib_ros.frame import SemanticClass as C
+from calib_ros.registration.classes import CLOUD, IMAGE, MASKS
 from calib_ros_semantics.models.cloud_classes import (
     BONNETAL,
     CENET,
     RANGE_FIRST,
     XYZ_FIRST,
-    CloudInput,
     classes_of_points,
-    point_model,
     range_view,
 )
-from calib_ros_semantics.models.image_classes import ImageInput, pixel_model
 from calib_ros_semantics.models.labels import (
     CAMVID,
     CITYSCAPES,
@@ -37,14 +37,15 @@ from calib_ros_semantics.models.labels import (
     NUMBERS_OF_IMAGES,
     OF_IMAGES,
     SEMANTIC_KITTI,
-    GuessedTable,
     LabelTable,
     lookup,
 )
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
+from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel
+from calib_ros_semantics.models.segmentation import load_model
 from calib_ros_synthetic.drive import SyntheticDrive
 
 CONFIG = SemanticsConfig()
+pixel_model, point_model = partial(load_model, IMAGE), partial(load_model, CLOUD)
 ROWS, COLUMNS = 3, 7  # blocks of the picture
 DARK = np.zeros((64, 64, 3), np.uint8)
 
@@ -206,18 +207,18 @@ def test_the_picture_is_not_turned_and_edges_stay_where_they_are(tmp_path: Path)
 )
 def test_the_size_at_which_a_picture_goes_in(tmp_path: Path, inputs, sizes) -> None:
     """Its own shape in multiples of 32, at most 1024 along the longer side, unless the graph has sizes of its own."""
-    network = ImageInput(OnnxModel(segmentation(tmp_path / "n.onnx", 19, "o ?", inputs=inputs), CONFIG))
+    network = pixel_model(str(segmentation(tmp_path / "n.onnx", 19, "o ?", inputs=inputs)), CONFIG)
     assert {own: network.size(*own) for own in sizes} == sizes
 
 
 def test_label_dataset_is_chosen_once() -> None:
     """34 raw numbers stay raw in a frame whose own would pass for others; one that nobody has spoils all that follow."""
     numbers = np.array([[0, -1, 255], [18, 13, 10]])
-    for table in (GuessedTable(NUMBERS_OF_IMAGES), LabelTable(CITYSCAPES)):
+    for table in (LabelTable(NUMBERS_OF_IMAGES), LabelTable({"": CITYSCAPES})):
         assert table.classes(numbers).tolist() == [[C.GROUND, UNLABELLED, UNLABELLED], [C.CYCLIST, C.VEHICLE, C.SKY]]
     for wrong in (-2, 70000):
         assert "which are no classes" in error_of(lambda wrong=wrong: table.classes(np.array([3, wrong])))
-    table, low = GuessedTable(NUMBERS_OF_IMAGES), np.array([[7, 8], [11, 255]])
+    table, low = LabelTable(NUMBERS_OF_IMAGES), np.array([[7, 8], [11, 255]])
     assert table.classes(low).tolist() == [[C.SIGN, C.VEGETATION], [C.PERSON, UNLABELLED]]
     assert table.guess == "cityscapes"
     table.classes(np.array([26, 33]))
@@ -242,8 +243,8 @@ REFUSED = [
     ({"classes": 3, "outputs": "s 1 3 256 512"}, "labels: [object, void, unknown]", "none of its classes is of use here"),
     ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "scores of 7 classes, which are of no known dataset"),
     ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "inputs: input float32 1x3x256x512; outputs: o float32 1x7x256x512"),
-    (MEANS, "", "this looks like a classifier of whole pictures"),
-    ({"classes": 256, "inputs": "1 3 64 64", "outputs": "s 1 256 64 64"}, "", "encoder of Segment Anything, for semantics"),
+    (MEANS, "", "none of its outputs is a map of classes"),
+    ({"classes": 256, "inputs": "1 3 64 64", "outputs": "s 1 256 64 64"}, "", "If it is Segment Anything, it goes to semantics"),
     ({"inputs": "1 5 64 1024", "outputs": "o 1 19 64 1024", "normal": ([0] * 5, [1] * 5)}, "", "takes one picture as 1x3xHxW"),
     (
         {"inputs": "1 3 1024 2048", "outputs": "s 1 19 4096 8192", "enlarged": 4},
@@ -261,6 +262,45 @@ def test_networks_for_pictures_that_cannot_be_used(tmp_path: Path, graph: dict, 
     text = error_of(lambda: pixel_model(str(beside(segmentation(tmp_path / "n.onnx", **graph), yaml)), CONFIG))
     assert says in text
     assert str(tmp_path / "n.") in text
+
+
+def made(path: Path, *outputs: tuple) -> Path:
+    """A graph that takes a picture and gives outputs of these shapes, all of them 0."""
+    names = [f"o{k}" for k in range(len(outputs))]
+    constants = {f"z{k}": np.zeros(shape, np.float32) for k, shape in enumerate(outputs)}
+    nodes = [helper.make_node("ReduceMean", ["i"], ["m"], axes=[0, 1, 2, 3], keepdims=0)]
+    nodes += [helper.make_node("Add", ["m", f"z{k}"], [name]) for k, name in enumerate(names)]
+    declared = [value(name, list(shape)) for name, shape in zip(names, outputs, strict=True)]
+    return save(path, nodes, [value("i", [1, 3, 320, 320])], declared, constants)
+
+
+OTHERS = {
+    "YOLOv8": ((1, 84, 2100),),
+    "YOLOv5": ((1, 6300, 85),),
+    "boxes after NMS": ((1, 300, 6),),
+    "corners and scores": ((100, 4), (100,)),
+    "heads by anchor": ((1, 3, 40, 40, 85), (1, 3, 20, 20, 85)),
+    "heads of COCO": ((1, 255, 40, 40), (1, 255, 20, 20), (1, 255, 10, 10)),
+    "heads of two classes": ((1, 28, 40, 40), (1, 28, 20, 20)),
+    "FastSAM": ((1, 37, 2100), (1, 32, 80, 80)),
+    "encoder of Segment Anything": ((1, 256, 20, 20),),
+    "encoder of SAM2": ((1, 32, 80, 80), (1, 64, 40, 40), (1, 256, 20, 20)),
+    "classifier": ((1, 1000),),
+    "classifier of 19 classes": ((1, 19, 1, 1),),
+    "a network for classes": ((1, 19, 320, 320),),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_networks_of_other_kinds_are_refused(tmp_path: Path, name: str) -> None:
+    """Also where they are meant for the other parameter."""
+    path = str(made(tmp_path / "n.onnx", *OTHERS[name]))
+    if name != "a network for classes":
+        assert re.search("none of its outputs is a map|which are of no known", error_of(lambda: pixel_model(path, CONFIG)))
+    if name not in ("FastSAM", "heads of COCO"):
+        said = error_of(lambda: load_model(MASKS, path, CONFIG))
+        assert "set semantics.segment_anything_decoder" in said
+        assert "networks for classes go to semantics.image_classes" in said
 
 
 @pytest.mark.parametrize(
@@ -400,7 +440,7 @@ def test_empty_pixels_are_zero_and_far_points_do_not_hide_near_ones(tmp_path: Pa
     assert np.argwhere(view.index >= 0).tolist() == [[row, 384], [row, 640]]  # 45 deg to the left, and to the right
     assert view.index[row, 384] == 1  # the nearer of two
     many = np.concatenate([ahead, np.tile(ahead[2:], (200, 1))])
-    feeds, _, note = CloudInput(OnnxModel(scan_network(tmp_path, "bonnetal"), CONFIG)).feed(PointCloud(many))
+    feeds, _, note = point_model(str(scan_network(tmp_path, "bonnetal")), CONFIG).feed(PointCloud(many))
     image = feeds["input"][0]
     assert (image[:, view.index < 0] == 0).all()
     expected = [(np.sqrt(50) - 12.12) / 12.32, (5 - 10.88) / 11.47, (5 - 0.23) / 6.91, 1.04 / 0.86, -0.21 / 0.16]
@@ -434,7 +474,7 @@ def test_points_without_a_return_have_no_class(tmp_path: Path) -> None:
 
 def test_the_width_follows_the_scan(tmp_path: Path) -> None:
     """A network of any width runs at that of the scan; one of another width works, and says that it does not fit."""
-    dynamic = CloudInput(OnnxModel(scan_network(tmp_path, "bonnetal", name="any", size=(64, "w")), CONFIG))
+    dynamic = point_model(str(scan_network(tmp_path, "bonnetal", name="any", size=(64, "w"))), CONFIG)
     for columns, width in ((480, 512), (512, 512), (1024, 1024), (1800, 2048), (2048, 2048)):
         feeds, _, note = dynamic.feed(scan(columns))
         assert (feeds["input"].shape[3], note) == (width, "")
@@ -488,14 +528,14 @@ def test_networks_for_scans_that_cannot_be_used(tmp_path: Path) -> None:
     nodes = [helper.make_node("Identity", [f"i{k}"], [f"o{k}"]) for k in (0, 1)]
     usual = scan_network(tmp_path, "bonnetal")
     for path, yaml, says in (
-        (segmentation(tmp_path / "n.onnx"), "", "input has no axis of 5 or 6 channels"),
+        (segmentation(tmp_path / "n.onnx"), "", "takes one range image as 1xCxHxW or 1xHxWxC of 5 or 6 channels"),
         (range_network(tmp_path / "7.onnx", centres(7), 0, [0] * 5, [1] * 5), "", "scores of 7 classes, which are of no known"),
         (save(tmp_path / "mininet.onnx", nodes, inputs, outputs), "", "groups of neighbours, as 3D-MiniNet takes them"),
         (usual, "family: pointnet", "family 'pointnet' is unknown; known are bonnetal"),
         (usual, "channels: rgb", "must be a list of range, x, y, z, remission, mask"),
         (usual, "channels: [range, x, y, z, colour]", "must be a list of range"),
-        (usual, "channels: [range, x, y, z, depth]", "must name each channel once"),
-        (usual, "channels: [range, x, y]", "has no axis of 3 channels"),
+        (usual, "channels: [range, x, y, z, depth]", "must be a list of range, x, y, z, remission, mask, each once"),
+        (usual, "channels: [range, x, y]", "of 3 channels"),
         (usual, "mean: [1, 2, 3]", "'mean:' must have 5 numbers"),
         (usual, "size: [64, 512]", "does not run at the height and width"),
         (usual, "labels: [car]", "names 1 classes"),

@@ -334,9 +334,9 @@ def test_a_keyframe_is_replaced_by_its_semantic_features(drive, start):
     assert second.view is not None
     assert recalibrator.segment_keyframe() == ()
     assert list(recalibrator.buffer) == [first, second]
-    assert recalibrator.segmenter.done == 1
+    assert recalibrator.segmented == 1
     took = r"1 keyframes; image_classes \d+\.\d s; cloud_classes \d+\.\d s; image_classes source; cloud_classes source"
-    assert re.fullmatch(took, recalibrator.segmenter.describe(recalibrator.segmentation))
+    assert re.fullmatch(took, recalibrator.describe_semantics())
 
 
 def test_raw_frames_are_not_kept(source, start):

@@ -13,9 +13,11 @@ from calib_ros.cli.main import main
 from calib_ros.config import Config, update
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
-from calib_ros_check.fleet import fleet as module
-from calib_ros_check.fleet.fleet import FleetOptions, check_fleet
-from calib_ros_check.fleet.jobs import CheckJob, options_key, run_checks
+from calib_ros_check.fleet import check as module
+from calib_ros_check.fleet.check import check_fleet
+from calib_ros_check.fleet.fleet import FleetOptions
+from calib_ros_check.fleet.jobs import options_key, run_checks
+from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.recording import CheckOptions
 from calib_ros_semantics.models.weight_sets import of_package
@@ -89,7 +91,7 @@ def test_keys_of_options(tmp_path: Path) -> None:
             FleetOptions(["x"], tmp_path, **wrong)
 
 
-def deadly(options: CheckOptions, jobs: list[CheckJob]) -> list[dict]:
+def deadly(options: CheckOptions, jobs: list[Recording]) -> list[dict]:
     """Like `run_checks`, but the garbage kills the process as a crash in a library does."""
     if "garbage" in jobs[0].path:
         os._exit(9)
@@ -107,10 +109,10 @@ def test_a_recording_that_ends_its_workers_is_a_row_and_is_tried_again(bad: Path
 
 
 def test_a_recording_that_is_gone_is_blamed_on_the_machine(tmp_path: Path) -> None:
-    (answer,) = run_checks(CheckOptions(), [CheckJob(str(tmp_path / "gone"), "f", "o")])
+    (answer,) = run_checks(CheckOptions(), [Recording(str(tmp_path / "gone"), fingerprint="f")])
     assert "mount it on all workers" in answer["error"]
     assert answer["from"] == "other"
-    (answer,) = run_checks(CheckOptions(), [CheckJob(str(tmp_path / "gone"), "", "o")])
+    (answer,) = run_checks(CheckOptions(), [Recording(str(tmp_path / "gone"))])
     assert "does not exist" in answer["error"]
 
 

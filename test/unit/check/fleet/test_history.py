@@ -14,10 +14,10 @@ from fleets import broken, checked, moved
 from calib_ros.errors import MissingDependencyError
 from calib_ros_check.fleet.cli import summary
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
-from calib_ros_check.fleet.history import vehicles
+from calib_ros_check.fleet.history import Row, row_of, utc, vehicles
 from calib_ros_check.fleet.page import MOST_ROWS, change_size, write_page
 from calib_ros_check.fleet.plot import plots
-from calib_ros_check.fleet.rows import COLUMNS, Row, row_of, utc, write_changes, write_csv, write_parquet
+from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +30,7 @@ def fleet() -> Fleet:
     answers += [checked("c", k, right if k < 11 else turned, rng) for k in range(12)]
     answers += [broken("d", 0, "nothing of it <b>works</b>")]
     rows = [row_of(recording, answer) for recording, answer in answers]
-    results = {recording.path: answer.get("result") for recording, answer in answers}
-    histories, variances = vehicles([*reversed(rows)], results)
-    return Fleet([row for own in histories for row in own.rows], histories, np.sqrt(variances))
+    return Fleet(*vehicles([*reversed(rows)]))
 
 
 def test_changes_name_vehicle_recordings_and_size(fleet: Fleet) -> None:
@@ -70,7 +68,7 @@ def test_exit_codes() -> None:
     codes = {"pass": 0, "pass fail inconclusive error": 1, "pass inconclusive": 3, "error error": 2, "pass error": 3, "": 2}
     for verdicts, code in codes.items():
         rows = [Row("r", "v", "", verdict) for verdict in verdicts.split()]
-        assert Fleet(rows, [], np.zeros(6)).exit_code == code, verdicts
+        assert Fleet(*vehicles(rows)).exit_code == code, verdicts
 
 
 def test_what_is_printed(fleet: Fleet) -> None:
@@ -91,10 +89,10 @@ def test_times_come_from_the_data_unless_its_clock_was_never_set() -> None:
 
 
 def test_tables(fleet: Fleet, tmp_path: Path) -> None:
-    write_csv(tmp_path / "fleet.csv", fleet.rows)
+    write_csv(tmp_path / "fleet.csv", [row.values() for row in fleet.rows])
     with (tmp_path / "fleet.csv").open(newline="") as file:
         read = list(csv.DictReader(file))
-    assert tuple(read[0]) == COLUMNS
+    assert read[0].keys() == fleet.rows[0].values().keys()
     assert len(read) == 37
     assert read[0]["recording"] == "drive_00"
     assert float(read[0]["rx_deg"]) == pytest.approx(fleet.rows[0].errors["rx_deg"], rel=1e-5)
@@ -116,7 +114,7 @@ def test_parquet_has_types_and_without_pyarrow_says_what_to_install(
     parquet = pytest.importorskip("pyarrow.parquet")
     write_parquet(tmp_path / "fleet.parquet", fleet.rows)
     table = parquet.read_table(tmp_path / "fleet.parquet")
-    assert tuple(table.column_names) == COLUMNS
+    assert table.column_names == [*fleet.rows[0].values()]
     kinds = {"time_ns": "int64", "rx_deg": "double", "changed": "bool", "cause": "string"}
     assert {name: str(table.schema.field(name).type) for name in kinds} == kinds
     read = table.to_pylist()
@@ -135,7 +133,7 @@ def page_of(fleet: Fleet, folder: Path) -> str:
 def test_page_says_it_all_without_network(fleet: Fleet, tmp_path: Path) -> None:
     page = page_of(fleet, tmp_path)
     assert not re.search(r"(src|href)=\"?(https?:)?//", page)
-    summary_at, table_at = page.index('id="summary"'), page.index('id="recordings"')
+    summary_at, table_at = page.index('id="summary"'), page.index('id="all"')
     assert summary_at < page.index("<b>a</b> by 0.") < table_at
     assert "drive_04 (b)" in page[summary_at:table_at]
     assert page.count("<tr><td") == 37
@@ -149,7 +147,7 @@ def test_page_says_it_all_without_network(fleet: Fleet, tmp_path: Path) -> None:
 
 def test_a_large_fleet_has_a_page_of_what_wants_attention(fleet: Fleet, tmp_path: Path) -> None:
     many = [Row(f"r{k}", "v", "", "pass") for k in range(MOST_ROWS)] + [Row("bad", "v", "", "fail")]
-    page = page_of(Fleet(many, [], np.zeros(6)), tmp_path)
+    page = page_of(Fleet(*vehicles(many)), tmp_path)
     assert page.count("<tr><td") == MOST_ROWS
     assert ">bad</td>" in page
     assert "1 more recordings are in fleet.csv" in page
@@ -157,10 +155,10 @@ def test_a_large_fleet_has_a_page_of_what_wants_attention(fleet: Fleet, tmp_path
 
 def test_plots_keep_within_their_frame(fleet: Fleet) -> None:
     for vehicle in fleet.vehicles:
-        for plot in plots(vehicle, fleet.scatter**2):
-            assert len(plot.points) == len(vehicle.known)
-            for point in plot.points:
-                assert 0 < point.x < 380
-                assert 18 <= point.high <= point.y <= point.low <= 132
-    same_time = vehicles([Row("r", "v", "", "pass", path=str(k)) for k in range(3)], {})[0][0]
+        for plot in plots(vehicle, fleet.variances):
+            assert len(plot["points"]) == len(vehicle.known)
+            for point in plot["points"]:
+                assert 0 < point["x"] < 380
+                assert 18 <= point["high"] <= point["y"] <= point["low"] <= 132
+    same_time = vehicles([Row("r", "v", "", "pass", path=str(k)) for k in range(3)])[0][0]
     assert plots(same_time, np.zeros(6)) == []

@@ -20,8 +20,8 @@ from calib_ros.rig.description import CAMERA, LIDAR, RigDescription, Sensor, pri
 from calib_ros.rig.edges import RigMeasurer
 from calib_ros.rig.graph import Edge, RigSolution, solve
 from calib_ros.rig.report import RigReport
+from calib_ros_check.fleet.history import row_of
 from calib_ros_check.fleet.recordings import Recording
-from calib_ros_check.fleet.rows import row_of
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.rig.check import PairCheck, RigCheck, as_given, as_row, check_rig, judged
 from calib_ros_check.rig.cli import summary

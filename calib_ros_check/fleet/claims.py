@@ -1,11 +1,12 @@
-"""The calibrations that a data set claims, and the frames that each is of."""
+"""The calibrations that a data set claims, and the frames that each is of: a fleet whose vehicles are calibrations."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,62 +23,50 @@ from calib_ros_check.recording import FRAMES, CheckOptions, opened
 DIGITS = 9  # of numbers in files, which copies round
 
 
-@dataclass(frozen=True)
-class Claim:
-    """Frames of a recording that have one calibration. recording: its `vehicle` is the calibration's name. camera: "" where the
-    recording has only one. frames: positions that are checked, as `frame_positions` has them; "" = those of every check."""
-
-    recording: Recording
-    camera: str = ""
-    frames: str = ""
-
-
-def find_claims(sources: Sequence[str], options: CheckOptions, count: int = FRAMES) -> list[Claim]:
+def find_claims(sources: Sequence[str], options: CheckOptions, count: int = FRAMES) -> list[Recording]:
     """All calibrations of data sets: of every recording in `sources`, every camera, and every frame where each has its own.
 
-    Calibrations are the same where their numbers are. count: frames of each in a recording. What cannot be opened is a claim of
-    its own, so that its check says why.
+    Calibrations are the same where their numbers are; `vehicle` is the name of each. count: frames of each in a recording. What
+    cannot be opened is a calibration of its own, so that its check says why.
     Raises as `find_recordings`.
     """
-    found: dict[bytes, list[Claim]] = {}
-    for recording in _scenes(find_recordings(sources)):
-        try:
-            claims = list(_claims_of(recording, options, count))
-        except CalibrationError:
-            claims = [(recording.path.encode("utf-8", "surrogateescape"), Claim(recording))]
-        for key, claim in claims:
-            found.setdefault(key, []).append(claim)
+    found: dict[bytes, list[Recording]] = {}
+    for recording in find_recordings(sources):
+        for scene in _scenes(recording):
+            try:
+                claims = list(_claims_of(scene, options, count))
+            except CalibrationError:
+                claims = [(os.fsencode(scene.path), scene)]
+            for key, claim in claims:
+                found.setdefault(key, []).append(claim)
     return _named(list(found.values()))
 
 
-def _scenes(recordings: Sequence[Recording]) -> Iterator[Recording]:
+def _scenes(recording: Recording) -> list[Recording]:
     """Scenes of nuScenes as recordings."""
-    for own in recordings:
-        scenes = []
-        if "#" not in own.path and is_nuscenes(Path(own.path)):
-            try:
-                scenes = NuScenesSource(own.path).scenes
-            except CalibrationError:  # its claim says why
-                yield own
-                continue
-        yield from (replace(own, path=f"{own.path}#{name}") for name in scenes) if scenes else [own]
+    scenes: Sequence[str] = ()
+    if "#" not in recording.path and is_nuscenes(Path(recording.path)):
+        with suppress(CalibrationError):  # the check says why
+            scenes = NuScenesSource(recording.path).scenes
+    return [replace(recording, path=f"{recording.path}#{name}") for name in scenes] or [recording]
 
 
-def _claims_of(recording: Recording, options: CheckOptions, count: int) -> Iterator[tuple[bytes, Claim]]:
-    """What tells a calibration from others, and a claim of it."""
+def _claims_of(recording: Recording, options: CheckOptions, count: int) -> Iterator[tuple[bytes, Recording]]:
+    """What tells a calibration from others, and the recording with the frames that are of it."""
     first = opened(recording.path, options)
     cameras = [] if options.camera else [str(name) for name in getattr(first, "cameras", ())]
     for camera in cameras or [""]:
+        claim = replace(recording, camera=camera)
         try:
             source = opened(recording.path, replace(options, camera=camera)) if camera else first
         except CalibrationError:
-            yield f"{recording.path} {camera}".encode("utf-8", "surrogateescape"), Claim(recording, camera)
+            yield os.fsencode(f"{recording.path} {camera}"), claim
             continue
         groups = _groups(source)
         for key, positions in groups.items():
             chosen = [positions[k] for k in spread_positions(count, len(positions))]
             frames = "" if len(groups) == 1 and count == FRAMES else ",".join(map(str, chosen))
-            yield source.camera_frame.encode() + key, Claim(recording, camera, frames)
+            yield source.camera_frame.encode() + key, replace(claim, frames=frames)
 
 
 def _groups(source: Source) -> dict[bytes, list[int]]:
@@ -96,9 +85,9 @@ def _key(*numbers: Any) -> bytes:
     return b"".join(b"-" if one is None else (np.round(one, DIGITS) + 0.0).tobytes() for one in numbers)
 
 
-def _named(groups: Sequence[Sequence[Claim]]) -> list[Claim]:
+def _named(groups: Sequence[Sequence[Recording]]) -> list[Recording]:
     """Each calibration by its recording, or the folder that has all of its recordings, and its camera."""
-    paths = [[Path(claim.recording.path).absolute() for claim in group] for group in groups]
+    paths = [[Path(claim.path).absolute() for claim in group] for group in groups]
     root = os.path.commonpath([path.parent for group in paths for path in group])
     uses = Counter(path for own in paths for path in own)
     names = []
@@ -109,10 +98,10 @@ def _named(groups: Sequence[Sequence[Claim]]) -> list[Claim]:
         name = Path(root).name if name == "." else name
         more = "" if is_folder or len(own) == 1 else f" and {len(own) - 1} more"
         names.append(f"{name}{more}, camera {group[0].camera}" if group[0].camera else f"{name}{more}")
-    counts: dict[str, int] = {}
+    total, seen = Counter(names), Counter[str]()
     out = []
     for name, group in zip(names, groups, strict=True):
-        counts[name] = counts.get(name, 0) + 1
-        full = name if names.count(name) == 1 else f"{name} ({counts[name]} of {names.count(name)})"
-        out += [replace(claim, recording=replace(claim.recording, vehicle=full)) for claim in group]
+        seen[name] += 1
+        full = name if total[name] == 1 else f"{name} ({seen[name]} of {total[name]})"
+        out += [replace(claim, vehicle=full) for claim in group]
     return out

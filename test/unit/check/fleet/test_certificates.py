@@ -8,7 +8,6 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -26,10 +25,9 @@ from calib_ros.cli.main import main
 from calib_ros.config import MotionConfig
 from calib_ros.frame import Frame
 from calib_ros.lidar.deskew import deskewed_frame
-from calib_ros_check.certify.certificates import Certificate, certificate_of
-from calib_ros_check.certify.claims import Claim, find_claims
-from calib_ros_check.fleet.history import vehicles
-from calib_ros_check.fleet.rows import row_of
+from calib_ros_check.fleet.certificates import Certificate, certificate_of
+from calib_ros_check.fleet.claims import find_claims
+from calib_ros_check.fleet.history import row_of, vehicles
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.recording import CheckOptions
 
@@ -101,7 +99,7 @@ def test_right_and_wrong_calibrations_of_a_data_set_are_told_apart(tree: Path, c
     assert "deg too far left" in wrong["message"]
     assert "calibration.yaml" in rows["damaged"]["message"]
     page = (out / "certificates.html").read_text()
-    doubtful = page[page.index("Doubtful calibrations") : page.index("All calibrations")]
+    doubtful = page[page.index("Summary") : page.index("All calibrations")]
     assert doubtful.index("(2 of 2)") < doubtful.index("damaged")
     assert "campus" not in doubtful
     shown = [np.frombuffer(base64.b64decode(own.partition("base64,")[2]), np.uint8) for own in Page(page).sources]
@@ -145,7 +143,7 @@ def test_drives_of_a_day_share_a_calibration_and_frames_may_have_their_own(tmp_p
     own = tmp_path / "object/training/calib/000001.txt"
     own.write_text(own.read_text().replace("P2: ", "P2: 1", 1))
     claims = find_claims([str(tmp_path)], CheckOptions())
-    assert [(c.recording.vehicle, c.recording.name, c.camera, c.frames) for c in claims] == [
+    assert [(c.vehicle, c.name, c.camera, c.frames) for c in claims] == [
         ("2011_09_26, camera 2", "first_sync", "2", ""),
         ("2011_09_26, camera 2", "second_sync", "2", ""),
         ("object/training, camera 2 (1 of 2)", "training", "2", "0"),
@@ -161,7 +159,7 @@ def test_a_calibration_is_named_by_the_recording_that_has_no_other(tmp_path: Pat
     changed = tmp_path / "object/training/calib/000001.txt"
     changed.write_text(changed.read_text().replace("P2: ", "P2: 1", 1))
     claims = find_claims([str(tmp_path)], CheckOptions())
-    assert [(Path(c.recording.path).parent.name, c.frames, c.recording.vehicle) for c in claims] == [
+    assert [(Path(c.path).parent.name, c.frames, c.vehicle) for c in claims] == [
         ("object", "0", "other/training and 1 more, camera 2"),
         ("other", "", "other/training and 1 more, camera 2"),
         ("object", "1", "object/training, camera 2"),
@@ -172,7 +170,7 @@ def test_scenes_and_cameras_of_nuscenes_are_claims(tmp_path: Path) -> None:
     sample_sources.nuscenes(tmp_path / "nuscenes")
     claims = find_claims([str(tmp_path / "nuscenes")], CheckOptions())
     assert claims
-    assert all("#" in claim.recording.path and claim.camera.startswith("CAM") for claim in claims)
+    assert all("#" in claim.path and claim.camera.startswith("CAM") for claim in claims)
 
 
 def certificate(errors: list[list[float]], factor: float = 6.0, shared: np.ndarray | None = None) -> Certificate:
@@ -180,12 +178,10 @@ def certificate(errors: list[list[float]], factor: float = 6.0, shared: np.ndarr
     rng = np.random.default_rng(2)
     made = [checked("set", k, moved(error), rng, factor) for k, error in enumerate(errors)]
     rows = [row_of(*one) for one in made]
-    results = {row.path: answer["result"] for row, (_, answer) in zip(rows, made, strict=True)}
-    for own in results.values():
-        own["shared_covariance"] = None if shared is None else shared.tolist()
-    (vehicle,), _ = vehicles(rows, results)
-    claims = {row.path: Claim(recording) for row, (recording, _) in zip(rows, made, strict=True)}
-    return certificate_of(vehicle, results, claims, Tolerance())
+    for row in rows:
+        row.result["shared_covariance"] = None if shared is None else shared.tolist()
+    (vehicle,), _ = vehicles(rows)
+    return certificate_of(vehicle, Tolerance())
 
 
 def test_recordings_that_tell_too_little_each_tell_enough_together() -> None:
@@ -216,14 +212,12 @@ def test_sensors_that_move_while_the_calibration_stays_are_told() -> None:
     found = certificate([steady] * 6 + [moved_by] * 6, factor=1.0)
     assert found.verdict == "fail"
     assert found.reason.startswith("the sensors moved 1 times while the calibration stayed; at worst: ")
-    assert [change.after.recording for change in found.changes] == ["drive_06"]
+    assert [change.after.recording for change in found.vehicle.changes] == ["drive_06"]
     assert found.values()["changes"] == 1
 
 
 def test_a_calibration_without_anything_readable_is_an_error() -> None:
-    recording, answer = broken("set", 0, "no such file")
-    row = row_of(recording, answer)
-    (vehicle,), _ = vehicles([row], {row.path: None})
-    found = certificate_of(vehicle, {row.path: None}, {row.path: Claim(replace(recording))}, Tolerance())
+    (vehicle,), _ = vehicles([row_of(*broken("set", 0, "no such file"))])
+    found = certificate_of(vehicle, Tolerance())
     assert (found.verdict, found.reason) == ("error", "no such file")
     assert found.values()["rotation_deg"] is None

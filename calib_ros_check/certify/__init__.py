@@ -1,1 +1,0 @@
-"""Certificates of data sets: is every calibration that comes with one right?"""
