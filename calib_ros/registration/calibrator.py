@@ -133,7 +133,7 @@ class Calibrator:
             seen = [replace(frame, camera=camera) for frame in frames]
             return self._with_camera(camera)._calibrated(seen, start, box, progress, ())
 
-        # Of other objectives the edges confirm the place, not the covariance; see Acceptance._check_uncertainty.
+        # Of other objectives the edges confirm the place, not the covariance; see Acceptance.refusal.
         asked = not box.is_empty and other_objective(self.config) is None
         limits = self.config.refine if asked else None
         result = refined_with_camera(first, self.extract.source_camera, near, whole, self.config.camera, limits)
@@ -242,7 +242,7 @@ class Calibrator:
                 objective, alignment.T, start, box, inflated, optimised.search.nearby if optimised.search else ()
             )
             intrinsics = acceptance.intrinsics(objective, alignment, evidence)
-            found = Estimate(initial, start, optimised, alignment, evidence, pose, intrinsics)
+            found = Estimate(initial, start, optimised, alignment, evidence, *pose, intrinsics)
             shared, clocks = found.nuisance(self.config, intrinsics if self._given is None else ())
             # Accept, or say why not.
             refusal = acceptance.refusal(found, watch)
@@ -261,7 +261,7 @@ class Calibrator:
         objective, camera, limits = found.objective, self.extract.source_camera, found.objective.constraints.limits
         inflated, search = inflation(found.evidence.disagreement), acceptance.box is not None and self._given is None
         score, prior, T = objective.edges.score, objective.constraints.prior, found.alignment.T
-        extrinsic = found.pose.covariance
+        extrinsic = found.covariance
         return joint_optimum(score, T, limits, prior, camera, self.config.camera, inflated, extrinsic, search, self._given)
 
     def estimate_in_doubt(

@@ -36,24 +36,18 @@ class Alignment:
 
 
 @dataclass(frozen=True, eq=False)
-class ObservablePose:
-    """An extrinsic T (4, 4), its covariance (6, 6), and the directions that no scene shows, along which T is the start."""
-
-    T: Transform
-    covariance: Covariance
-    unobservable: tuple[Direction, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
 class Estimate:
-    """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it."""
+    """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it. T: the
+    extrinsic (4, 4), with its covariance (6, 6), and the directions that no scene shows, along which it is the start."""
 
     initial: Transform
     start: Transform
     optimised: Optimised
     alignment: Alignment
     evidence: Evidence
-    pose: ObservablePose
+    T: Transform
+    covariance: Covariance
+    unobservable: tuple[Direction, ...]
     intrinsics: Sequence[NuisanceEstimate]
 
     @property
@@ -64,7 +58,7 @@ class Estimate:
     def nuisance(self, config: Config, intrinsics: Sequence[NuisanceEstimate]) -> tuple[Covariance, Effect | None]:
         """What these intrinsics and the clocks leave open of the optimum, however many such scenes there are: covariance (6, 6),
         and the effect of an offset as large as motion.max_time_offset_s; None where the motion is not known."""
-        T, covariance, constraints = self.pose.T, self.pose.covariance, self.objective.constraints
+        T, covariance, constraints = self.T, self.covariance, self.objective.constraints
         score = self.objective.smooth_score(T)
         sigma_s, clocks = self.optimised.clocks(config.motion)
         active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
@@ -100,12 +94,12 @@ class Estimate:
             *notes,
             objective.remark,
             LEFT_OUT.format(", ".join(outliers)) if outliers else "",
-            KEPT.format(", ".join(map(str, self.pose.unobservable))) if self.pose.unobservable else "",
+            KEPT.format(", ".join(map(str, self.unobservable))) if self.unobservable else "",
             "" if all(f.has_reflectivity for f in features) else NO_INTENSITY,
             ONE_FRAME if used == 1 else "",
         ]
         return Result(
-            self.initial if refusal else self.pose.T,
+            self.initial if refusal else self.T,
             REFUSED if refusal else CONVERGED,
             joined(reasons),
             frames_used=used,
@@ -114,16 +108,16 @@ class Estimate:
             frames_left_out=tuple(outliers),
             refusal=refusal.code if refusal else None,
             refusal_figures=refusal.figures if refusal else {},
-            optimum=self.pose.T if refusal else None,
-            optimum_covariance=self.pose.covariance if refusal else None,
+            optimum=self.T if refusal else None,
+            optimum_covariance=self.covariance if refusal else None,
             data_stamp=max(f.stamp for f in features),
-            score=objective.value(self.pose.T),
+            score=objective.value(self.T),
             initial_score=objective.value(self.start),
             evidence=self.evidence,
-            frame_scores=tuple(float(s) for s in objective.frame_scores(self.pose.T)),
+            frame_scores=tuple(float(s) for s in objective.frame_scores(self.T)),
             starts=None if search is None else (search.agreed, search.optimised),
             intrinsics={e.parameter.name: e.in_files for e in self.intrinsics},
-            covariance=None if refusal else self.pose.covariance + shared,
+            covariance=None if refusal else self.covariance + shared,
             shared_covariance=None if refusal else shared,
             clock_direction=None if refusal or clocks is None else clocks.direction,
             clock_sigma_s=None if refusal or clocks is None else clocks.sigma(motion.max_time_offset_s),
@@ -169,8 +163,8 @@ def refine_start(objective: Objective, alignment: Alignment, start: Transform, p
 
 def observable_pose(
     objective: Objective, T: Transform, start: Transform, box: SearchBox | None, inflated: float, others: Sequence[Matrix] = ()
-) -> ObservablePose:
-    """The optimum T (4, 4) with its covariance; directions that no scene shows are kept from the start.
+) -> tuple[Matrix, Covariance, tuple[Direction, ...]]:
+    """The optimum T (4, 4) with its covariance, and the directions that no scene shows, which are kept from the start.
 
     box: that was searched, whose half widths are the standard deviations of a start that is fused. inflated: factor of the
     variance. others: optima (4, 4) nearby.
@@ -185,14 +179,13 @@ def observable_pose(
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         constraints = replace(constraints, limits=limits)
         C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
-    optimum = ObservablePose(T, C + np.diag(held))
     unobservable = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
     if not unobservable:
-        return optimum
+        return T, C + np.diag(held), ()
     deg, m = box.reach if box is not None else (0.0, 0.0)
     reach = [np.deg2rad(deg or REFINEMENT_DEG)] * 3 + [m or REFINEMENT_M] * 3
     kept, narrower = fused(T, C, start, np.diag(np.square(reach) * constraints.limits.open_axes))
     kept = objective.constraints.limits.clip(kept)  # composed rotations and translations exceed them by terms of second order
     if penalised(objective, kept) < penalised(objective, start):  # the score does observe them farther from the optimum
-        return optimum
-    return ObservablePose(kept, narrower + np.diag(held), tuple(unobservable))
+        return T, C + np.diag(held), ()
+    return kept, narrower + np.diag(held), tuple(unobservable)

@@ -78,7 +78,7 @@ class Acceptance:
 
     def refusal(self, found: Estimate, progress: Progress) -> Refusal | None:
         """Why the extrinsic of an estimate is not to be used: the first check that fails."""
-        objective, T, start, limits = found.objective, found.pose.T, found.start, found.objective.constraints.limits
+        objective, T, start, limits = found.objective, found.T, found.start, found.objective.constraints.limits
         if penalised(objective, T) < penalised(objective, start):
             return worse_than_start(objective.value(T), objective.value(start))
         wrong = self._check_intrinsics_and_clocks(found)
@@ -95,8 +95,13 @@ class Acceptance:
         # Only of a search: a refinement has a start to rely on, and is fused with it. What intrinsics and clocks leave open is
         # not asked: more scenes would not help.
         if wrong is None and self.searched and objective.agreement is None:
-            wrong = check_uncertainty(found.pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
-        return wrong or _check_agreement(objective, T, progress)
+            wrong = check_uncertainty(found.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
+        if wrong is None and objective.agreement is not None:
+            # If the edges, begun at the optimum of another objective, end far away, one of the two is wrong.
+            deg, m = se3.error(T, objective.edges.optimise(T, False, progress))
+            if not (deg <= objective.agreement[0] and m <= objective.agreement[1]):
+                return objectives_disagree(deg, m)
+        return wrong
 
     def _check_match(self, found: Estimate) -> Refusal | None:
         """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
@@ -150,15 +155,6 @@ class Acceptance:
         if too_far or unobservable or offset.suspected(motion):
             return wrong_times(optimised.seconds if unobservable else offset.seconds, offset.gain)
         return None
-
-
-def _check_agreement(objective: Objective, T: Transform, progress: Progress) -> Refusal | None:
-    """If the edges, begun at the optimum T (4, 4) of another objective, end far away, one of the two is wrong."""
-    if objective.agreement is None:
-        return None
-    other = objective.edges.optimise(T, False, progress)
-    deg, m = se3.rotation_error_deg(T, other), se3.translation_error_m(T, other)
-    return None if deg <= objective.agreement[0] and m <= objective.agreement[1] else objectives_disagree(deg, m)
 
 
 def leaves_doubt(result: Result) -> bool:

@@ -137,13 +137,8 @@ def search_decoy(
         return null_distribution(decoy, optima.best()[0]).z_score
 
 
-@dataclass(frozen=True, eq=False)
-class SeedingStrategy:
-    """Starts are ranked by a level of `ranking`, the best of them by that of `score`, and optimised from that level on."""
-
-    ranking: PointScore
-    score: PointScore
-    level: int
+# Of seeding: starts are ranked by the first score, the best of them by the second, on the level, from which they are optimised.
+Strategy = tuple[PointScore, PointScore, int]
 
 
 class SearchSpace:
@@ -169,10 +164,10 @@ class SearchSpace:
         self.coarse, self.middle = score.subset(COARSE_POINTS, rng), score.subset(MIDDLE_POINTS, rng)
         ranking = self._fewer(self.first, RANKING_POINTS)
         levels = WIDE_SEED_LEVELS if is_wide(box) else SEED_LEVELS
-        self.strategies = [SeedingStrategy(ranking, self.first, level) for level in levels]
+        self.strategies: list[Strategy] = [(ranking, self.first, level) for level in levels]
         if guide is not None:
             guide = self._fewer(guide, GUIDE_POINTS)
-            self.strategies.append(SeedingStrategy(self._fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL))
+            self.strategies.append((self._fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL))
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
@@ -224,7 +219,7 @@ class Optima:
         for k, strategy in enumerate(strategies):
             own = progress.part(0.6 * k / len(strategies), 0.6 * (k + 1) / len(strategies))
             starts = seed_starts(self._space, strategy, self._rounds == 0, own.part(0, 0.25))
-            self.optimised += optimise_starts(self._space, starts, strategy.level, self._all, own.part(0.25, 1))
+            self.optimised += optimise_starts(self._space, starts, strategy[2], self._all, own.part(0.25, 1))
         waiting = sorted((o for o in self._all if o.coarse_T is None), key=lambda o: -o.value)[:POLISHED]
         for k, _ in enumerate(self._space.workers.map(self._polish, waiting)):
             progress(0.6 + 0.3 * (k + 1) / len(waiting))
@@ -254,15 +249,15 @@ class Optima:
         return best, sum(count for T, _, count in finalists if _same(T, best) or _same(T, top))
 
 
-def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
+def seed_starts(space: SearchSpace, strategy: Strategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
     """The best starts by a strategy that differ. with_prior: the centre of the box is among the candidates."""
-    unit = space.draw()
+    (ranking, score, level), unit = strategy, space.draw()
     if len(unit) > BEST_RANKED:
-        ranked = score_starts(space, strategy.ranking, strategy.level, unit, progress.part(0, 0.7))
+        ranked = score_starts(space, ranking, level, unit, progress.part(0, 0.7))
         unit = unit[np.sort(np.argsort(-ranked, kind="stable")[:BEST_RANKED])]
     if with_prior:
         unit = np.vstack([np.zeros(6), unit])
-    scores = score_starts(space, strategy.score, strategy.level, unit, progress.part(0.7, 1))
+    scores = score_starts(space, score, level, unit, progress.part(0.7, 1))
     picked: list[int] = []
     for k in np.argsort(-scores, kind="stable"):
         if not picked or (np.abs(unit[k] - unit[picked]).max(axis=1) > SAME_START).all():

@@ -85,8 +85,8 @@ def test_the_search_is_seeded_by_classes_too(source, features):
     score = FastScore([features[0]], T, SOURCE.score, 0.9)
     space = SearchSpace(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), guide=consistency)
     by_edges, by_classes = space.strategies[0], space.strategies[-1]
-    assert type(by_classes.score) is type(consistency) is not type(by_edges.score)
-    assert by_classes.level == GUIDE_LEVEL
+    assert type(by_classes[1]) is type(consistency) is not type(by_edges[1])
+    assert by_classes[2] == GUIDE_LEVEL
     starts = np.array(seed_starts(space, by_classes, with_prior=False))
     anywhere = se3.exp_many(np.random.default_rng(0).uniform(-1, 1, (500, 6)) * space.half) @ T
     seeded, by_chance = (consistency.values(some, GUIDE_LEVEL) for some in (starts, anywhere))
