@@ -99,8 +99,8 @@ def search_margin(camera: Camera, box: SearchBox | None) -> float:
 class FastObjective:
     """The method's own objective: oriented edges of sparse points (FastScore).
 
-    features: of one camera. T_prior: (4, 4), decides which points are near the image. constraints: None = none. atlas: of the
-    edge maps, if there is one already. TooFewFeaturesError with too few points near the image.
+    features: of one camera. T_prior: (4, 4), decides which points are near the image. atlas: of the edge maps, if there is one
+    already. TooFewFeaturesError with too few points near the image.
     """
 
     systematic_error = SYSTEMATIC_ERROR
@@ -112,11 +112,11 @@ class FastObjective:
         features: Sequence[FrameFeatures],
         T_prior: Transform,
         config: Config,
-        constraints: PoseConstraints | None = None,
+        constraints: PoseConstraints,
         atlas: Atlas | None = None,
     ) -> None:
         self.features, self.config = list(features), config
-        self.constraints = constraints or PoseConstraints(unlimited(T_prior))
+        self.constraints = constraints
         self.score: PointScore = self._score_near(T_prior, atlas)
         self._excluded: list[int] = []
 
@@ -249,10 +249,10 @@ class ObjectiveMaker:
 
         anchor: None = constraints do not count. The maps that are kept are left to estimates: this is for another thread.
         """
-        config = self.config
-        constraints = pose_constraints(T_prior if anchor is None else anchor, config.constraints, max(len(features), 1))
         if anchor is None:
             constraints = PoseConstraints(unlimited(T_prior))
+        else:
+            constraints = pose_constraints(anchor, self.config.constraints, max(len(features), 1))
         constraints = constraints.within_trust_region(T_prior, *trust_region())
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
         plain = [(f.plain or f).edges_only for f in features]
