@@ -35,12 +35,10 @@ MIN_CURVATURE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason. matched: share
-    of the points with a match in the other scan."""
+    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason."""
 
     twist: Floats | None
     reason: str = ""
-    matched: float = 0.0
 
 
 def needs_ego_motion(frame: Frame, config: MotionConfig) -> bool:
@@ -129,7 +127,7 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats) -> Motion:
         problem = "nothing in sight stands upright: the scans slide along each other"
     elif speed > MAX_SPEED or rate > MAX_TURN_RATE:
         problem = f"{speed:.1f} m/s and {rate:.2f} rad/s are beyond {MAX_SPEED:g} and {MAX_TURN_RATE:g}"
-    return Motion(None if problem else twist, problem, matched)
+    return Motion(None if problem else twist, problem)
 
 
 def align(target: Floats, source: Floats, T: Floats, reach_m: float) -> Any:

@@ -5,7 +5,6 @@ Drivers differ in what they say about rings, so each property is estimated from 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -60,7 +59,7 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
         in_own_frame = known.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * known.spacing)
         if in_own_frame or stays(xyz, ring, MUCH_SHARPER * known.spread):
             return ring, CLOUD_FRAME
-    for candidate, apart in ((_ring_field(cloud), FIELD_APART), (_runs(*angles(xyz)), RUNS_APART)):
+    for candidate, apart in ((_ring_field(cloud), FIELD_APART), (rings_by_order(*angles(xyz), posed=False), RUNS_APART)):
         if candidate is not None:
             fit = fitted_pose(xyz, candidate)
             sharper = fit.spread < MUCH_SHARPER * ring_fit(xyz, candidate).spread
@@ -84,7 +83,7 @@ def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], S
         ring = _ring_field(cloud)
         if ring is not None and keeps_elevation(ring, elevation):
             return ring, pose
-        runs = _runs(azimuth, elevation)
+        runs = rings_by_order(azimuth, elevation, posed=False)
         fit = None if runs is None else fitted_pose(cloud.xyz, runs, pose)
         if runs is None or fit is None or not fit.apart:
             runs = rings_by_elevation(own, elevation)
@@ -140,50 +139,33 @@ def keeps_elevation(ring: NDArray[np.int32], elevation: Angles) -> bool:
     return _ring_spread(compact, elevation) <= MAX_RING_SPREAD * _mean_deviation(elevation)
 
 
-def rings_by_order(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
+def rings_by_order(azimuth: Angles, elevation: Angles, posed: bool = True) -> NDArray[np.int32] | None:
     """Rings as runs of monotonic azimuth, (n,) int32; None if the points are not stored ring after ring. Of the starts tried, the
-    one whose runs spread least in elevation wins."""
-    turn, sign = _turns(azimuth)
-    if turn is None:
+    one whose runs spread least in elevation wins. posed: False = as seen from a wrong pose."""
+    turn = np.diff(azimuth)
+    turn -= (2 * np.pi * np.rint(turn / (2 * np.pi))).astype(turn.dtype)
+    sign = 1.0 if np.count_nonzero(turn > 0) >= np.count_nonzero(turn < 0) else -1.0
+    if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn):
         return None
-    limit = MAX_RUN_SPREAD * _mean_deviation(elevation)
-    every = max(len(azimuth) // HISTOGRAM_POINTS, 1) | 1
-    starts = (0.0, np.pi, float(azimuth[0]) - sign * 1e-3)
-    return _best_runs(azimuth, sign, starts, lambda ring: _ring_spread(ring[::every], elevation[::every]), limit)
-
-
-def _runs(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
-    """Runs of monotonic azimuth, (n,) int32, as seen from a wrong pose; None if the points are not stored in such."""
-    turn, sign = _turns(azimuth)
-    if turn is None:
-        return None
-    # They end where the elevation jumps to another ring's. Its spread does not tell: a start half a turn aside mixes evenly.
-    step = np.abs(np.diff(elevation))
-    starts = (0.0, np.pi, float(azimuth[0]) - sign * 1e-3, _cut(azimuth, step, sign * float(np.median(np.abs(turn)))))
-    return _best_runs(azimuth, sign, starts, lambda ring: -float(np.median(step[np.diff(ring) > 0])), np.inf)
-
-
-def _best_runs(
-    azimuth: Angles, sign: float, starts: Sequence[float], cost: Callable[[NDArray[np.int32]], float], limit: float
-) -> NDArray[np.int32] | None:
-    """Of the runs of azimuths that begin at each of the starts, those of the least cost below the limit."""
-    tried = []
+    starts = [0.0, np.pi, float(azimuth[0]) - sign * 1e-3]
+    every, best = max(len(azimuth) // HISTOGRAM_POINTS, 1) | 1, None
+    if posed:
+        least = MAX_RUN_SPREAD * _mean_deviation(elevation)
+    else:
+        step, least = np.abs(np.diff(elevation)), np.inf
+        starts.append(_cut(azimuth, step, sign * float(np.median(np.abs(turn)))))
     for start in starts:
         angle = np.mod(sign * (azimuth - start), 2 * np.pi)
         span = float(np.ptp(angle))
         ring = np.concatenate([[0], np.cumsum(np.diff(angle) < -0.5 * span)]).astype(np.int32)
-        if MIN_RINGS <= int(ring[-1]) + 1 <= MAX_RINGS and span >= 0.1:
-            tried.append(ring)
-    least, best = min(((cost(ring), k) for k, ring in enumerate(tried)), default=(np.inf, 0))
-    return tried[best] if least < limit else None
-
-
-def _turns(azimuth: Angles) -> tuple[Angles | None, float]:
-    """Steps (n - 1,) of the azimuth and the sign of most; None if too many go the other way."""
-    turn = np.diff(azimuth)
-    turn -= (2 * np.pi * np.rint(turn / (2 * np.pi))).astype(turn.dtype)
-    sign = 1.0 if np.count_nonzero(turn > 0) >= np.count_nonzero(turn < 0) else -1.0
-    return (None if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn) else turn), sign
+        if not (MIN_RINGS <= int(ring[-1]) + 1 <= MAX_RINGS and span >= 0.1):
+            continue
+        # From a wrong pose the spread does not tell, since a start half a turn aside mixes evenly; but runs end where the
+        # elevation jumps to another ring's.
+        cost = _ring_spread(ring[::every], elevation[::every]) if posed else -float(np.median(step[np.diff(ring) > 0]))
+        if cost < least:
+            least, best = cost, ring
+    return best
 
 
 def _cut(azimuth: Angles, step: Angles, turn: float) -> float:
