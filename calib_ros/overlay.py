@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import MIN_DEPTH, Camera
-from calib_ros.config import ImageConfig
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import equalize, to_gray
@@ -199,7 +198,7 @@ def render(
 
 def _backdrop(image: Image) -> Image:
     """The image nearly grey and dimmed, so that bright colours are the LiDAR's; equalised, so that edges in the shade show."""
-    gray = cv2.cvtColor(equalize(to_gray(image), ImageConfig()), cv2.COLOR_GRAY2BGR)
+    gray = cv2.cvtColor(equalize(to_gray(image)), cv2.COLOR_GRAY2BGR)
     return np.asarray(cv2.addWeighted(image if image.ndim == 3 else gray, 0.2, gray, 0.45, 0), np.uint8)
 
 
