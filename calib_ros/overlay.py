@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import MIN_DEPTH, Camera
-from calib_ros.config import ImageConfig
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import equalize, to_gray
@@ -179,7 +178,7 @@ def render(
     plan = layout(width, height, len(views))
     canvas = np.full((plan.size[1], plan.size[0], 3), BAR, np.uint8)
     # The image nearly grey and dimmed, so that bright colours are the LiDAR's; equalised, so that edges in the shade show.
-    gray = cv2.cvtColor(equalize(to_gray(frame.image), ImageConfig()), cv2.COLOR_GRAY2BGR)
+    gray = cv2.cvtColor(equalize(to_gray(frame.image)), cv2.COLOR_GRAY2BGR)
     backdrop = cv2.addWeighted(frame.image if frame.image.ndim == 3 else gray, 0.2, gray, 0.45, 0)
     for name, T_view, (x, y) in zip(views, transforms, plan.panels, strict=True):
         panel = canvas[y : y + height, x : x + width]

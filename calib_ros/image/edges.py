@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import ImageConfig
-from calib_ros.image.enhance import prepare, reach
+from calib_ros.image.enhance import BILATERAL_DIAMETER, prepare
 from calib_ros.image.mask import filled, without_border
 
 Map = NDArray[np.float32]
@@ -60,9 +59,7 @@ class EdgeLevel:
         return np.asarray(self.packed * np.float32(UNIT), np.float32)
 
 
-def oriented_edges(
-    gray: NDArray[np.uint8], config: ImageConfig, used: Mask | None = None, across: Map | None = None
-) -> tuple[Map, ...]:
+def oriented_edges(gray: NDArray[np.uint8], used: Mask | None = None, across: Map | None = None) -> tuple[Map, ...]:
     """Prepared grey image (H, W) -> edge strength of horizontal and of vertical gradients, two (H, W) maps in 0..1.
 
     Sobel magnitude, saturated at a percentile, half of it thinned by non-maximum suppression, split by the direction of
@@ -132,7 +129,6 @@ def _is_ridge(magnitude: Map, axis: int) -> NDArray[np.bool_]:
 def edge_levels(
     image: NDArray[np.uint8],
     focal_length: float,
-    config: ImageConfig,
     semantic: Map | None = None,
     share: float = 0.0,
     used: Mask | None = None,
@@ -144,8 +140,8 @@ def edge_levels(
     to be no edges, nor one along the border; None = everywhere. across: see `oriented_edges`.
     """
     if used is not None:
-        used = without_border(used, reach(config) + EDGE_REACH)
-    edges = oriented_edges(prepare(image, config), config, used, across)
+        used = without_border(used, BILATERAL_DIAMETER // 2 + EDGE_REACH)
+    edges = oriented_edges(prepare(image), used, across)
     if semantic is not None:
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
     if used is not None:

@@ -160,7 +160,7 @@ class FeatureExtractor:
         if plain is not None:
             levels = plain.levels
         else:
-            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, used=self.used, across=self.across)
+            levels = edge_levels(image, float(self.camera.K[0, 0]), used=self.used, across=self.across)
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
         facts = (self.camera, frame.stamp, frame.name, reflectivity, twist, by_azimuth)
         features = FrameFeatures(points, levels, *facts)
@@ -186,9 +186,7 @@ class FeatureExtractor:
 
     def seen_anew(self, features: FrameFeatures, image: NDArray[np.uint8]) -> FrameFeatures:
         """Features of the same scan, had this camera taken the image; without semantics."""
-        levels = edge_levels(
-            self.working_image(image), float(self.camera.K[0, 0]), self.config.image, used=self.used, across=self.across
-        )
+        levels = edge_levels(self.working_image(image), float(self.camera.K[0, 0]), used=self.used, across=self.across)
         return replace(features, levels=levels, camera=self.camera, plain=None, view=None)
 
     def _with_semantics(
@@ -201,7 +199,7 @@ class FeatureExtractor:
             points = replace(points, strength=points.strength * edge_weights(points.label))
         if edges is not None:
             focal = float(features.camera.K[0, 0])
-            levels = edge_levels(image, focal, self.config.image, edges, EDGE_SHARE, self.used, self.across)
+            levels = edge_levels(image, focal, edges, EDGE_SHARE, self.used, self.across)
         out = replace(features, points=points, levels=levels, plain=features)
         if models is None or semantics.classes is None or frame.cloud.label is None:
             return out
