@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import pandas as pd
 import yaml
@@ -66,30 +66,30 @@ class StudyReport:
     facts: Mapping[str, str] = field(default_factory=dict)
 
 
-class Study(Protocol):
+class Study:
     """What is done with the sources of an evaluation."""
 
     @property
-    def about(self) -> Mapping[str, str]:
-        """What the answers depend on, beside sources, configuration and code."""
-        ...
+    def about(self) -> dict[str, str]:
+        """What the answers depend on beside sources, configuration and code."""
+        return {}
 
     def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
         """All there is to do, in the order of the report. BadInputError for sources that do not fit the study."""
-        ...
+        raise NotImplementedError
 
     def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
         """The answers, in order."""
-        ...
+        return run_jobs(setup, todo)
 
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class Experiments:
-    """Those of the thesis and more; a Study. methods: in the order of the report."""
+class Experiments(Study):
+    """Those of the thesis and more. methods: in the order of the report."""
 
     plan: Plan = FULL
     methods: tuple[str, ...] = NAMES
@@ -98,18 +98,9 @@ class Experiments:
     def __post_init__(self) -> None:
         check_names(self.methods)
 
-    @property
-    def about(self) -> Mapping[str, str]:
-        """See Study."""
-        return {}
-
     def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
         """See Study."""
         return jobs(self.plan, summaries, self.methods, self.experiments)
-
-    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
-        """See Study."""
-        return run_jobs(setup, todo)
 
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """See Study."""

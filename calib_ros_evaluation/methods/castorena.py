@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.registration.score.point_score import Score, project
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import AXES, LEVEL
-from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, near
+from calib_ros_evaluation.methods.method import Outcome, PointFeatures, Viewing, Watched, near
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -138,15 +137,6 @@ def fista(
     return np.asarray(se3.exp(best * AXES) @ T), highest
 
 
-@dataclass(frozen=True, eq=False)
-class CastorenaFeatures:
-    """Of one frame. gray: (h, w) uint8. xyz: (n, 3) float32 m, LiDAR frame, far ones first."""
-
-    camera: Camera
-    gray: NDArray[np.uint8]
-    xyz: NDArray[np.float32]
-
-
 @dataclass(frozen=True)
 class Castorena(Viewing):
     """Method: -F of eq. 4.4, by FISTA.
@@ -173,17 +163,18 @@ class Castorena(Viewing):
     name: str = "castorena"
     title: str = "Castorena et al. (2016): edges of the completed depth map on image edges"
 
-    def features(self, frame: Frame) -> CastorenaFeatures:
-        """Picture and points. TooFewFeaturesError if hardly anything returned."""
-        view = self._preprocess(frame)
-        order = np.argsort(-np.linalg.norm(view.xyz, axis=1), kind="stable")
-        return CastorenaFeatures(view.camera, view.gray, view.xyz[order])
+    def features(self, frame: Frame) -> PointFeatures:
+        """The grey picture, and all points with their distance, far ones first. TooFewFeaturesError if hardly anything
+        returned."""
+        view, _, _ = self._preprocess(frame)
+        distance = np.linalg.norm(view.xyz, axis=1)
+        return replace(view, value=distance).select(np.argsort(-distance, kind="stable"))
 
-    def score(self, features: Sequence[CastorenaFeatures], T_prior: Matrix) -> CastorenaScore:
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> CastorenaScore:
         """Mean of the frames' scores. TooFewFeaturesError for fewer than min_points per frame near the image at T_prior."""
         return CastorenaScore(self, features, T_prior, self.scales[-1])
 
-    def optimise(self, features: Sequence[CastorenaFeatures], T: Matrix, reach: SearchBox) -> Outcome:
+    def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """FISTA within reach, coarse to fine; the evaluations of all searches are counted."""
         watched, found = Watched(self.score(features, T)), T
         start = watched.value(T)
@@ -218,14 +209,12 @@ def misfit(weights: tuple[Map, Map], steepness: tuple[Map, Map]) -> float:
 class CastorenaScore:
     """-|Omega| F, the mean over frames, with both blurs `scale` times as wide as the method says; a Score."""
 
-    def __init__(self, method: Castorena, features: Sequence[CastorenaFeatures], T_prior: Matrix, scale: float) -> None:
-        points = near(features, T_prior, method.margin, method.min_points, "near the image")
+    def __init__(self, method: Castorena, features: Sequence[PointFeatures], T_prior: Matrix, scale: float) -> None:
+        kept = near(features, T_prior, method.margin, method.min_points, "near the image")
         self.camera = camera = features[0].camera
         self._complete = DepthCompletion(camera.height, camera.width, method.depth_sigma * scale)
-        self._frames = []
-        for own, kept in zip(features, points, strict=True):
-            weights = edge_weights(own.gray, method.gamma, method.image_sigma * scale)
-            self._frames.append((own.xyz[kept], weights.reshape(2, -1)))
+        sigma = method.image_sigma * scale
+        self._frames = [(f.xyz, edge_weights(f.image, method.gamma, sigma).reshape(2, -1)) for f in kept]
 
     def value(self, T: Matrix) -> float:
         """At T_camera_lidar (4, 4)."""

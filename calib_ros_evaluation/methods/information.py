@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import entr
 
-from calib_ros.camera import Camera
-from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
-from calib_ros_evaluation.methods.method import PreprocessedFrame
+from calib_ros.errors import BadInputError
+from calib_ros.registration.score.point_score import MIN_POINTS
+from calib_ros_evaluation.methods.method import PointFeatures, require
 
 Matrix = NDArray[np.float64]
 TAIL = 4  # standard deviations; a Gaussian kernel is cut off where 6e-5 of its mass is left
@@ -71,42 +67,18 @@ def _kernel(bandwidth: float) -> NDArray[np.float32]:
     return np.asarray((weight / weight.sum())[:, None], np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class LitPoints:
-    """light: (h, w) grey values or their bins. camera: its pinhole. xyz: (n, 3) float32 m, LiDAR frame. level: (n,) bin of each
-    point's reflectivity."""
-
-    light: NDArray[np.uint8]
-    camera: Camera
-    xyz: NDArray[np.float32]
-    level: NDArray[np.intp]
-
-    def select(self, keep: NDArray[np.intp]) -> LitPoints:
-        """Some of the points, by index."""
-        return replace(self, xyz=self.xyz[keep], level=self.level[keep])
-
-
-def known_reflectivity(view: PreprocessedFrame, frame_name: str) -> NDArray[np.float32]:
-    """Reflectivity (n,) of a view's points, 0..1. BadInputError if it has none."""
-    if view.reflectivity is None:
+def known_reflectivity(known: NDArray[np.float32] | None, frame_name: str) -> NDArray[np.float32]:
+    """Reflectivity (n,) of a frame's points, 0..1. BadInputError if it has none."""
+    if known is None:
         raise BadInputError(
             f"frame {frame_name}: the cloud has no reflectivity, or the same everywhere, and this method compares nothing else; "
             "record the field intensity, or leave this method out"
         )
-    return view.reflectivity
+    return known
 
 
-def all_near_image(features: Sequence[LitPoints], T: Matrix) -> list[LitPoints]:
-    """The points of every frame that project near the image at T (4, 4): within MARGIN of its width."""
-    return enough([f.select(near_image(f.xyz, T, f.camera, MARGIN)) for f in features])
-
-
-def enough(features: list[LitPoints]) -> list[LitPoints]:
+def enough(features: list[PointFeatures]) -> list[PointFeatures]:
     """The same; TooFewFeaturesError if they have fewer than MIN_POINTS points in all."""
-    found = sum(len(f.xyz) for f in features)
-    if found < MIN_POINTS:
-        raise TooFewFeaturesError(
-            f"only {found} points near the image in {len(features)} frames (need {MIN_POINTS}); "
-            "check the initial extrinsic and that the LiDAR sees what the camera sees"
-        )
+    advice = "check the initial extrinsic and that the LiDAR sees what the camera sees"
+    require(sum(len(f.xyz) for f in features), MIN_POINTS, f"near the image in {len(features)} frames", advice)
     return features

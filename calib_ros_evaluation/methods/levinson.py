@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import cv2
@@ -13,12 +13,11 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from calib_ros import se3
-from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, near, require
+from calib_ros_evaluation.methods.method import Outcome, PointFeatures, Viewing, Watched, near, require
 from calib_ros_thesis.cloud import discontinuity
 
 Matrix = NDArray[np.float64]
@@ -98,17 +97,6 @@ def spread(E: NDArray[np.uint8], gamma: float) -> Map:
     return np.asarray(F, np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class LevinsonFeatures:
-    """Of one frame. xyz: (n, 3) float32 m, LiDAR frame, the points behind which it is far. xi: (n,) float32, eq. 4.3.
-    edginess: D of eq. 4.2, (h, w) float32 grey levels."""
-
-    camera: Camera
-    xyz: NDArray[np.float32]
-    xi: NDArray[np.float32]
-    edginess: Map
-
-
 @dataclass(frozen=True)
 class Levinson(Viewing):
     """Method: the sum of xi D, by grid search. alpha, gamma, exponent and least_m are the published ones.
@@ -129,20 +117,20 @@ class Levinson(Viewing):
     name: str = "levinson"
     title: str = "Levinson and Thrun (2013): depth discontinuities on image edges"
 
-    def features(self, frame: Frame) -> LevinsonFeatures:
+    def features(self, frame: Frame) -> PointFeatures:
         """Points in front of a depth discontinuity of more than least_m, and D. TooFewFeaturesError for fewer than min_points."""
-        view = self._preprocess(frame)
-        jump = discontinuity(view.measured)
+        view, measured, _ = self._preprocess(frame)
+        jump = discontinuity(measured)
         keep = np.flatnonzero(jump > self.least_m)
         require(len(keep), self.min_points, WHAT, "check that the LiDAR sees objects in front of others")
-        D = edginess(edge_image(view.gray), self.alpha, self.gamma)
-        return LevinsonFeatures(view.camera, view.xyz[keep], jump[keep] ** np.float32(self.exponent), D)
+        D = edginess(edge_image(view.image), self.alpha, self.gamma)
+        return replace(view, image=D, value=jump ** np.float32(self.exponent)).select(keep)
 
-    def score(self, features: Sequence[LevinsonFeatures], T_prior: Matrix) -> LevinsonScore:
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> LevinsonScore:
         """Mean of the frames' J. TooFewFeaturesError for fewer than min_points per frame near the image at T_prior."""
         return LevinsonScore(features, T_prior, self.margin, self.min_points)
 
-    def optimise(self, features: Sequence[LevinsonFeatures], T: Matrix, reach: SearchBox) -> Outcome:
+    def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Grid search within reach, by steps from half of it."""
         score = self.score(features, T)
         watched = Watched(score)
@@ -151,23 +139,15 @@ class Levinson(Viewing):
         return Outcome(found, watched.evaluations)
 
 
-@dataclass(frozen=True, eq=False)
-class _FramePoints:
-    """Of one frame, near the image. xyz: (3, n). xi: (n,). table: D (h + 1, w + 1) ravelled, 0 in the last row and column."""
-
-    xyz: Map
-    xi: Map
-    table: Map
-
-
 class LevinsonScore:
     """J of eq. 4.3, the mean over frames; a Score. Points outside the image, or less than MIN_DEPTH in front of it, add 0."""
 
-    def __init__(self, features: Sequence[LevinsonFeatures], T_prior: Matrix, margin: float, min_points: int) -> None:
-        self._frames: list[_FramePoints] = []
-        for own, kept in zip(features, near(features, T_prior, margin, min_points, WHAT), strict=True):
-            table = np.pad(own.edginess, ((0, 1), (0, 1))).ravel()
-            self._frames.append(_FramePoints(np.ascontiguousarray(own.xyz[kept].T), own.xi[kept], table))
+    def __init__(self, features: Sequence[PointFeatures], T_prior: Matrix, margin: float, min_points: int) -> None:
+        # (3, n) points, (n,) xi, and D (h + 1, w + 1) ravelled, 0 in the last row and column.
+        self._frames = [
+            (np.ascontiguousarray(f.xyz.T), f.value, np.pad(f.image, ((0, 1), (0, 1))).ravel())
+            for f in near(features, T_prior, margin, min_points, WHAT)
+        ]
         self.camera = features[0].camera
 
     def value(self, T: Matrix) -> float:
@@ -178,16 +158,16 @@ class LevinsonScore:
         """At many T_camera_lidar (k, 4, 4) at once: (k,)."""
         M = (self.camera.K @ transforms[:, :3]).astype(np.float32)
         total = np.zeros(len(M))
-        for own in self._frames:
-            step = max(BLOCK // max(len(own.xi), 1), 1)
+        for xyz, xi, table in self._frames:
+            step = max(BLOCK // max(len(xi), 1), 1)
             for k in range(0, len(M), step):
-                total[k : k + step] += self._sampled(own, M[k : k + step]) @ own.xi
+                total[k : k + step] += self._sampled(xyz, table, M[k : k + step]) @ xi
         return total / len(self._frames)
 
-    def _sampled(self, own: _FramePoints, M: Map) -> Map:
-        """D (k, n) under the points by projections M (k, 3, 4)."""
-        width, height, n = self.camera.width, self.camera.height, len(own.xi)
-        p = (M[:, :, :3].reshape(-1, 3) @ own.xyz).reshape(len(M), 3, n)
+    def _sampled(self, xyz: Map, table: Map, M: Map) -> Map:
+        """D (k, n) under the points (3, n) by projections M (k, 3, 4)."""
+        width, height, n = self.camera.width, self.camera.height, xyz.shape[1]
+        p = (M[:, :, :3].reshape(-1, 3) @ xyz).reshape(len(M), 3, n)
         p += M[:, :, 3:]
         u, v, z = p[:, 0], p[:, 1], p[:, 2]
         outside = z < MIN_DEPTH
@@ -199,7 +179,7 @@ class LevinsonScore:
         u[outside], v[outside] = width, height
         v *= width + 1
         v += u  # exact: pictures of less than 2^24 pixels
-        return own.table.take(v.astype(np.int32))
+        return table.take(v.astype(np.int32))
 
 
 def fitted(shares: Sequence[float]) -> tuple[float, float]:

@@ -8,7 +8,7 @@ a simplex, starts again from where it ended until it ends near there. Several fr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -22,13 +22,12 @@ from calib_ros.registration.score.point_score import project
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.information import (
-    LitPoints,
     enough,
     joint_counts,
     known_reflectivity,
     normalised_information_distance,
 )
-from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, search_limits
+from calib_ros_evaluation.methods.method import Outcome, PointFeatures, Viewing, Watched, search_limits
 
 Matrix = NDArray[np.float64]
 BINS = 16  # published
@@ -38,20 +37,20 @@ BINS = 16  # published
 class DistanceScore:
     """Less the mean of the frames' distances: -1, nothing in common, to 0. frames: with the points that are not hidden."""
 
-    frames: Sequence[LitPoints]
+    frames: Sequence[PointFeatures]
 
     def value(self, T: Matrix) -> float:
         """At T_camera_lidar (4, 4); a frame without a point in the image has a distance of 1."""
         return -float(np.mean([_distance(frame, T) for frame in self.frames]))
 
 
-def _distance(frame: LitPoints, T: Matrix) -> float:
+def _distance(frame: PointFeatures, T: Matrix) -> float:
     u, v, points = project(frame.xyz, T, frame.camera)
-    counts = joint_counts(frame.level[points], frame.light[v, u], BINS)
+    counts = joint_counts(frame.value[points], frame.image[v, u], BINS)
     return normalised_information_distance(counts / len(points)) if len(points) else 1.0
 
 
-def unhidden(frame: LitPoints, T: Matrix, tolerance: float) -> NDArray[np.intp]:
+def unhidden(frame: PointFeatures, T: Matrix, tolerance: float) -> NDArray[np.intp]:
     """Indices of the points in the image at T (4, 4) that are at most `tolerance` m farther from the camera than the
     nearest point of their pixel."""
     u, v, points = project(frame.xyz, T, frame.camera)
@@ -80,18 +79,18 @@ class Nid(Viewing):
     name: str = "nid"
     title: str = "Koide et al. 2023: normalised information distance of reflectivity and grey value"
 
-    def features(self, frame: Frame) -> LitPoints:
+    def features(self, frame: Frame) -> PointFeatures:
         """All points and their equalised reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty.
 
         Equalised is the rank among all points of the cloud. Points of the same reflectivity share their mean rank: where the
         sensor gives few values, ranks by order alone would tell where a point stands in the scan.
         """
-        view = self._preprocess(frame)
-        rank = (rankdata(known_reflectivity(view, frame.name)) - 0.5) / len(view.xyz)
+        view, _, known = self._preprocess(frame)
+        rank = (rankdata(known_reflectivity(known, frame.name)) - 0.5) / len(view.xyz)
         shade = np.minimum(np.arange(256) * BINS // 255, BINS - 1).astype(np.uint8)
-        return LitPoints(shade[cv2.equalizeHist(view.gray)], view.camera, view.xyz, (rank * BINS).astype(np.intp))
+        return replace(view, image=shade[cv2.equalizeHist(view.image)], value=(rank * BINS).astype(np.intp))
 
-    def score(self, features: Sequence[LitPoints], T_prior: Matrix) -> DistanceScore:
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> DistanceScore:
         """What is maximised while what is hidden stays as it is at T_prior (4, 4), and only points in its image count.
 
         TooFewFeaturesError if there is hardly any.
@@ -99,7 +98,7 @@ class Nid(Viewing):
         seen = [f.select(unhidden(f, T_prior, self.tolerance_m)) for f in features]
         return DistanceScore(enough(seen))
 
-    def optimise(self, features: Sequence[LitPoints], T: Matrix, reach: SearchBox) -> Outcome:
+    def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Nelder and Mead's simplex from T (4, 4), again and again; every search has its own score.
 
         A reach of zero refines: a small first simplex, no bounds.

@@ -19,7 +19,7 @@ from calib_ros_check.checker import Checker
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict, Tolerance
 from calib_ros_evaluation.csv_files import numbers, read_table
-from calib_ros_evaluation.evaluate import StudyReport
+from calib_ros_evaluation.evaluate import Study, StudyReport
 from calib_ros_evaluation.experiments.answers import Answers, read_answers
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, WorkerCache, worker_cache
@@ -40,15 +40,15 @@ RIGHT, WRONG, INCONCLUSIVE = "right", "wrong", "inconclusive"
 
 
 @dataclass(frozen=True, eq=False)
-class Detection:
-    """A Study: a check of every row of the published table whose frame the source has, with every number of frames in `counts`:
+class Detection(Study):
+    """A check of every row of the published table whose frame the source has, with every number of frames in `counts`:
     its own and those that follow in the source, the first after the last."""
 
     rows: pd.DataFrame
     counts: tuple[int, ...]
 
     @property
-    def about(self) -> Mapping[str, str]:
+    def about(self) -> dict[str, str]:
         """See Study."""
         return {"protocol": MISCALIBRATION}
 

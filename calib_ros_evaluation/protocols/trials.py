@@ -4,17 +4,16 @@ our trials stand beside the published figures."""
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.csv_files import TRIALS
-from calib_ros_evaluation.evaluate import StudyReport
-from calib_ros_evaluation.experiments.answers import Answers, read_answers, run_jobs, trial_of
+from calib_ros_evaluation.evaluate import Study, StudyReport
+from calib_ros_evaluation.experiments.answers import Answers, read_answers, trial_of
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary
 from calib_ros_evaluation.methods.own import Own
@@ -31,8 +30,8 @@ HEADER = (
 
 
 @dataclass(frozen=True)
-class Calibrations:
-    """A Study: so many trials of every source, size of start error and number of frames in `counts`. Trial k has the seed `seed`
+class Calibrations(Study):
+    """So many trials of every source, size of start error and number of frames in `counts`. Trial k has the seed `seed`
     + k."""
 
     protocol: Protocol
@@ -41,7 +40,7 @@ class Calibrations:
     seed: int = 0
 
     @property
-    def about(self) -> Mapping[str, str]:
+    def about(self) -> dict[str, str]:
         """See Study."""
         return {"protocol": self.protocol.name}
 
@@ -56,10 +55,6 @@ class Calibrations:
             for count in self.counts
             for k in range(self.seed, self.seed + self.trials)
         ]
-
-    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
-        """See Study."""
-        return run_jobs(setup, todo)
 
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """See Study. A table for each size of start error."""

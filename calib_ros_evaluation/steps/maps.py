@@ -45,7 +45,7 @@ from calib_ros_thesis.score import MAX_DISCONTINUITY
 
 Levels = NDArray[np.int16]
 SECTION = "3.4.3"
-step = partial(Step, SECTION)
+step, wide_step = partial(Step, SECTION), partial(Step, SECTION, wide=True)
 
 
 def completion_stages(sparse_depth: Levels, far: int) -> list[tuple[str, Levels]]:
@@ -88,12 +88,11 @@ def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
             f"Figure 3.13. {text} {shown.mean():.1%} of the pixels are filled.",
             draw(levels / DEPTH_UNITS, shown),
         )
-    yield step(
+    yield wide_step(
         "Completion, magnified",
         "Figure 3.13 on the part of the picture with the strongest jumps, pixel by pixel: from single points to a surface. "
         "The last step but the inversion back is a median blur, which takes away what sticks out of a surface.",
         _magnified(stages, scene.maps.discontinuity, inverted),
-        wide=True,
     )
 
 

@@ -32,7 +32,7 @@ from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.score import MAX_DISCONTINUITY, RegistrationMaps, ThesisScore, registration_maps
 
 SECTION = "3.4.4"
-step = partial(Step, SECTION)
+step, wide_step = partial(Step, SECTION), partial(Step, SECTION, wide=True)
 ROTATION_DEG, TRANSLATION_M = 2.0, 0.3  # half widths of the curves
 EDGE_SHOWN = 0.1  # W D + E^L from here on is drawn over the image
 STRONG = 0.25  # E^I that counts as an edge beneath, in captions
@@ -149,12 +149,11 @@ def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score |
         pairs["fast score"] = [fast.value(scene.T), fast.value(scene.wrong)]
     for name, (a, b) in pairs.items():
         rows.append((name, f"{a:.4g}", f"{b:.4g}", f"{a / b:.2f}" if b > 0 else "-"))
-    return step(
+    return wide_step(
         "Scores",
         f"The same frame at the extrinsic of this page and moved {WRONG_DEG:g} deg and {100 * WRONG_M:g} cm to the side. The "
         "more a score falls, the better it separates a right extrinsic from a wrong one.",
         table=tuple(rows),
-        wide=True,
     )
 
 
@@ -171,21 +170,19 @@ def _curve_steps(scene: RegisteredFrame, fast: Score | None, samples: int) -> It
     if fast is not None:
         found["fast score"] = curves(fast, scene.T, ROTATION_DEG, TRANSLATION_M, samples)
     missing = "" if fast is not None else " The scan shows too few edge points for the fast score."
-    yield step(
+    yield wide_step(
         "Loss curves",
         "Scores along each axis around the extrinsic of this page, the others at rest, as in figures 4.7 and 4.10; every "
         f"curve is scaled to 0..1 and its peak marked. Axes are the camera's: x right, y down, z ahead.{missing} A good score "
         "has one hill, which peaks at the true extrinsic.",
         loss_curves(found),
-        wide=True,
     )
     rows = [("peak at", *(f"{axis}, {'deg' if k < 3 else 'cm'}" for k, axis in enumerate(AXES)))]
     for name, curve in found.items():
         rows.append((name, *(f"{p:+.2f}" if k < 3 else f"{p:+.1f}" for k, p in enumerate(curve.peaks))))
-    yield step(
+    yield wide_step(
         "Peaks",
         f"Where each curve is highest, within {ROTATION_DEG:g} deg and {100 * TRANSLATION_M:g} cm. A single frame may show an "
         "axis badly: then its curve is flat and its peak far off.",
         table=tuple(rows),
-        wide=True,
     )

@@ -10,18 +10,9 @@ import pytest
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.castorena import (
-    Castorena,
-    CastorenaFeatures,
-    DepthCompletion,
-    edge_weights,
-    fista,
-    misfit,
-    slopes,
-)
+from calib_ros_evaluation.methods.castorena import Castorena, DepthCompletion, edge_weights, fista, misfit, slopes
 from calib_ros_evaluation.methods.levinson import (
     Levinson,
-    LevinsonFeatures,
     edge_image,
     edginess,
     grid_search,
@@ -29,7 +20,7 @@ from calib_ros_evaluation.methods.levinson import (
     spread,
     worse_share,
 )
-from calib_ros_evaluation.methods.method import Watched
+from calib_ros_evaluation.methods.method import PointFeatures, Watched
 
 
 class Bowl:
@@ -95,7 +86,7 @@ def test_score_of_three_points():
     D = np.arange(12, dtype=np.float32).reshape(3, 4)  # D[v, u] = 4 v + u
     xyz = np.array([[1, 0, 1], [6, 4, 2], [-1, 0, 1], [1, 1, -1]], np.float32)  # pixels (1, 0), (3, 2), left of it, behind it
     camera, xi = pinhole(4, 3), np.array([2.0, 3.0, 5.0, 7.0], np.float32)
-    score = Levinson(min_points=1, margin=1.0).score([LevinsonFeatures(camera, xyz, xi, D)], np.eye(4))
+    score = Levinson(min_points=1, margin=1.0).score([PointFeatures(camera, D, xyz, xi)], np.eye(4))
     assert score.value(np.eye(4)) == pytest.approx(2 * 1 + 3 * 11)  # D[0, 1] = 1, D[2, 3] = 11; the others add nothing
     # A pixel to the right at depth 1, half a pixel at depth 2: (2, 0), (3.5 -> 4, 2), which is outside, and (0, 0).
     right = se3.from_parts(np.eye(3), [1, 0, 0])
@@ -183,7 +174,7 @@ def test_score_is_the_misfit_of_visible_points():
     u, v = (a.ravel() for a in np.meshgrid(np.arange(18), np.arange(10)))
     depth = np.where(u < 10, 2.0, 6.0)
     xyz = np.stack([u / 10 * depth, v / 10 * depth, depth], 1).astype(np.float32)[np.argsort(-depth, kind="stable")]
-    score = Castorena(min_points=10).score([CastorenaFeatures(camera, gray, xyz)], np.eye(4))
+    score = Castorena(min_points=10).score([PointFeatures(camera, gray, xyz, depth)], np.eye(4))
     turned = [score.value(se3.exp([0, angle, 0, 0, 0, 0])) for angle in (-0.2, 0, 0.2)]
     assert turned[1] > max(turned[0], turned[2])
     behind = se3.from_parts(np.eye(3), [0, 0, -50])

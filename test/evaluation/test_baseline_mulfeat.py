@@ -12,8 +12,8 @@ from calib_ros.config import Config
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import range_image, reflectivity
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import search_limits, typical_step_deg
-from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatFeatures, MulfeatScore, edge_probability
+from calib_ros_evaluation.methods.method import PointFeatures, search_limits, typical_step_deg
+from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatScore, edge_probability
 
 IDENTITY = np.eye(4)  # the points are given in the camera's frame
 CAMERA = Camera(np.array([[50.0, 0, 19.5], [0, 50.0, 11.5], [0, 0, 1]]), 40, 24)
@@ -28,12 +28,12 @@ def at_pixels(u: list[float], v: list[float], z: float = 10.0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def three() -> MulfeatFeatures:
+def three() -> PointFeatures:
     """P = 0.5, 0.25, 0.1 on pixels (3, 2), (10, 5), (20, 8), where E^C = 0.8, 0.2, 0.6; and one of P = 0.9 beside the image."""
     E = np.zeros((24, 40), np.float32)
     E[2, 3], E[5, 10], E[8, 20], E[5, 11] = 0.8, 0.2, 0.6, 0.4
     xyz = at_pixels([3, 10, 20, 45], [2, 5, 8, 5])
-    return MulfeatFeatures(CAMERA, xyz, np.array([0.5, 0.25, 0.1, 0.9], np.float32), E)
+    return PointFeatures(CAMERA, E, xyz, np.array([0.5, 0.25, 0.1, 0.9], np.float32))
 
 
 def test_the_score_by_hand(three):
