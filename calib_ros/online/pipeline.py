@@ -32,7 +32,7 @@ from calib_ros.online.pacing import LoadBudget, Work
 from calib_ros.online.pairing.pairing import Intake, Pairing
 from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.requests import ESTIMATE, Job, Requests
+from calib_ros.online.requests import ESTIMATE, Pending, Requests
 from calib_ros.online.worker import Worker
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.progress import Callback
@@ -152,11 +152,11 @@ class Pipeline:
         that waited for it; the extrinsic stays. progress: called on the thread of estimates; must not raise.
         """
         with self._lock:
-            future = self._requests.add(Job(ESTIMATE), self._keyframes_seen(), progress)
+            future = self._requests.add(Pending(ESTIMATE), self._keyframes_seen(), progress)
         self._estimator.put(None)
         return future
 
-    def defer(self, job: Job, obstacle: str = "") -> Future[Any]:
+    def defer(self, job: Pending, obstacle: str = "") -> Future[Any]:
         """A job for the thread of estimates, after those under way; its CPU time is not charged to online.max_load. The future
         holds what it returns, or an exception: a CalibrationError where it is not taken, for an obstacle among other reasons."""
         future = self._requests.add(job, obstacle=obstacle)

@@ -19,7 +19,7 @@ MAX_WAITING = 8
 
 
 @dataclass(eq=False)
-class Job:
+class Pending:
     """Something to be done once for all who ask for it.
 
     kind: a noun for people, as "check". key: while it waits, all who ask for the same kind and key share it. work: called with a
@@ -62,8 +62,8 @@ class Requests:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: list[Job] = []
-        self._running: Job | None = None
+        self._waiting: list[Pending] = []
+        self._running: Pending | None = None
         self._refusal: str | None = None  # "" = the node is stopping
 
     @property
@@ -76,10 +76,10 @@ class Requests:
         """True while there is a job that has not begun."""
         return bool(self._waiting)
 
-    def add(self, job: Job, joins: Hashable = None, progress: Callback | None = None, obstacle: str = "") -> Future[Any]:
+    def add(self, job: Pending, joins: Hashable = None, progress: Callback | None = None, obstacle: str = "") -> Future[Any]:
         """A new request; it fails at once with a CalibrationError for an obstacle, if requests are refused, or too many wait.
 
-        joins: see Job.open_to. progress: called on the thread of the job with its stage and share done, from when the request
+        joins: see Pending.open_to. progress: called on the thread of the job with its stage and share done, from when the request
         joins it; must not raise.
         """
         future: Future[Any] = Future()
@@ -98,7 +98,7 @@ class Requests:
         future.set_exception(CalibrationError(problem))
         return future
 
-    def begin(self, estimate: bool, open_to: Hashable = None, is_due: bool = False) -> Job | None:
+    def begin(self, estimate: bool, open_to: Hashable = None, is_due: bool = False) -> Pending | None:
         """The job that has waited longest, an estimate or another one, is under way from now on; None if there is none.
 
         is_due: an estimate begins though nobody has asked for one. It is open to nobody: it does not search the whole box.
@@ -110,7 +110,7 @@ class Requests:
                 self._waiting.remove(job)
                 job.open_to = open_to
             elif is_due and not self.refused:
-                job = Job(ESTIMATE)
+                job = Pending(ESTIMATE)
             self._running = job
             return job
 
@@ -120,7 +120,7 @@ class Requests:
             if self._running is not None:
                 self._running.open_to = None
 
-    def run(self, job: Job, work: Callable[[Callback], T], check_cancelled: Callable[[], None]) -> T:
+    def run(self, job: Pending, work: Callable[[Callback], T], check_cancelled: Callable[[], None]) -> T:
         """Do the job that has begun, on this thread, and answer all who wait for it; what `work` raises they hear as well.
 
         check_cancelled: raises Cancelled where the thread is to end.
@@ -146,7 +146,7 @@ class Requests:
         self._end(job, outcome)
         return outcome
 
-    def _end(self, job: Job, outcome: Any = None, error: BaseException | None = None) -> None:
+    def _end(self, job: Pending, outcome: Any = None, error: BaseException | None = None) -> None:
         with self._lock:
             refused, self._running = job is not self._running, None
         if not refused:  # else: answered already

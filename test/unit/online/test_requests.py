@@ -12,7 +12,7 @@ from waiting import LIMIT_S, until
 from calib_ros.config import update
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.online.requests import ESTIMATE, MAX_WAITING, Job, Requests
+from calib_ros.online.requests import ESTIMATE, MAX_WAITING, Pending, Requests
 from calib_ros.online.worker import Cancelled
 from calib_ros.result import Extrinsic
 from calib_ros_synthetic.drive import SyntheticDrive
@@ -30,10 +30,10 @@ class Queue(Requests):
     """Estimates and checks, which return OUTCOME after what a test does meanwhile."""
 
     def ask(self, keyframes: int, progress=None) -> Future[str]:
-        return self.add(Job(ESTIMATE), keyframes, progress)
+        return self.add(Pending(ESTIMATE), keyframes, progress)
 
     def check(self, key: object, obstacle: str = "") -> Future[str]:
-        return self.add(Job("check", key), obstacle=obstacle)
+        return self.add(Pending("check", key), obstacle=obstacle)
 
     def do(
         self, keyframes: int | None = None, meanwhile=lambda progress: None, check_cancelled=go_on, is_due: bool = False
@@ -60,7 +60,7 @@ def test_requests_for_an_estimate_share_the_next_and_those_over_the_same_keyfram
 def test_checks_with_the_same_key_share_one_that_has_not_begun() -> None:
     queue, asked = Queue(), []
     first, again, other = queue.check(1), queue.check(1), queue.check(2)
-    queue.add(Job("count", 1))
+    queue.add(Pending("count", 1))
     assert queue.do(None, lambda _: asked.append(queue.check(1)))
     assert [first.result(0), again.result(0)] == [OUTCOME] * 2
     assert [other.done(), asked[0].done()] == [False, False]
