@@ -29,10 +29,6 @@ from calib_ros_semantics.models.segmentation import SegmentationModels
 Progress = Callable[[str, int, int], None]  # called with the stage (frames, trials), done and total
 
 
-def silent(stage: str, done: int, total: int) -> None:
-    """No progress wanted."""
-
-
 @dataclass(frozen=True)
 class RunOptions:
     """What to work on, and with what. frames: of each source, as for --frames. workers: processes on this machine. scheduler:
@@ -120,7 +116,7 @@ class Evaluation(NamedTuple):
     notes: list[str]
 
 
-def evaluate(options: RunOptions, study: Study, facts: Mapping[str, str], progress: Progress = silent) -> Evaluation:
+def evaluate(options: RunOptions, study: Study, facts: Mapping[str, str], progress: Progress) -> Evaluation:
     """Do what the journal in the folder does not hold yet, then write table and report. facts: for the head of the report.
 
     Interrupted or killed at any moment, the same options go on where it stopped; with more of the same to do, what is there is

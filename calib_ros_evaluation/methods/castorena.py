@@ -32,51 +32,30 @@ def slopes(image: Map) -> tuple[Map, Map]:
     return np.abs(np.diff(image, axis=1, append=image[:, -1:])), np.abs(np.diff(image, axis=0, append=image[-1:]))
 
 
-class DepthCompletion:
-    """phi of eq. 4.4 for pictures of one size, by normalised convolution (Knutsson and Westin 1993).
+def slopes_at_points(size: tuple[int, int], sigma: float, u: Pixels, v: Pixels, depth: Map) -> tuple[Pixels, Map, Map]:
+    """Flat pixels (m,) with a point, and there |grad_x phi| and |grad_y phi| of eq. 4.4, m per px, by normalised convolution
+    (Knutsson and Westin 1993): phi at a pixel is the mean of the measured depths around it, weighed by a Gaussian of `sigma` px.
+    Where a point and its neighbours to the right and below lie there is always one in reach, and phi is asked for nowhere else.
 
-    phi at a pixel is the mean of the measured depths around it, weighed by a Gaussian of `sigma` px. Where a point and its
-    neighbours to the right and below lie there is always one in reach, and phi is asked for nowhere else.
+    size: height and width of the picture. u, v, depth: (n,) column, row and depth in m of points in it, far ones first: the
+    nearest hides the others. Pixels in the last column and row are left out.
     """
-
-    def __init__(self, height: int, width: int, sigma: float) -> None:
-        self.height, self.width, self.sigma = height, width, sigma
-        self._reach = max(round(3 * sigma), 1)  # px; of the kernel, beyond which a Gaussian is nearly 0
-        kernel = np.asarray(cv2.getGaussianKernel(2 * self._reach + 1, sigma, cv2.CV_32F), np.float32)
-        # Scaled to 1 in the middle: the share of a lonely point must not get lost in rounding.
-        self._kernel = kernel / kernel.max()
-        self._sparse, self._measured, self._depth, self._share = (np.empty(height * width, np.float32) for _ in range(4))
-
-    def slopes_at_points(self, u: Pixels, v: Pixels, depth: Map) -> tuple[Pixels, Map, Map]:
-        """Flat pixels (m,) with a point, and there |grad_x phi| and |grad_y phi|, m per px.
-
-        u, v, depth: (n,) column, row and depth in m of points in the picture, far ones first: the nearest hides the others.
-        Pixels in the last column and row are left out.
-        """
-        if len(u) == 0:
-            return np.zeros(0, np.intp), np.zeros(0, np.float32), np.zeros(0, np.float32)
-        w = self.width
-        top = max(int(v.min()) - self._reach, 0)
-        rows = min(int(v.max()) + self._reach + 1, self.height) - top  # nothing lies above and below
-        part = slice(0, rows * w)
-        sparse, measured = self._sparse[part], self._measured[part]
-        sparse.fill(0)
-        measured.fill(0)
-        pixels = (v - top) * w + u
-        sparse[pixels] = depth
-        measured[pixels] = 1
-        for of, into in ((sparse, self._depth), (measured, self._share)):
-            cv2.sepFilter2D(of.reshape(rows, w), -1, self._kernel, self._kernel, dst=into[part].reshape(rows, w))
-        measured = measured.reshape(rows, w)
-        measured[:, -1] = 0
-        if top + rows == self.height:
-            measured[-1] = 0
-        shown = np.flatnonzero(measured)
-        here = self._phi(shown)
-        return shown + top * w, np.abs(self._phi(shown + 1) - here), np.abs(self._phi(shown + w) - here)
-
-    def _phi(self, pixels: Pixels) -> Map:
-        return np.asarray(self._depth[pixels] / self._share[pixels], np.float32)
+    if len(u) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.float32), np.zeros(0, np.float32)
+    (height, w), reach = size, max(round(3 * sigma), 1)  # px; of the kernel, beyond which a Gaussian is nearly 0
+    kernel = np.asarray(cv2.getGaussianKernel(2 * reach + 1, sigma, cv2.CV_32F), np.float32)
+    kernel = kernel / kernel.max()  # 1 in the middle: the share of a lonely point must not get lost in rounding
+    top = max(int(v.min()) - reach, 0)
+    rows = min(int(v.max()) + reach + 1, height) - top  # nothing lies above and below
+    sparse, measured = np.zeros((2, rows, w), np.float32)
+    sparse[v - top, u], measured[v - top, u] = depth, 1
+    sums, shares = (cv2.sepFilter2D(of, -1, kernel, kernel).ravel() for of in (sparse, measured))
+    measured[:, -1] = 0
+    if top + rows == height:
+        measured[-1] = 0
+    shown = np.flatnonzero(measured)
+    here, right, below = (np.asarray(sums[shown + k] / shares[shown + k], np.float32) for k in (0, 1, w))
+    return shown + top * w, np.abs(right - here), np.abs(below - here)
 
 
 def fista(
@@ -164,11 +143,10 @@ class Castorena(Viewing):
     title: str = "Castorena et al. (2016): edges of the completed depth map on image edges"
 
     def features(self, frame: Frame) -> PointFeatures:
-        """The grey picture, and all points with their distance, far ones first. TooFewFeaturesError if hardly anything
-        returned."""
-        view, _, _ = self._preprocess(frame)
-        distance = np.linalg.norm(view.xyz, axis=1)
-        return replace(view, value=distance).select(np.argsort(-distance, kind="stable"))
+        """The grey picture, and all points, far ones first. TooFewFeaturesError if hardly anything returned."""
+        view, _ = self._preprocess(frame)
+        order = np.argsort(-np.linalg.norm(view.xyz, axis=1), kind="stable")
+        return replace(view, value=None).select(order)
 
     def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> CastorenaScore:
         """Mean of the frames' scores. TooFewFeaturesError for fewer than min_points per frame near the image at T_prior."""
@@ -211,8 +189,8 @@ class CastorenaScore:
 
     def __init__(self, method: Castorena, features: Sequence[PointFeatures], T_prior: Matrix, scale: float) -> None:
         kept = near(features, T_prior, method.margin, method.min_points, "near the image")
-        self.camera = camera = features[0].camera
-        self._complete = DepthCompletion(camera.height, camera.width, method.depth_sigma * scale)
+        self.camera = features[0].camera
+        self._sigma = method.depth_sigma * scale
         sigma = method.image_sigma * scale
         self._frames = [(f.xyz, edge_weights(f.image, method.gamma, sigma).reshape(2, -1)) for f in kept]
 
@@ -223,5 +201,5 @@ class CastorenaScore:
     def _misfit(self, T: Matrix, xyz: Map, weights: Map) -> float:
         u, v, points = project(xyz, T, self.camera)
         depth = xyz[points] @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
-        pixels, x, y = self._complete.slopes_at_points(u, v, depth)
+        pixels, x, y = slopes_at_points((self.camera.height, self.camera.width), self._sigma, u, v, depth)
         return misfit((weights[0][pixels], weights[1][pixels]), (x, y))

@@ -119,7 +119,7 @@ class Levinson(Viewing):
 
     def features(self, frame: Frame) -> PointFeatures:
         """Points in front of a depth discontinuity of more than least_m, and D. TooFewFeaturesError for fewer than min_points."""
-        view, measured, _ = self._preprocess(frame)
+        view, measured = self._preprocess(frame)
         jump = discontinuity(measured)
         keep = np.flatnonzero(jump > self.least_m)
         require(len(keep), self.min_points, WHAT, "check that the LiDAR sees objects in front of others")

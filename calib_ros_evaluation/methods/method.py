@@ -139,16 +139,16 @@ class Extracting:
 @dataclass(frozen=True, eq=False)
 class PointFeatures:
     """What a baseline keeps of a frame. camera: its pinhole. image: (h, w) what points are matched with. xyz: (n, 3) float32 m
-    at the image's moment, LiDAR frame. value: (n,) of each point, what the method matches."""
+    at the image's moment, LiDAR frame. value: (n,) of each point, what the method matches; None = nothing."""
 
     camera: Camera
     image: NDArray[Any]
     xyz: NDArray[np.float32]
-    value: NDArray[Any]
+    value: Any = None
 
     def select(self, keep: NDArray[np.intp]) -> PointFeatures:
         """Some of the points, by index."""
-        return replace(self, xyz=self.xyz[keep], value=self.value[keep])
+        return replace(self, xyz=self.xyz[keep], value=None if self.value is None else self.value[keep])
 
 
 class Viewing:
@@ -160,18 +160,17 @@ class Viewing:
     def _extractors(self) -> Extractors:
         return Extractors(replace(self.config, image=replace(self.config.image, projection="pinhole")))
 
-    def _preprocess(self, frame: Frame) -> tuple[PointFeatures, PointCloud, NDArray[np.float32] | None]:
-        """The grey image (h, w) uint8 with all points; the scan as it was measured, finite points only, in the source's order:
-        neighbours are to be looked for in it; and reflectivity (n,) float32 in 0..1, None if the source has none.
+    def _preprocess(self, frame: Frame) -> tuple[PointFeatures, PointCloud]:
+        """The grey image (h, w) uint8 with all points and their reflectivity, float32 in 0..1, None if the source has none; and
+        the scan as it was measured, finite points only, in the source's order: neighbours are to be looked for in it.
 
         TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
         require_returns(frame.cloud)
         extract, measured = self._extractors.of(frame.camera), frame.cloud.finite()
         at_image = deskewed_points(frame, self.config.motion)
         xyz = measured.xyz if at_image is None else at_image[frame.cloud.finite_mask()]
-        known = reflectivity(measured.intensity)
         gray = to_gray(extract.working_image(frame.image))
-        return PointFeatures(extract.camera, gray, xyz, np.zeros(len(xyz)) if known is None else known), measured, known
+        return PointFeatures(extract.camera, gray, xyz, reflectivity(measured.intensity)), measured
 
 
 def near(features: Sequence[PointFeatures], T: Matrix, margin: float, least: int, what: str) -> list[PointFeatures]:

@@ -155,8 +155,8 @@ class Mulfeat(Viewing):
 
     def features(self, frame: Frame) -> PointFeatures:
         """P(E^L) and E^C. TooFewFeaturesError for fewer than min_points points with P above 0."""
-        (view, measured, known), config = self._preprocess(frame), self.config
-        index, P = edge_probability(measured, known, config, self.rows_per_ring, self.columns_per_step)
+        (view, measured), config = self._preprocess(frame), self.config
+        index, P = edge_probability(measured, view.value, config, self.rows_per_ring, self.columns_per_step)
         require(len(index), self.min_points, WHAT, "check that the LiDAR sees objects")
         edges = gradient_edges(prepare(view.image, config.image), thesis_of(config))
         blur = self.smoothing * float(view.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,12 +32,12 @@ from calib_ros_thesis.maps import (
     EMPTY,
     LARGE,
     MIDDLE,
-    NEAREST,
     REFLECTIVITY_STEP,
     REFLECTIVITY_UNITS,
     SMALL,
     EdgeMaps,
     complete,
+    completion_stages,
     far_level,
 )
 from calib_ros_thesis.score import MAX_DISCONTINUITY
@@ -48,25 +47,11 @@ SECTION = "3.4.3"
 step, wide_step = partial(Step, SECTION), partial(Step, SECTION, wide=True)
 
 
-def completion_stages(sparse_depth: Levels, far: int) -> list[tuple[str, Levels]]:
-    """Sparse depth (h, w) -> the map after each step of figure 3.13, still inverted; the last is complete()'s result."""
-    square = {size: np.ones((size, size), np.uint8) for size in (SMALL, MIDDLE, LARGE)}
-    empty = np.int16(EMPTY)
-    stages = [("inversion", np.where(sparse_depth != empty, np.int16(far + 1) - sparse_depth, empty))]
-    stages.append(("dilation", np.asarray(cv2.dilate(stages[-1][1], NEAREST), np.int16)))
-    closed = cv2.morphologyEx(stages[-1][1], cv2.MORPH_CLOSE, square[SMALL])
-    stages.append(("closing", np.asarray(closed, np.int16)))
-    for name, size in (("middle holes", MIDDLE), ("large holes", LARGE)):
-        before = stages[-1][1]
-        stages.append((name, np.where(before == empty, np.asarray(cv2.dilate(before, square[size]), np.int16), before)))
-    stages.append(("blur", np.asarray(cv2.medianBlur(stages[-1][1], BLUR), np.int16)))
-    return stages
-
-
 def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Sparse depth to the map before the last step, which gives dense depth."""
     sparse_depth, far = scene.maps.lidar.sparse_depth, far_level(thesis_of(scene.config))
-    stages = completion_stages(sparse_depth, far)
+    inversion = np.where(sparse_depth != EMPTY, np.int16(far + 1) - sparse_depth, np.int16(EMPTY))
+    stages = {"inversion": inversion, **completion_stages(inversion)}
     seen = sparse_depth[sparse_depth != EMPTY]
     low, high = np.round((far + 1 - np.percentile(seen, [99, 1])) / DEPTH_UNITS) if len(seen) else (0, far / DEPTH_UNITS)
     inverted = Scale(f"{far / DEPTH_UNITS:g} m - depth, m", float(low), max(float(high), float(low) + 1), VIRIDIS)
@@ -80,7 +65,7 @@ def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
         f"to {LARGE // 2} px, which is why edges count only where a point lies.",
     }
     for name, text in texts.items():
-        levels = dict(stages)[name]
+        levels = stages[name]
         shown = levels != EMPTY
         draw = inverted.dots if name == "inversion" else inverted.dense
         yield step(
@@ -96,13 +81,14 @@ def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
     )
 
 
-def _magnified(stages: list[tuple[str, Levels]], interest: NDArray[np.float32], scale: Scale) -> Image:
+def _magnified(stages: dict[str, Levels], interest: NDArray[np.float32], scale: Scale) -> Image:
     h, w = interest.shape
     window = busiest(interest, max(h // 3, 2), max(w // 8, 2))
     pictures = [
-        scale.palette[np.where(levels[window] != EMPTY, scale.levels(levels[window] / DEPTH_UNITS), 0)] for _, levels in stages
+        scale.palette[np.where(levels[window] != EMPTY, scale.levels(levels[window] / DEPTH_UNITS), 0)]
+        for levels in stages.values()
     ]
-    return scale.below(tiles(pictures, [name for name, _ in stages], 3, w))
+    return scale.below(tiles(pictures, list(stages), 3, w))
 
 
 def map_steps(scene: RegisteredFrame) -> Iterator[Step]:

@@ -13,9 +13,8 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros_evaluation.methods import information as jh
+from calib_ros_evaluation.methods.information import DistanceScore, InformationScore, Nid, Pandey, unhidden
 from calib_ros_evaluation.methods.method import PointFeatures
-from calib_ros_evaluation.methods.nid import DistanceScore, Nid, unhidden
-from calib_ros_evaluation.methods.pandey import InformationScore, Pandey
 
 METHODS = [Pandey(), Nid()]
 both = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
@@ -27,20 +26,19 @@ APART = np.full((2, 2), 0.25)  # independent: H(x) = H(y) = ln 2, H(x, y) = ln 4
 MIXED = np.array([[0.5, 0], [0.25, 0.25]])
 
 
-def test_mutual_information_by_hand() -> None:
-    assert jh.mutual_information(SAME) == pytest.approx(log(2))
-    assert jh.mutual_information(APART) == pytest.approx(0)
-    assert jh.mutual_information(MIXED) == pytest.approx(1.5 * log(2) - 0.75 * log(3))
-    assert jh.mutual_information(MIXED.T) == pytest.approx(jh.mutual_information(MIXED))
-
-
-def test_distance_by_hand() -> None:
-    """1 - MI / H(x, y)."""
-    assert jh.normalised_information_distance(SAME) == pytest.approx(0)  # 1 - ln 2 / ln 2
-    assert jh.normalised_information_distance(APART) == pytest.approx(1)  # 1 - 0 / ln 4
-    # 1 - (3/2 ln 2 - 3/4 ln 3) / (3/2 ln 2) = ln 3 / (2 ln 2)
-    assert jh.normalised_information_distance(MIXED) == pytest.approx(log(3) / (2 * log(2)))
-    assert jh.normalised_information_distance(np.array([[1.0, 0], [0, 0]])) == 1  # nothing varies: nothing can be told
+@pytest.mark.parametrize(
+    ("joint", "information", "distance"),  # 1 - MI / H(x, y)
+    [
+        (SAME, log(2), 0),
+        (APART, 0, 1),
+        (MIXED, 1.5 * log(2) - 0.75 * log(3), log(3) / (2 * log(2))),
+        (MIXED.T, 1.5 * log(2) - 0.75 * log(3), log(3) / (2 * log(2))),
+        (np.array([[1.0, 0], [0, 0]]), 0, 1),  # nothing varies: nothing can be told
+    ],
+)
+def test_information_by_hand(joint: np.ndarray, information: float, distance: float) -> None:
+    assert jh.mutual_information(joint) == pytest.approx(information)
+    assert jh.normalised_information_distance(joint) == pytest.approx(distance)
 
 
 def test_bandwidth_is_the_standard_deviation_by_the_sixth_root_of_n() -> None:

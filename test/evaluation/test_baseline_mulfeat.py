@@ -10,10 +10,10 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.range_image import range_image, reflectivity
+from calib_ros.lidar.range_image import reflectivity
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.method import PointFeatures, search_limits, typical_step_deg
-from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatScore, edge_probability
+from calib_ros_evaluation.methods.mulfeat import Mulfeat, MulfeatScore, edge_probability
 
 IDENTITY = np.eye(4)  # the points are given in the camera's frame
 CAMERA = Camera(np.array([[50.0, 0, 19.5], [0, 50.0, 11.5], [0, 0, 1]]), 40, 24)
@@ -51,27 +51,7 @@ def test_the_score_by_hand(three):
     assert score.value(se3.from_parts(np.eye(3), [0.2, 0, 0])) == pytest.approx(0.05, rel=1e-6)
 
 
-# ---- the cylinder -------------------------------------------------------------------------------------------------------
-
-
-def test_cells_of_the_cylinder_by_hand():
-    """Cells 0.1 high from height 0.25 down, 90 deg wide from azimuth -180 deg on."""
-    grid = Grid(top=0.25, row_step=0.1, rows=5, columns=4)
-    xyz = np.array([[-10, -1, 2.0], [1, -1, 0], [5, 5, -1], [-3, 4, 1.1], [10, 0.1, -9]], np.float32)
-    row, column = grid.cells(xyz)
-    # Heights on the cylinder of radius 1: 0.199, 0, -0.141, 0.22 and -0.9, which is below the last row.
-    assert row.tolist() == [0, 2, 3, 0, 4]
-    assert column.tolist() == [0, 1, 2, 3, 2]
-
-
-def test_the_grid_follows_rings_and_azimuth_step():
-    scan = Spinner(rings=25, low=-20, high=4, step=0.25).scan([GROUND, Plane((1, 0, 0), 20.0)])
-    grid = Grid.of(range_image(scan, CONFIG.lidar), scan.xyz, 4.0, 2.0)
-    assert grid.columns == 2 * 1440
-    assert grid.row_step == pytest.approx(np.deg2rad(1.0) / 4, rel=0.02)
-    row, _ = grid.cells(scan.xyz)
-    assert row.min() == 0
-    assert row.max() == grid.rows - 1
+# ---- the cylinder ---
 
 
 BEHIND = Plane((1, 0, 0), 15.0)
