@@ -27,7 +27,7 @@ from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache, spread
-from calib_ros_evaluation.methods.levinson import Levinson, worse_share
+from calib_ros_evaluation.methods.edges import Levinson, worse_share
 from calib_ros_evaluation.protocols.definitions import PROTOCOLS, Size
 from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_thesis.features import importance

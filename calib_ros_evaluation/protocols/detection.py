@@ -18,7 +18,6 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.checker import Checker
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict, Tolerance
-from calib_ros_evaluation.csv_files import numbers, read_table
 from calib_ros_evaluation.evaluate import Study, StudyReport
 from calib_ros_evaluation.experiments.answers import Answers, read_answers
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
@@ -27,6 +26,7 @@ from calib_ros_evaluation.protocols.definitions import MISCALIBRATION
 from calib_ros_evaluation.protocols.published import ACCURACIES, protocol_report
 from calib_ros_evaluation.report.statistics import median
 from calib_ros_evaluation.report.table import NONE, Rows, Table, interval, percent, plural
+from calib_ros_evaluation.results import numbers, read_table
 
 Matrix = NDArray[np.float64]
 RIGHT_SET = "pos"  # holds right extrinsics, all others wrong ones

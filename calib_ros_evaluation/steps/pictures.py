@@ -20,8 +20,7 @@ from calib_ros.image.enhance import prepare, to_gray
 from calib_ros.overlay import BAR, put, text_width
 from calib_ros.registration.classes import OF_CLASSES, OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.rendering import COLORS, above, draw_curves, empty_figure, pixels
+from calib_ros_evaluation.curves import COLORS, Curves, above, draw_curves, empty_figure, pixels
 from calib_ros_semantics.class_pictures import BACKGROUND, sizes
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures, semantic_share

@@ -11,13 +11,18 @@ from bowl import Bowl
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.castorena import Castorena, edge_weights, fista, misfit, slopes, slopes_at_points
-from calib_ros_evaluation.methods.levinson import (
+from calib_ros_evaluation.methods.edges import (
+    Castorena,
     Levinson,
     edge_image,
+    edge_weights,
     edginess,
+    fista,
     grid_search,
+    misfit,
     probability_right,
+    slopes,
+    slopes_at_points,
     spread,
     worse_share,
 )

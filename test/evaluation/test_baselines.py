@@ -15,9 +15,8 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import curves
-from calib_ros_evaluation.methods.castorena import Castorena
+from calib_ros_evaluation.methods.edges import Castorena, Levinson
 from calib_ros_evaluation.methods.information import Nid, Pandey
-from calib_ros_evaluation.methods.levinson import Levinson
 from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.mulfeat import Mulfeat
 

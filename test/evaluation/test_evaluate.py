@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -175,6 +177,14 @@ def test_bad_requests_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
         error = capsys.readouterr().err
         assert named in error
         assert error.count("\n") == 1
+
+
+def test_without_pandas_there_are_steps_but_no_tables() -> None:
+    code = "import sys; sys.modules['pandas'] = None; import calib_ros_evaluation.steps.page; from calib_ros.cli import main; "
+    done = subprocess.run([sys.executable, "-c", f"{code}sys.exit(main.main(['evaluate', 'x']))"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "pip install pandas" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
