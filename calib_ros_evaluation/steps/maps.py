@@ -21,7 +21,6 @@ from calib_ros_evaluation.steps.pictures import (
     busiest,
     edge_picture,
     enlarged,
-    over,
     tiles,
 )
 from calib_ros_thesis.config import thesis_of
@@ -122,9 +121,9 @@ def _points(scene: RegisteredFrame) -> NDArray[np.uint8]:
     points, camera = scene.thesis.points, scene.frame.camera
     u, v, inside = project(points.xyz, scene.T, camera)
     scale = depth_scale(points.depth[inside])
-    levels = np.zeros((camera.height, camera.width), np.uint8)
-    levels[v, u] = scale.levels(points.depth[inside])
-    return scale.below(over(scene.gray, enlarged(levels), scale.palette))
+    depth = np.zeros((camera.height, camera.width), np.float32)
+    depth[v, u] = points.depth[inside]
+    return scale.over(scene.gray, depth, depth > 0)
 
 
 def _depth_scale(lidar: EdgeMaps) -> Scale:

@@ -176,6 +176,10 @@ class Scale:
         """As dense, but what is shown are single pixels, drawn larger."""
         return self.below(self.palette[enlarged(np.where(shown, self.levels(values), 0))])
 
+    def over(self, image: Image, values: ArrayLike, shown: Mask) -> Image:
+        """As dots, over an image (h, w[, 3])."""
+        return self.below(over(image, enlarged(np.where(shown, self.levels(values), 0)), self.palette))
+
     def below(self, picture: Image) -> Image:
         """The picture with the scale's bar under it."""
         width = picture.shape[1]
