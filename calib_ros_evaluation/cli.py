@@ -26,7 +26,7 @@ class Steps:
 
     def run(self, args: argparse.Namespace) -> int:
         """Write the page; 0."""
-        from calib_ros_evaluation.steps.command import run_steps
+        from calib_ros_evaluation.steps.page import run_steps
 
         print(run_steps(args))
         return 0

@@ -20,7 +20,6 @@ from calib_ros.datasets.kitti import drives_in
 from calib_ros.datasets.open import is_single
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare
-from calib_ros_evaluation.csv_files import read_trials
 from calib_ros_evaluation.evaluate import Experiments, RunOptions, Study, evaluate
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, labels
@@ -28,6 +27,7 @@ from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, PROTOCOLS, TRIALS, check_name
 from calib_ros_evaluation.protocols.detection import Detection, read_perturbations
 from calib_ros_evaluation.protocols.trials import Calibrations
+from calib_ros_evaluation.results import read_trials
 
 
 def run_evaluation(args: argparse.Namespace) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import pandas as pd
 import yaml
@@ -15,7 +15,6 @@ from calib_ros import __version__
 from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.pool import run
-from calib_ros_evaluation.csv_files import TRIALS, write_table
 from calib_ros_evaluation.experiments.answers import Answers, collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
@@ -24,13 +23,10 @@ from calib_ros_evaluation.methods.registry import NAMES, check_names, methods
 from calib_ros_evaluation.report.page import check_report, write_report
 from calib_ros_evaluation.report.sections import Section, sections
 from calib_ros_evaluation.report.tables import summary
+from calib_ros_evaluation.results import TRIALS, write_table
 from calib_ros_semantics.models.segmentation import SegmentationModels
 
 Progress = Callable[[str, int, int], None]  # called with the stage (frames, trials), done and total
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """No progress wanted."""
 
 
 @dataclass(frozen=True)
@@ -64,30 +60,30 @@ class StudyReport:
     facts: Mapping[str, str] = field(default_factory=dict)
 
 
-class Study(Protocol):
+class Study:
     """What is done with the sources of an evaluation."""
 
     @property
-    def about(self) -> Mapping[str, str]:
-        """What the answers depend on, beside sources, configuration and code."""
-        ...
+    def about(self) -> dict[str, str]:
+        """What the answers depend on beside sources, configuration and code."""
+        return {}
 
     def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
         """All there is to do, in the order of the report. BadInputError for sources that do not fit the study."""
-        ...
+        raise NotImplementedError
 
     def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
         """The answers, in order."""
-        ...
+        return run_jobs(setup, todo)
 
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class Experiments:
-    """Those of the thesis and more; a Study. methods: in the order of the report."""
+class Experiments(Study):
+    """Those of the thesis and more. methods: in the order of the report."""
 
     plan: Plan = FULL
     methods: tuple[str, ...] = NAMES
@@ -96,18 +92,9 @@ class Experiments:
     def __post_init__(self) -> None:
         check_names(self.methods)
 
-    @property
-    def about(self) -> Mapping[str, str]:
-        """See Study."""
-        return {}
-
     def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
         """See Study."""
         return jobs(self.plan, summaries, self.methods, self.experiments)
-
-    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
-        """See Study."""
-        return run_jobs(setup, todo)
 
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """See Study."""
@@ -129,7 +116,7 @@ class Evaluation(NamedTuple):
     notes: list[str]
 
 
-def evaluate(options: RunOptions, study: Study, facts: Mapping[str, str], progress: Progress = silent) -> Evaluation:
+def evaluate(options: RunOptions, study: Study, facts: Mapping[str, str], progress: Progress) -> Evaluation:
     """Do what the journal in the folder does not hold yet, then write table and report. facts: for the head of the report.
 
     Interrupted or killed at any moment, the same options go on where it stopped; with more of the same to do, what is there is

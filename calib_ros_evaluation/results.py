@@ -1,15 +1,20 @@
-"""Results of an evaluation: the table of trials, and what other experiments measured. Tables and plots need nothing else."""
+"""Results of an evaluation: the table of trials, also as a CSV file, and what other experiments measured. Tables and plots need
+nothing else."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from calib_ros.errors import BadInputError
+from calib_ros.io import write_atomically
 from calib_ros_evaluation.curves import Curves
 
 Matrix = NDArray[np.float64]
@@ -29,6 +34,10 @@ COLUMNS = (
     *("status", "reason", "success", "rotation_deg", "translation_m", "start_rotation_deg", "start_translation_m"),
     *(*END, *START, *SCORES, "evaluations", "cpu_s", "features_cpu_s"),
 )
+TRIALS = "trials.csv"
+TEXTS = ("experiment", "method", "scene", "frames", "status", "reason")
+WHOLE = ("seed", "success", "evaluations")
+ADVICE = "give the trials.csv of an evaluation"
 
 
 def trials_table(rows: Sequence[Mapping[str, Any]], limit_deg: float = SUCCESS_DEG, limit_m: float = SUCCESS_M) -> pd.DataFrame:
@@ -37,6 +46,61 @@ def trials_table(rows: Sequence[Mapping[str, Any]], limit_deg: float = SUCCESS_D
     table = pd.DataFrame(rows, columns=list(COLUMNS))
     near = (table.rotation_deg < limit_deg) & (table.translation_m < limit_m)
     return table.assign(success=((table.status == "done") & near).astype(int))
+
+
+def write_table(path: Path, table: pd.DataFrame) -> None:
+    """A row for each of the table's under a header; floats so that reading gives the same ones. The file is replaced as a whole;
+    BadInputError if its folder cannot be written."""
+    write_atomically(path, table.to_csv(index=False, na_rep="nan").encode())
+
+
+def read_table(path: Path, columns: Sequence[str], advice: str) -> pd.DataFrame:
+    """Texts of a CSV file; columns may stand in any order, with others between.
+
+    BadInputError, with the advice, if it cannot be read, a column is missing or a line is cut off.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+        table = pd.read_csv(io.StringIO(text), dtype=object, keep_default_na=False)
+    except OSError as error:
+        raise BadInputError(f"cannot read {path}: {error.strerror}; {advice}") from None
+    except UnicodeDecodeError:
+        raise BadInputError(f"{path} is no text; {advice}") from None
+    except (pd.errors.EmptyDataError, pd.errors.ParserError) as error:
+        raise BadInputError(f"{path} is empty, cut off or damaged ({str(error).strip()}); {advice}") from None
+    missing = [name for name in columns if name not in table]
+    if missing:
+        raise BadInputError(f"{path}: no column {', '.join(missing)}; {advice}")
+    if not text.endswith("\n"):
+        raise BadInputError(f"{path}: the last line is cut off; copy the file again")
+    return table
+
+
+def numbers(table: pd.DataFrame, name: str, kind: Callable[[str], float], path: Path, advice: str) -> pd.Series:
+    """What `kind` makes of the texts of a column. BadInputError, with the advice, for one of which it makes nothing."""
+    try:
+        return table[name].map(kind)
+    except ValueError as error:
+        raise BadInputError(f"{path}, column {name}: {error}; {advice}") from None
+
+
+def read_trials(path: Path) -> pd.DataFrame:
+    """Trials of a file that an evaluation wrote, of this version or another. BadInputError as of read_table, and if there are
+    none, a value is none, or a trial is there twice."""
+    table = read_table(path, COLUMNS, ADVICE)
+    if table.empty:
+        raise BadInputError(f"{path} holds no trials, only a header; was its evaluation broken off?")
+    for name in COLUMNS:
+        if name not in TEXTS:
+            table[name] = numbers(table, name, int if name in WHOLE else float, path, ADVICE)
+    numbers(table, "frames", lambda text: sum(map(int, text.split())), path, ADVICE)
+    for said, is_so in (
+        (f"status must be one of {', '.join(STATUSES)}", ~table.status.isin(STATUSES)),
+        ("a trial that is there already; give the trials.csv of one evaluation", table.duplicated(list(IDENTITY))),
+    ):
+        if is_so.any():
+            raise BadInputError(f"{path}, row {is_so.to_numpy().argmax() + 1}: {said}")
+    return trials_table(table)
 
 
 class CurveResult(NamedTuple):

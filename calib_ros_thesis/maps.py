@@ -133,12 +133,17 @@ def complete_depth(sparse: Levels, far: int) -> Levels:
 
 
 def complete(sparse: Levels) -> Levels:
-    """Sparse map -> dense map (eq. 3.11; Ku et al. 2018): dilation, closing of small holes, filling of larger ones, median."""
-    dense = np.asarray(cv2.dilate(sparse, NEAREST), np.int16)
-    dense = np.asarray(cv2.morphologyEx(dense, cv2.MORPH_CLOSE, _square(SMALL)), np.int16)
-    for size in (MIDDLE, LARGE):
-        dense = np.where(dense == EMPTY, np.asarray(cv2.dilate(dense, _square(size)), np.int16), dense)
-    return np.asarray(cv2.medianBlur(dense, BLUR), np.int16)
+    """Sparse map -> dense map (eq. 3.11; Ku et al. 2018): the last of `completion_stages`."""
+    return completion_stages(sparse)["blur"]
+
+
+def completion_stages(sparse: Levels) -> dict[str, Levels]:
+    """The map after each step: dilation, closing of small holes, filling of larger ones, median."""
+    stages = {"dilation": np.asarray(cv2.dilate(sparse, NEAREST), np.int16)}
+    dense = stages["closing"] = np.asarray(cv2.morphologyEx(stages["dilation"], cv2.MORPH_CLOSE, _square(SMALL)), np.int16)
+    for name, size in (("middle holes", MIDDLE), ("large holes", LARGE)):
+        dense = stages[name] = np.where(dense == EMPTY, np.asarray(cv2.dilate(dense, _square(size)), np.int16), dense)
+    return stages | {"blur": np.asarray(cv2.medianBlur(dense, BLUR), np.int16)}
 
 
 def close_gaps(labels: NDArray[np.uint8], size: int, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:

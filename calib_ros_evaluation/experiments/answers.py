@@ -11,10 +11,9 @@ import numpy as np
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.experiments.frames import averaging, similarities
 from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
-from calib_ros_evaluation.experiments.trial import cost, loss_curves, trial, trust
+from calib_ros_evaluation.experiments.trial import averaging, cost, loss_curves, similarities, trial, trust
 from calib_ros_evaluation.protocols.definitions import PROTOCOLS
 from calib_ros_evaluation.results import (
     SCORES,

@@ -12,8 +12,11 @@ from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
 from calib_ros_evaluation.results import SET
 
+Options = dict[str, float | int | str]
+Wanted = tuple[str, Sequence[int], Sequence[str], Options]
 AVERAGED = ("thesis", "ours")  # whose curves are averaged
 TRUSTED = "levinson"  # whose test of a calibration is tried
+EXPERIMENTS = ("curves", "single", "starts", "frames", "averaging", "similarity", "cost", "trust")  # in the order of the report
 TOGETHER = 8  # jobs given to a worker at once; so many are lost at most when it is killed
 
 
@@ -57,9 +60,60 @@ def jobs(
 ) -> list[EvaluationJob]:
     """All jobs, in the order of the report. BadInputError for an experiment that there is not."""
     for name in experiments:
-        if name not in MAKERS:
+        if name not in EXPERIMENTS:
             raise BadInputError(f"there is no experiment '{name}'; choose among {', '.join(EXPERIMENTS)}")
-    return [one for name in EXPERIMENTS if name in experiments for one in MAKERS[name](plan, summaries, methods)]
+    around: Options = {"deg": plan.curve_reach[0], "m": plan.curve_reach[1], "samples": plan.curve_samples}
+    largest = max(summaries, key=lambda s: len(s.groups[0]))
+    several = [(one.label, group) for one in summaries for group in one.groups if len(group) >= SET]
+    # Experiment -> source, frames, methods and options; every method does the same.
+    wanted: dict[str, list[Wanted]] = {
+        "curves": [(label, [k], methods, around) for label, k in shared_out(summaries, plan.curve_frames)],
+        "single": [
+            (label, [k], methods, _start(plan.start, plan.seed + n))
+            for n in range(plan.repeats)
+            for label, k in shared_out(summaries, plan.single_frames)
+        ],
+        "starts": [
+            (label, [k], methods, _start(size, plan.seed))
+            for size in plan.sizes
+            for label, k in shared_out(summaries, plan.size_frames)
+        ],
+        "frames": [(*one, methods, _start(plan.start, plan.seed)) for one in _sets(plan, summaries)],
+        "averaging": [
+            (label, spread(group, plan.averaged_frames), [name for name in AVERAGED if name in methods], around)
+            for label, group in several
+        ],
+        "similarity": [(one.label, one.frames, [""], {}) for one in summaries if len(one.frames) > 1],
+        "cost": [(largest.label, spread(largest.groups[0], plan.cost_frames), methods, {})],
+        "trust": [
+            (label, [k], [TRUSTED] if TRUSTED in methods else [], {"seed": plan.seed})
+            for label, k in shared_out(summaries, plan.trust_frames)
+        ],
+    }
+    return [
+        job(name, method, label, frames, options)
+        for name in EXPERIMENTS
+        if name in experiments
+        for label, frames, doers, options in wanted[name]
+        for method in doers
+    ]
+
+
+def _sets(plan: Plan, summaries: Sequence[SourceSummary]) -> list[tuple[str, tuple[int, ...]]]:
+    """Sets of frames of one calibration, drawn by the seed; of every source that has enough, in turn."""
+    out = []
+    for count in plan.counts:
+        large = [(one.label, group) for one in summaries for group in one.groups if len(group) >= count]
+        large = [(label, group) for label, group in large if len(group) >= max(plan.counts)] or large
+        for k in range(plan.sets if large else 0):
+            label, group = large[k % len(large)]
+            rng = np.random.default_rng([plan.seed, count, k])
+            out.append((label, tuple(sorted(int(i) for i in rng.choice(group, count, replace=False)))))
+    return list(dict.fromkeys(out))  # a set that is drawn twice, as that of all frames, is one
+
+
+def _start(size: tuple[float, float], seed: int) -> Options:
+    return {"start_deg": size[0], "start_m": size[1], "seed": seed}
 
 
 def groups(todo: Sequence[EvaluationJob]) -> list[list[EvaluationJob]]:
@@ -69,84 +123,3 @@ def groups(todo: Sequence[EvaluationJob]) -> list[list[EvaluationJob]]:
         alone = one.key if one.experiment == "cost" else ""  # measured with features made anew
         out.setdefault((one.scene, one.frames, one.method, alone), []).append(one)
     return [whole[k : k + TOGETHER] for whole in out.values() for k in range(0, len(whole), TOGETHER)]
-
-
-def _curves(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    chosen = shared_out(summaries, plan.curve_frames)
-    return [job("curves", method, label, [k], _around(plan)) for label, k in chosen for method in methods]
-
-
-def _single(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    return [
-        job("single", method, label, [k], _start(plan.start, plan.seed + n))
-        for n in range(plan.repeats)
-        for label, k in shared_out(summaries, plan.single_frames)
-        for method in methods
-    ]
-
-
-def _starts(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    return [
-        job("starts", method, label, [k], _start(size, plan.seed))
-        for size in plan.sizes
-        for label, k in shared_out(summaries, plan.size_frames)
-        for method in methods
-    ]
-
-
-def _frames(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    """Sets of frames of one calibration, drawn by the seed; of every source that has enough, in turn."""
-    out = []
-    for count in plan.counts:
-        large = [(one.label, group) for one in summaries for group in one.groups if len(group) >= count]
-        large = [(label, group) for label, group in large if len(group) >= max(plan.counts)] or large
-        for k in range(plan.sets if large else 0):
-            label, group = large[k % len(large)]
-            rng = np.random.default_rng([plan.seed, count, k])
-            chosen = sorted(int(i) for i in rng.choice(group, count, replace=False))
-            out += [job("frames", method, label, chosen, _start(plan.start, plan.seed)) for method in methods]
-    return list(dict.fromkeys(out))  # a set that is drawn twice, as that of all frames, is one
-
-
-def _averaging(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    averaged = [method for method in AVERAGED if method in methods]
-    sets = [(one.label, spread(group, plan.averaged_frames)) for one in summaries for group in one.groups if len(group) >= SET]
-    return [job("averaging", method, label, frames, _around(plan)) for label, frames in sets for method in averaged]
-
-
-def _similarity(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    return [job("similarity", "", one.label, one.frames) for one in summaries if len(one.frames) > 1]
-
-
-def _cost(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    one = max(summaries, key=lambda s: len(s.groups[0]))
-    chosen = spread(one.groups[0], plan.cost_frames)
-    return [job("cost", method, one.label, chosen) for method in methods]
-
-
-def _trust(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
-    if TRUSTED not in methods:
-        return []
-    return [job("trust", TRUSTED, label, [k], {"seed": plan.seed}) for label, k in shared_out(summaries, plan.trust_frames)]
-
-
-def _around(plan: Plan) -> dict[str, float | int | str]:
-    return {"deg": plan.curve_reach[0], "m": plan.curve_reach[1], "samples": plan.curve_samples}
-
-
-def _start(size: tuple[float, float], seed: int) -> dict[str, float | int | str]:
-    return {"start_deg": size[0], "start_m": size[1], "seed": seed}
-
-
-# In the order of the report.
-MAKERS = {
-    "curves": _curves,
-    "single": _single,
-    "starts": _starts,
-    "frames": _frames,
-    "averaging": _averaging,
-    "similarity": _similarity,
-    "cost": _cost,
-    "trust": _trust,
-}
-EXPERIMENTS = tuple(MAKERS)

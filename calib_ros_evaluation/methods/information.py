@@ -1,21 +1,40 @@
-"""Information measures of a joint histogram of reflectivity and grey value, in nats."""
+"""Methods that compare reflectivity with grey values, by information measures of their joint histogram, in nats.
+
+Pandey, McBride, Savarese and Eustice 2012 and 2015: mutual information (thesis eq. 4.1). Probabilities are kernel density
+estimates; steepest ascent with the step lengths of Barzilai and Borwein, as in both papers. All points that fall into the image
+count: there is no test of what hides what.
+
+Koide, Oishi, Yokozuka and Banno 2023, "General, single-shot, target-less, and automatic LiDAR-camera extrinsic calibration
+toolbox": normalised information distance, its fine registration. Both are histogram-equalised first. Points that nearer ones
+hide are left out, seen from where the search starts; the search, a simplex, starts again from where it ended until it ends near
+there. Several frames: the mean of their distances.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 from scipy.special import entr
+from scipy.stats import rankdata
 
-from calib_ros.camera import Camera
-from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
-from calib_ros_evaluation.methods.method import PreprocessedFrame
+from calib_ros import se3
+from calib_ros.config import Config
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
+from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image, project
+from calib_ros.registration.score.sampler import MIN_DEPTH
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.optimizers import barzilai_borwein, nelder_mead
+from calib_ros_evaluation.methods.method import Outcome, PointFeatures, Viewing, Watched, require, search_limits
 
 Matrix = NDArray[np.float64]
+PANDEY_BINS = 256  # of both: the papers' lasers and cameras give 8 bits, and so do ours
+NID_BINS = 16  # published
 TAIL = 4  # standard deviations; a Gaussian kernel is cut off where 6e-5 of its mass is left
 
 
@@ -71,42 +90,166 @@ def _kernel(bandwidth: float) -> NDArray[np.float32]:
     return np.asarray((weight / weight.sum())[:, None], np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class LitPoints:
-    """light: (h, w) grey values or their bins. camera: its pinhole. xyz: (n, 3) float32 m, LiDAR frame. level: (n,) bin of each
-    point's reflectivity."""
-
-    light: NDArray[np.uint8]
-    camera: Camera
-    xyz: NDArray[np.float32]
-    level: NDArray[np.intp]
-
-    def select(self, keep: NDArray[np.intp]) -> LitPoints:
-        """Some of the points, by index."""
-        return replace(self, xyz=self.xyz[keep], level=self.level[keep])
-
-
-def known_reflectivity(view: PreprocessedFrame, frame_name: str) -> NDArray[np.float32]:
-    """Reflectivity (n,) of a view's points, 0..1. BadInputError if it has none."""
-    if view.reflectivity is None:
+def known_reflectivity(view: PointFeatures, frame_name: str) -> NDArray[np.float32]:
+    """Reflectivity (n,) of a frame's points, 0..1. BadInputError if it has none."""
+    if view.value is None:
         raise BadInputError(
             f"frame {frame_name}: the cloud has no reflectivity, or the same everywhere, and this method compares nothing else; "
             "record the field intensity, or leave this method out"
         )
-    return view.reflectivity
+    return np.asarray(view.value)
 
 
-def all_near_image(features: Sequence[LitPoints], T: Matrix) -> list[LitPoints]:
-    """The points of every frame that project near the image at T (4, 4): within MARGIN of its width."""
-    return enough([f.select(near_image(f.xyz, T, f.camera, MARGIN)) for f in features])
-
-
-def enough(features: list[LitPoints]) -> list[LitPoints]:
+def enough(features: list[PointFeatures]) -> list[PointFeatures]:
     """The same; TooFewFeaturesError if they have fewer than MIN_POINTS points in all."""
-    found = sum(len(f.xyz) for f in features)
-    if found < MIN_POINTS:
-        raise TooFewFeaturesError(
-            f"only {found} points near the image in {len(features)} frames (need {MIN_POINTS}); "
-            "check the initial extrinsic and that the LiDAR sees what the camera sees"
-        )
+    advice = "check the initial extrinsic and that the LiDAR sees what the camera sees"
+    require(sum(len(f.xyz) for f in features), MIN_POINTS, f"near the image in {len(features)} frames", advice)
     return features
+
+
+@dataclass(frozen=True, eq=False)
+class InformationScore:
+    """Mutual information in nats of one joint histogram, into which the points of all frames go, as in the papers."""
+
+    frames: Sequence[PointFeatures]
+
+    def counts(self, T: Matrix) -> NDArray[np.intp]:
+        """Joint histogram (PANDEY_BINS, PANDEY_BINS), reflectivity by grey value, at T_camera_lidar (4, 4)."""
+        seen = [_seen(frame, T) for frame in self.frames]
+        return joint_counts(np.concatenate([level for level, _ in seen]), np.concatenate([gray for _, gray in seen]), PANDEY_BINS)
+
+    def value(self, T: Matrix) -> float:
+        """At T (4, 4); 0 if no point falls into an image. The bandwidth is that of the points which do."""
+        counts = self.counts(T)
+        return mutual_information(density(counts, silverman_bandwidth(counts))) if counts.any() else 0.0
+
+
+def _seen(frame: PointFeatures, T: Matrix) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Bins of the points in the image (m,): reflectivity, and the grey value between the four pixels around each.
+
+    Bilinear, for the nearest pixel's value would not change while a point moves within the pixel, and the slope is taken by
+    differences.
+    """
+    camera = frame.camera
+    M = (camera.K @ T[:3]).astype(np.float32)
+    p = M[:, :3] @ frame.xyz.T + M[:, 3:]
+    in_front = np.flatnonzero(p[2] > MIN_DEPTH)
+    z = p[2, in_front]
+    u, v = p[0, in_front] / z, p[1, in_front] / z
+    inside = np.flatnonzero((u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1))
+    gray = map_coordinates(frame.image, (v[inside], u[inside]), np.float32, order=1, mode="nearest")
+    return frame.value[in_front[inside]], np.rint(gray).astype(np.intp)
+
+
+@dataclass(frozen=True)
+class Pandey(Viewing):
+    """What the papers leave open. step_share: first and longest step, as a share of the reach. epsilon_deg: half width of the
+    central differences. evaluations: of the score, at most. Nothing beyond the reach is tried.
+    """
+
+    config: Config = field(default_factory=Config)
+    step_share: float = 0.25
+    epsilon_deg: float = 0.1
+    evaluations: int = 400
+    name: str = "pandey"
+    title: str = "Pandey et al. 2015: mutual information of reflectivity and grey value"
+
+    def features(self, frame: Frame) -> PointFeatures:
+        """All points and their reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty."""
+        view, _ = self._preprocess(frame)
+        level = np.rint(known_reflectivity(view, frame.name) * np.float32(PANDEY_BINS - 1)).astype(np.intp)
+        return replace(view, value=level)
+
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> InformationScore:
+        """Mutual information over all frames. T_prior: (4, 4). TooFewFeaturesError if hardly a point is near the image."""
+        return InformationScore(enough([f.select(near_image(f.xyz, T_prior, f.camera, MARGIN)) for f in features]))
+
+    def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
+        """Steepest ascent from T (4, 4), thesis eq. 3.13 and 3.14. A reach of zero refines: a short first step, no bounds."""
+        watched = Watched(self.score(features, T))
+        step = max(self.step_share * reach.reach[0], 2 * self.epsilon_deg)
+        found, _ = barzilai_borwein(watched, T, step, self.epsilon_deg, self.evaluations, search_limits(T, reach))
+        return Outcome(found, watched.evaluations)
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceScore:
+    """Less the mean of the frames' distances: -1, nothing in common, to 0. frames: with the points that are not hidden."""
+
+    frames: Sequence[PointFeatures]
+
+    def value(self, T: Matrix) -> float:
+        """At T_camera_lidar (4, 4); a frame without a point in the image has a distance of 1."""
+        return -float(np.mean([_distance(frame, T) for frame in self.frames]))
+
+
+def _distance(frame: PointFeatures, T: Matrix) -> float:
+    u, v, points = project(frame.xyz, T, frame.camera)
+    counts = joint_counts(frame.value[points], frame.image[v, u], NID_BINS)
+    return normalised_information_distance(counts / len(points)) if len(points) else 1.0
+
+
+def unhidden(frame: PointFeatures, T: Matrix, tolerance: float) -> NDArray[np.intp]:
+    """Indices of the points in the image at T (4, 4) that are at most `tolerance` m farther from the camera than the
+    nearest point of their pixel."""
+    u, v, points = project(frame.xyz, T, frame.camera)
+    distance = np.linalg.norm(frame.xyz[points] @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32), axis=1)
+    pixel = v * frame.camera.width + u
+    nearest = np.full(frame.camera.height * frame.camera.width, np.inf, np.float32)
+    np.minimum.at(nearest, pixel, distance)
+    return np.asarray(points[distance <= nearest[pixel] + tolerance])
+
+
+@dataclass(frozen=True)
+class Nid(Viewing):
+    """Published: tolerance_m of what hides; starts and steps of the simplex, at most; settled, deg and m, is how near a
+    search must end to where it began to be the last.
+
+    step_share: size of the first simplex as a share of the reach; the published one suits a start that is as good as right.
+    Nothing beyond the reach is tried, as in the published variant with slopes; the free simplex runs away on one scene.
+    """
+
+    config: Config = field(default_factory=Config)
+    tolerance_m: float = 0.1
+    starts: int = 10
+    evaluations: int = 600  # 256 steps of one to three each; the tolerances end it long before
+    settled: tuple[float, float] = (0.5, 0.1)
+    step_share: float = 0.35
+    name: str = "nid"
+    title: str = "Koide et al. 2023: normalised information distance of reflectivity and grey value"
+
+    def features(self, frame: Frame) -> PointFeatures:
+        """All points and their equalised reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty.
+
+        Equalised is the rank among all points of the cloud. Points of the same reflectivity share their mean rank: where the
+        sensor gives few values, ranks by order alone would tell where a point stands in the scan.
+        """
+        view, _ = self._preprocess(frame)
+        rank = (rankdata(known_reflectivity(view, frame.name)) - 0.5) / len(view.xyz)
+        shade = np.minimum(np.arange(256) * NID_BINS // 255, NID_BINS - 1).astype(np.uint8)
+        return replace(view, image=shade[cv2.equalizeHist(view.image)], value=(rank * NID_BINS).astype(np.intp))
+
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> DistanceScore:
+        """What is maximised while what is hidden stays as it is at T_prior (4, 4), and only points in its image count.
+
+        TooFewFeaturesError if there is hardly any.
+        """
+        seen = [f.select(unhidden(f, T_prior, self.tolerance_m)) for f in features]
+        return DistanceScore(enough(seen))
+
+    def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
+        """Nelder and Mead's simplex from T (4, 4), again and again; every search has its own score.
+
+        A reach of zero refines: a small first simplex, no bounds.
+        """
+        watched = Watched(self.score(features, T))
+        step = max(self.step_share * reach.reach[0], 0.1)
+        limits = search_limits(T, reach)
+        for _ in range(self.starts):
+            found, _ = nelder_mead(watched, T, step, self.evaluations, limits=limits)
+            near = se3.rotation_error_deg(T, found) < self.settled[0] and se3.translation_error_m(T, found) < self.settled[1]
+            T = found
+            if near:
+                break
+            watched.score = self.score(features, T)
+        return Outcome(T, watched.evaluations)

@@ -98,20 +98,6 @@ def search_limits(T: Matrix, reach: SearchBox) -> Limits:
     return unlimited(T) if reach.is_empty else Limits(T, reach.half_width())
 
 
-@dataclass(frozen=True, eq=False)
-class PreprocessedFrame:
-    """gray: (h, w) uint8. camera: its pinhole. measured: the scan as it was measured, finite points only, in the source's order;
-    neighbours are to be looked for in it. xyz: (n, 3) float32 m where these points stand at the image's moment, LiDAR frame.
-    reflectivity: (n,) float32 in 0..1, None if the source has none.
-    """
-
-    gray: NDArray[np.uint8]
-    camera: Camera
-    measured: PointCloud
-    xyz: NDArray[np.float32]
-    reflectivity: NDArray[np.float32] | None
-
-
 class Extractors:
     """The feature extractor of a configuration for the last camera, whose look-up tables are kept."""
 
@@ -124,54 +110,6 @@ class Extractors:
         if self._last is None or self._last.source_camera != camera:
             self._last = FeatureExtractor(camera, self.config)
         return self._last
-
-
-class Viewing:
-    """Base of methods that work with views of frames."""
-
-    config: Config
-
-    @cached_property
-    def _extractors(self) -> Extractors:
-        # The baselines project by eq. 2.3.
-        return Extractors(replace(self.config, image=replace(self.config.image, projection="pinhole")))
-
-    def _preprocess(self, frame: Frame) -> PreprocessedFrame:
-        """Preprocess a frame. TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
-        require_returns(frame.cloud)
-        extract, measured = self._extractors.of(frame.camera), frame.cloud.finite()
-        at_image = deskewed_points(frame, self.config.motion)
-        xyz = measured.xyz if at_image is None else at_image[frame.cloud.finite_mask()]
-        gray = to_gray(extract.working_image(frame.image))
-        return PreprocessedFrame(gray, extract.camera, measured, xyz, reflectivity(measured.intensity))
-
-
-class Points(Protocol):
-    """Features of a frame with points xyz (n, 3), m, LiDAR frame."""
-
-    @property
-    def camera(self) -> Camera: ...
-
-    @property
-    def xyz(self) -> NDArray[np.float32]: ...
-
-
-def near(features: Sequence[Points], T: Matrix, margin: float, least: int, what: str) -> list[NDArray[np.intp]]:
-    """Indices of the points of each frame that project near the image at T (4, 4): within `margin` of its width.
-
-    TooFewFeaturesError without a frame, or for fewer than `least` points per frame. what: for people.
-    """
-    if not features:
-        raise TooFewFeaturesError("no frame can be used; give others")
-    kept = [near_image(f.xyz, T, f.camera, margin) for f in features]
-    require(sum(map(len, kept)), least * len(features), what, "check the initial extrinsic")
-    return kept
-
-
-def require(found: int, needed: int, what: str, advice: str) -> None:
-    """TooFewFeaturesError for fewer points than needed."""
-    if found < needed:
-        raise TooFewFeaturesError(f"only {found} points {what} (need {needed}); {advice}")
 
 
 class Extracting:
@@ -196,3 +134,58 @@ class Extracting:
         cannot be used."""
         seen = self._segmentation(frame) if self._segmentation.active else None
         return self._extractors.of(frame.camera)(frame, seen)
+
+
+@dataclass(frozen=True, eq=False)
+class PointFeatures:
+    """What a baseline keeps of a frame. camera: its pinhole. image: (h, w) what points are matched with. xyz: (n, 3) float32 m
+    at the image's moment, LiDAR frame. value: (n,) of each point, what the method matches; None = nothing."""
+
+    camera: Camera
+    image: NDArray[Any]
+    xyz: NDArray[np.float32]
+    value: Any = None
+
+    def select(self, keep: NDArray[np.intp]) -> PointFeatures:
+        """Some of the points, by index."""
+        return replace(self, xyz=self.xyz[keep], value=None if self.value is None else self.value[keep])
+
+
+class Viewing:
+    """Base of the baselines, which project by eq. 2.3."""
+
+    config: Config
+
+    @cached_property
+    def _extractors(self) -> Extractors:
+        return Extractors(replace(self.config, image=replace(self.config.image, projection="pinhole")))
+
+    def _preprocess(self, frame: Frame) -> tuple[PointFeatures, PointCloud]:
+        """The grey image (h, w) uint8 with all points and their reflectivity, float32 in 0..1, None if the source has none; and
+        the scan as it was measured, finite points only, in the source's order: neighbours are to be looked for in it.
+
+        TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
+        require_returns(frame.cloud)
+        extract, measured = self._extractors.of(frame.camera), frame.cloud.finite()
+        at_image = deskewed_points(frame, self.config.motion)
+        xyz = measured.xyz if at_image is None else at_image[frame.cloud.finite_mask()]
+        gray = to_gray(extract.working_image(frame.image))
+        return PointFeatures(extract.camera, gray, xyz, reflectivity(measured.intensity)), measured
+
+
+def near(features: Sequence[PointFeatures], T: Matrix, margin: float, least: int, what: str) -> list[PointFeatures]:
+    """The points of each frame that project near the image at T (4, 4): within `margin` of its width.
+
+    TooFewFeaturesError without a frame, or for fewer than `least` points per frame. what: for people.
+    """
+    if not features:
+        raise TooFewFeaturesError("no frame can be used; give others")
+    kept = [f.select(near_image(f.xyz, T, f.camera, margin)) for f in features]
+    require(sum(len(f.xyz) for f in kept), least * len(features), what, "check the initial extrinsic")
+    return kept
+
+
+def require(found: int, needed: int, what: str, advice: str) -> None:
+    """TooFewFeaturesError for fewer points than needed."""
+    if found < needed:
+        raise TooFewFeaturesError(f"only {found} points {what} (need {needed}); {advice}")

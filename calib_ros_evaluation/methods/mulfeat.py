@@ -4,12 +4,11 @@ arXiv 2207.07228), as the thesis describes it: eq. 4.6, tables 4.2 and 4.3."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame, PointCloud
@@ -19,7 +18,16 @@ from calib_ros.lidar.range_image import RangeImage, range_image
 from calib_ros.registration.score.point_score import project
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import barzilai_borwein
-from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, near, require, search_limits, typical_step_deg
+from calib_ros_evaluation.methods.method import (
+    Outcome,
+    PointFeatures,
+    Viewing,
+    Watched,
+    near,
+    require,
+    search_limits,
+    typical_step_deg,
+)
 from calib_ros_thesis.cloud import PointAttributes, ground_plane, ground_points, object_labels, within_reach, within_thresholds
 from calib_ros_thesis.cloud import depth as point_depth
 from calib_ros_thesis.config import thesis_of
@@ -32,6 +40,7 @@ MAX_ROWS, MAX_COLUMNS = 2048, 16384  # cells of 0.02 deg and more; a few broken 
 
 WHAT = "on LiDAR edges"
 
+Matrix = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
@@ -116,21 +125,6 @@ def _height(xyz: Floats) -> Floats:
     return np.asarray(xyz[:, 2] / np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]), np.float32(1e-6)), np.float32)
 
 
-Matrix = NDArray[np.float64]
-Map = NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class MulfeatFeatures:
-    """Of one frame. xyz: (n, 3) float32 m at the image's moment, LiDAR frame. probability: (n,) P(E^L), above 0 to 1.
-    image_edges: E^C (h, w) in 0..1 of camera."""
-
-    camera: Camera
-    xyz: Map
-    probability: Map
-    image_edges: Map
-
-
 @dataclass(frozen=True)
 class Mulfeat(Viewing):
     """Method: the sum of P(E^L) E^C, times the share of LiDAR edges that meet an image edge, by steepest ascent.
@@ -159,22 +153,21 @@ class Mulfeat(Viewing):
     name: str = "mulfeat"
     title: str = "MulFEAT (Zhang et al. 2022): edges of depth, reflectivity and objects on a cylinder on image edges"
 
-    def features(self, frame: Frame) -> MulfeatFeatures:
+    def features(self, frame: Frame) -> PointFeatures:
         """P(E^L) and E^C. TooFewFeaturesError for fewer than min_points points with P above 0."""
-        view, config = self._preprocess(frame), self.config
-        index, P = edge_probability(view.measured, view.reflectivity, config, self.rows_per_ring, self.columns_per_step)
+        (view, measured), config = self._preprocess(frame), self.config
+        index, P = edge_probability(measured, view.value, config, self.rows_per_ring, self.columns_per_step)
         require(len(index), self.min_points, WHAT, "check that the LiDAR sees objects")
-        edges = gradient_edges(prepare(view.gray), thesis_of(config))
+        edges = gradient_edges(prepare(view.image), thesis_of(config))
         blur = self.smoothing * float(view.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
-        return MulfeatFeatures(view.camera, view.xyz[index], P, smoothed(edges, blur))
+        return PointFeatures(view.camera, smoothed(edges, blur), view.xyz[index], P)
 
-    def score(self, features: Sequence[MulfeatFeatures], T_prior: Matrix) -> MulfeatScore:
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> MulfeatScore:
         """Mean of the frames' J. TooFewFeaturesError for fewer than min_points per frame near the image at T_prior."""
         kept = near(features, T_prior, self.margin, self.min_points, WHAT)
-        frames = [replace(f, xyz=f.xyz[k], probability=f.probability[k]) for f, k in zip(features, kept, strict=True)]
-        return MulfeatScore(frames, self.lidar_edge, self.image_edge)
+        return MulfeatScore(kept, self.lidar_edge, self.image_edge)
 
-    def optimise(self, features: Sequence[MulfeatFeatures], T: Matrix, reach: SearchBox) -> Outcome:
+    def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Steepest ascent with the steps of Barzilai and Borwein, round after round from the best so far, within the reach."""
         watched, limits = Watched(self.score(features, T)), search_limits(T, reach)
         step = max(self.step_share * typical_step_deg(reach), 2 * self.finest_deg)
@@ -188,7 +181,7 @@ class Mulfeat(Viewing):
 class MulfeatScore:
     """J of eq. 4.6, the mean over frames; a Score. lidar_edge, image_edge: as of Mulfeat."""
 
-    frames: Sequence[MulfeatFeatures]
+    frames: Sequence[PointFeatures]
     lidar_edge: float
     image_edge: float
 
@@ -196,9 +189,9 @@ class MulfeatScore:
         """At T_camera_lidar (4, 4). A frame without LiDAR edges in the image adds 0."""
         return sum(self._of_frame(f, T) for f in self.frames) / len(self.frames)
 
-    def _of_frame(self, f: MulfeatFeatures, T: Matrix) -> float:
+    def _of_frame(self, f: PointFeatures, T: Matrix) -> float:
         u, v, inside = project(f.xyz, T, f.camera)
-        P, E = f.probability[inside], f.image_edges[v, u]
+        P, E = f.value[inside], f.image[v, u]
         is_edge = self.lidar_edge <= P
         n_edges = int(np.count_nonzero(is_edge))
         n_matched = int(np.count_nonzero(is_edge & (self.image_edge <= E)))

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.methods.castorena import Castorena
-from calib_ros_evaluation.methods.levinson import Levinson
+from calib_ros_evaluation.methods.edges import Castorena, Levinson
+from calib_ros_evaluation.methods.information import Nid, Pandey
 from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.mulfeat import Mulfeat
-from calib_ros_evaluation.methods.nid import Nid
-from calib_ros_evaluation.methods.own import Own
-from calib_ros_evaluation.methods.pandey import Pandey
-from calib_ros_evaluation.methods.thesis import Thesis
+from calib_ros_evaluation.methods.own import Own, Thesis
 
 # In the order of the thesis's table 4.2, then what came after it.
 METHODS = (Pandey, Levinson, Castorena, Mulfeat, Thesis, Nid, Own)

@@ -18,8 +18,7 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.checker import Checker
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict, Tolerance
-from calib_ros_evaluation.csv_files import numbers, read_table
-from calib_ros_evaluation.evaluate import StudyReport
+from calib_ros_evaluation.evaluate import Study, StudyReport
 from calib_ros_evaluation.experiments.answers import Answers, read_answers
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, WorkerCache, worker_cache
@@ -27,6 +26,7 @@ from calib_ros_evaluation.protocols.definitions import MISCALIBRATION
 from calib_ros_evaluation.protocols.published import ACCURACIES, protocol_report
 from calib_ros_evaluation.report.statistics import median
 from calib_ros_evaluation.report.table import NONE, Rows, Table, interval, percent, plural
+from calib_ros_evaluation.results import numbers, read_table
 
 Matrix = NDArray[np.float64]
 RIGHT_SET = "pos"  # holds right extrinsics, all others wrong ones
@@ -40,15 +40,15 @@ RIGHT, WRONG, INCONCLUSIVE = "right", "wrong", "inconclusive"
 
 
 @dataclass(frozen=True, eq=False)
-class Detection:
-    """A Study: a check of every row of the published table whose frame the source has, with every number of frames in `counts`:
+class Detection(Study):
+    """A check of every row of the published table whose frame the source has, with every number of frames in `counts`:
     its own and those that follow in the source, the first after the last."""
 
     rows: pd.DataFrame
     counts: tuple[int, ...]
 
     @property
-    def about(self) -> Mapping[str, str]:
+    def about(self) -> dict[str, str]:
         """See Study."""
         return {"protocol": MISCALIBRATION}
 

@@ -4,17 +4,15 @@ our trials stand beside the published figures."""
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.journal import Answer
-from calib_ros_evaluation.csv_files import TRIALS
-from calib_ros_evaluation.evaluate import StudyReport
-from calib_ros_evaluation.experiments.answers import Answers, read_answers, run_jobs, trial_of
+from calib_ros_evaluation.evaluate import Study, StudyReport
+from calib_ros_evaluation.experiments.answers import Answers, read_answers, trial_of
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary
 from calib_ros_evaluation.methods.own import Own
@@ -22,7 +20,7 @@ from calib_ros_evaluation.protocols.definitions import Protocol, Size
 from calib_ros_evaluation.protocols.published import OURS, PUBLISHED, protocol_report
 from calib_ros_evaluation.report.statistics import extended, median
 from calib_ros_evaluation.report.table import NONE, Rows, Table, degrees, interval, number, percent, plural
-from calib_ros_evaluation.results import trials_table
+from calib_ros_evaluation.results import TRIALS, trials_table
 
 HEADER = (
     *("system", "data", "frames", "trials", "success", "95 %", "refused", "wrong"),
@@ -31,8 +29,8 @@ HEADER = (
 
 
 @dataclass(frozen=True)
-class Calibrations:
-    """A Study: so many trials of every source, size of start error and number of frames in `counts`. Trial k has the seed `seed`
+class Calibrations(Study):
+    """So many trials of every source, size of start error and number of frames in `counts`. Trial k has the seed `seed`
     + k."""
 
     protocol: Protocol
@@ -41,7 +39,7 @@ class Calibrations:
     seed: int = 0
 
     @property
-    def about(self) -> Mapping[str, str]:
+    def about(self) -> dict[str, str]:
         """See Study."""
         return {"protocol": self.protocol.name}
 
@@ -56,10 +54,6 @@ class Calibrations:
             for count in self.counts
             for k in range(self.seed, self.seed + self.trials)
         ]
-
-    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
-        """See Study."""
-        return run_jobs(setup, todo)
 
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """See Study. A table for each size of start error."""

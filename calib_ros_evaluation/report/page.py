@@ -8,7 +8,7 @@ from pathlib import Path
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros_check.page import page_template
-from calib_ros_evaluation.rendering import empty_figure
+from calib_ros_evaluation.curves import empty_figure
 from calib_ros_evaluation.report.sections import Section
 from calib_ros_evaluation.report.table import escaped
 

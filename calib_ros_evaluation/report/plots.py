@@ -13,8 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calib_ros.frame import SemanticClass
-from calib_ros_evaluation.curves import AXES, Curves
-from calib_ros_evaluation.rendering import COLORS, Style, above, draw_curves, empty_figure, pixels
+from calib_ros_evaluation.curves import AXES, COLORS, Curves, Style, above, draw_curves, empty_figure, pixels
 from calib_ros_evaluation.report.statistics import OURS, axis_errors, groups, quantile, wilson
 from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, Similarity
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import binomtest, mannwhitneyu
 
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.methods.levinson import fitted, probability_right
+from calib_ros_evaluation.methods.edges import fitted, probability_right
 from calib_ros_evaluation.results import END, SUCCESS_DEG, SUCCESS_M, Results, Trust
 
 Matrix = NDArray[np.float64]

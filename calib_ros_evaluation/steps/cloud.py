@@ -11,10 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros import se3
-from calib_ros.camera import Camera
-from calib_ros.frame import PointCloud
-from calib_ros.lidar.range_image import RangeImage, range_image
+from calib_ros.lidar.range_image import range_image
 from calib_ros.lidar.segmentation import Plane
 from calib_ros.overlay import BAR, put, text_width
 from calib_ros.registration.score.point_score import project
@@ -51,7 +48,7 @@ Matrix = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 SECTION = "3.3"
-step = partial(Step, SECTION)
+step, wide_step = partial(Step, SECTION), partial(Step, SECTION, wide=True)
 TELLING = 0.05  # a configured filter that removes a smaller share of the points is shown with another threshold
 REFLECTIVITY = Scale("reflectivity, share of full scale", 0, 1, PLASMA)
 HEIGHT = 320  # px that all rings together are at least high
@@ -59,43 +56,6 @@ GROUND = (40, 120, 200)  # BGR, orange
 GROUND_LEVEL, OTHER_LEVEL = 1, 2
 GROUND_PALETTE = np.zeros((256, 3), np.uint8)
 GROUND_PALETTE[[GROUND_LEVEL, OTHER_LEVEL]] = GROUND, (200, 170, 60)
-
-
-@dataclass(frozen=True, eq=False)
-class Panorama:
-    """index: (rows, columns) into the scan's points or -1, highest ring first, left of the vehicle left.
-
-    borders: columns of the left and right border of the camera's picture.
-    """
-
-    index: NDArray[np.int32]
-    borders: tuple[int, ...]
-
-    @staticmethod
-    def of(scan: RangeImage, T: Matrix, camera: Camera) -> Panorama:
-        """The camera at T_camera_lidar (4, 4) sees what lies between the borders."""
-        rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T
-        ahead = rays @ se3.inverse(T)[:3, :3].T
-        columns = scan.index.shape[1]
-        azimuth = np.arctan2(ahead[:, 1], ahead[:, 0])
-        borders = tuple(int(c) for c in np.rint((np.pi - azimuth) / (2 * np.pi) * (columns - 1)))
-        return Panorama(np.ascontiguousarray(scan.index[:, ::-1]), borders)
-
-    def draw(self, colors: Image, scale: Scale | None = None) -> Image:
-        """Colours (n, 3) of the points -> picture with azimuths above, the camera's borders, and the scale below."""
-        rows, columns = self.index.shape
-        cells = np.where((self.index >= 0)[..., None], colors[np.maximum(self.index, 0)], np.uint8(BACKGROUND))
-        picture = np.repeat(cells, max(round(HEIGHT / rows), 1), axis=0)
-        font, line, margin = sizes(columns)
-        for x in self.borders:
-            cv2.line(picture, (x, 0), (x, picture.shape[0]), (255, 255, 255), max(columns // 900, 1))
-        top = np.full((line + margin, columns, 3), BAR, np.uint8)
-        for degrees, name in ((180, "behind"), (90, "left 90 deg"), (0, "ahead"), (-90, "right 90 deg"), (-180, "behind")):
-            width = text_width(name, font)
-            x = round((180 - degrees) / 360 * columns) - width // 2
-            put(top, name, (int(np.clip(x, margin, columns - width - margin)), line - margin // 2), font)
-        picture = np.vstack([top, picture])
-        return picture if scale is None else scale.below(picture)
 
 
 def depth_scale(depth: Floats) -> Scale:
@@ -107,21 +67,28 @@ def depth_scale(depth: Floats) -> Scale:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """All returns of a scan (n,) in the order of its panorama, and what the thesis finds of them."""
+    """All returns of a scan (n,) in the order of its panorama, and what the thesis finds of them.
 
-    points: PointCloud
-    panorama: Panorama
+    index: (rows, columns) into the returns or -1, highest ring first, left of the vehicle left. borders: azimuths of the left and
+    right border of the camera's picture, rad. colors: (n, 3) by depth, on `scale`.
+    """
+
+    xyz: Floats
+    index: NDArray[np.int32]
+    borders: Matrix
     depth: Floats
     reflectivity: Floats | None
     passed: Mask
     plane: Plane | None
     ground: Mask
     label: NDArray[np.uint8]
+    scale: Scale
+    colors: Image
 
     @staticmethod
     def of(scene: RegisteredFrame) -> Cloud:
         """The same steps as attributes(), which keeps only the points that are left in the end."""
-        config = thesis_of(scene.config)
+        config, camera = thesis_of(scene.config), scene.frame.camera
         scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0))  # nothing is cut off
         xyz, d = scan.cloud.xyz, depth(scan.cloud.xyz)
         reach, passed = within_reach(xyz, config), within_thresholds(xyz, scan.reflectivity, config)
@@ -130,20 +97,37 @@ class Cloud:
         ground[reach] = ground_points(xyz[reach], plane, config)
         ground &= passed
         label[passed] = object_labels(xyz[passed], d[passed], ground[passed], config)
-        panorama = Panorama.of(scan, scene.T, scene.frame.camera)
-        return Cloud(scan.cloud, panorama, d, scan.reflectivity, passed, plane, ground, label)
+        rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T
+        ahead = rays @ scene.T[:3, :3]
+        borders, index = np.arctan2(ahead[:, 1], ahead[:, 0]), np.ascontiguousarray(scan.index[:, ::-1])
+        scale = depth_scale(d)
+        colors = scale.palette[scale.levels(d)]
+        return Cloud(xyz, index, borders, d, scan.reflectivity, passed, plane, ground, label, scale, colors)
+
+    def draw(self, colors: Image, scale: Scale | None = None) -> Image:
+        """Colours (n, 3) of the points -> panorama with azimuths above, the camera's borders, and the scale below."""
+        rows, columns = self.index.shape
+        cells = np.where((self.index >= 0)[..., None], colors[np.maximum(self.index, 0)], np.uint8(BACKGROUND))
+        picture = np.repeat(cells, max(round(HEIGHT / rows), 1), axis=0)
+        font, line, margin = sizes(columns)
+        for x in np.rint((np.pi - self.borders) / (2 * np.pi) * (columns - 1)).astype(int).tolist():
+            cv2.line(picture, (x, 0), (x, picture.shape[0]), (255, 255, 255), max(columns // 900, 1))
+        top = np.full((line + margin, columns, 3), BAR, np.uint8)
+        for degrees, name in ((180, "behind"), (90, "left 90 deg"), (0, "ahead"), (-90, "right 90 deg"), (-180, "behind")):
+            width = text_width(name, font)
+            x = round((180 - degrees) / 360 * columns) - width // 2
+            put(top, name, (int(np.clip(x, margin, columns - width - margin)), line - margin // 2), font)
+        picture = np.vstack([top, picture])
+        return picture if scale is None else scale.below(picture)
 
 
 def cloud_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     """Raw scan and threshold filters."""
-    n = len(cloud.points)
-    scale = depth_scale(cloud.depth)
-    yield step(
+    yield wide_step(
         "Scan by depth",
-        f"Figure 3.7a: all {n} returns of the scan as a panorama; a row is a ring of the LiDAR, a column a direction. The white "
-        "lines are the borders of the camera's picture. Bright is near.",
-        cloud.panorama.draw(scale.palette[scale.levels(cloud.depth)], scale),
-        wide=True,
+        f"Figure 3.7a: all {len(cloud.xyz)} returns of the scan as a panorama; a row is a ring of the LiDAR, a column a "
+        "direction. The white lines are the borders of the camera's picture. Bright is near.",
+        cloud.draw(cloud.colors, cloud.scale),
     )
     if cloud.reflectivity is None:
         yield step(
@@ -152,20 +136,17 @@ def cloud_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
             "What needs it is left out, or zero, below.",
         )
     else:
-        yield step(
+        yield wide_step(
             "Scan by reflectivity",
             "Figure 3.7b: how much of the beam comes back. Look for signs, number plates and lane markings, which depth does not "
             f"show. The median is {np.median(cloud.reflectivity):.2f}; 5 % of the points lie above "
             f"{np.percentile(cloud.reflectivity, 95):.2f}.",
-            cloud.panorama.draw(PLASMA[REFLECTIVITY.levels(cloud.reflectivity)], REFLECTIVITY),
-            wide=True,
+            cloud.draw(PLASMA[REFLECTIVITY.levels(cloud.reflectivity)], REFLECTIVITY),
         )
     yield from _filters(scene, cloud)
 
 
 def _filters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
-    xyz, scale = cloud.points.xyz, depth_scale(cloud.depth)
-    colors = scale.palette[scale.levels(cloud.depth)]
     rows: list[tuple[str, ...]] = [("filter", "kept in this run", "removed", "kept in the picture", "removed")]
     for name, text, own, own_mask, other, other_mask in _choices(scene, cloud):
         removed = 1 - float(own_mask.mean())
@@ -174,24 +155,22 @@ def _filters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
         why = (
             "the limits of this run" if shown == own else f"chosen for the picture, since this run ({own}) removes {removed:.1%}"
         )
-        yield step(
+        yield wide_step(
             f"Filter by {name}",
             f"Figure 3.8. {text} Coloured: kept, {shown} ({why}). Grey: the {np.count_nonzero(~mask)} points removed, "
             f"{1 - mask.mean():.1%} of all.",
-            cloud.panorama.draw(np.where(mask[:, None], colors, np.uint8(HIDDEN[0])), scale),
-            wide=True,
+            cloud.draw(np.where(mask[:, None], cloud.colors, np.uint8(HIDDEN[0])), cloud.scale),
         )
-    yield step(
+    yield wide_step(
         "Threshold filters together",
-        f"Of {len(xyz)} points, {np.count_nonzero(cloud.passed)} pass all filters of this run and go on.",
+        f"Of {len(cloud.xyz)} points, {np.count_nonzero(cloud.passed)} pass all filters of this run and go on.",
         table=tuple(rows),
-        wide=True,
     )
 
 
 def _choices(scene: RegisteredFrame, cloud: Cloud) -> Iterator[tuple[str, str, str, Mask, str, Mask]]:
     """Filter, what it is for, the limits of this run and which points pass, limits that show its effect, and which pass those."""
-    config, xyz = thesis_of(scene.config), cloud.points.xyz
+    config, xyz = thesis_of(scene.config), cloud.xyz
     floor = float(np.percentile(xyz[:, 2], 10)) if cloud.plane is None else cloud.plane.offset / float(cloud.plane.normal[2])
     low = round(floor + 0.3, 1)
     yield (
@@ -212,7 +191,9 @@ def _choices(scene: RegisteredFrame, cloud: Cloud) -> Iterator[tuple[str, str, s
             f"{bright:g} to 1",
             by_reflectivity(cloud.reflectivity, bright),
         )
-    middle, half = _camera_azimuths(scene)
+    left, right = cloud.borders
+    width = float(np.angle(np.exp(1j * (left - right))))
+    middle, half = (float(np.rad2deg(a)) for a in (np.angle(np.exp(1j * (right + width / 2))), abs(width) / 2))
     yield (
         "angle",
         "Directions that the camera does not see are of no use.",
@@ -231,16 +212,6 @@ def _choices(scene: RegisteredFrame, cloud: Cloud) -> Iterator[tuple[str, str, s
     )
 
 
-def _camera_azimuths(scene: RegisteredFrame) -> tuple[float, float]:
-    """Middle and half width of the camera's horizontal field, in the LiDAR's azimuth, deg."""
-    camera, R = scene.frame.camera, scene.T[:3, :3]
-    rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T @ R
-    left, right = np.arctan2(rays[:, 1], rays[:, 0])
-    width = float(np.angle(np.exp(1j * (left - right))))
-    middle = float(np.angle(np.exp(1j * (right + width / 2))))
-    return float(np.rad2deg(middle)), float(np.rad2deg(abs(width) / 2))
-
-
 def object_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     """The ground found and removed, then clusters of what is left."""
     yield from _ground(scene, cloud)
@@ -249,8 +220,7 @@ def object_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
 
 def _ground(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     config = thesis_of(scene.config)
-    scale = depth_scale(cloud.depth)
-    colors = scale.palette[scale.levels(cloud.depth)]
+    colors = cloud.colors.copy()
     colors[~cloud.passed] = HIDDEN
     if cloud.plane is None:
         text = f"no plane holds {GROUND_SHARE:.0%} of the points, so nothing counts as ground."
@@ -263,26 +233,24 @@ def _ground(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
         )
     marked = colors.copy()
     marked[cloud.ground] = GROUND
-    yield step(
+    yield wide_step(
         "Ground found",
         f"RANSAC, algorithm 1, {config.ground_iterations} planes tried: {text} Ground is orange.",
-        cloud.panorama.draw(marked, scale),
-        wide=True,
+        cloud.draw(marked, cloud.scale),
     )
     colors[cloud.ground] = HIDDEN
-    yield step(
+    yield wide_step(
         "Ground removed",
         "Figure 3.9a: the depth map without the ground (grey). Objects now stand by themselves. Depth edges and clusters are "
         "taken from these points; reflectivity edges from all, since lane markings lie on the ground.",
-        cloud.panorama.draw(colors, scale),
-        wide=True,
+        cloud.draw(colors, cloud.scale),
     )
-    order = np.argsort(cloud.points.xyz[:, 2], kind="stable")
+    order = np.argsort(cloud.xyz[:, 2], kind="stable")
     yield step(
         "Ground from above",
         "The ground from above, ahead is up: ground in orange, all else by depth. Look for kerbs and slopes that are taken for "
         "ground, or are not.",
-        from_above(cloud.points.xyz[order], marked[order]),
+        from_above(cloud.xyz[order], marked[order]),
     )
     levels = np.where(cloud.ground, GROUND_LEVEL, OTHER_LEVEL)
     yield step(
@@ -299,20 +267,19 @@ def _clusters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     sizes = np.sort(np.bincount(cloud.label)[1:])[::-1]
     sizes = sizes[sizes > 0]
     largest = f"The largest has {sizes[0]} points, the smallest {sizes[-1]}. " if len(sizes) else ""
-    yield step(
+    yield wide_step(
         "Clusters",
         f"Figure 3.9b: DBSCAN, algorithm 2, finds {len(sizes)} objects among the points above ground within "
         f"{config.cluster_max_depth:g} m (radius {config.cluster_eps:g} m, {config.cluster_min_points} points). {largest}"
         "Grey points belong to none. Colours are names only.",
-        cloud.panorama.draw(colors),
-        wide=True,
+        cloud.draw(colors),
     )
     order = np.argsort(cloud.label > 0, kind="stable")
     yield step(
         "Clusters from above",
         "The same from above. Look for objects that have grown together and for walls that fall apart: their borders become "
         "edges.",
-        from_above(cloud.points.xyz[order], colors[order]),
+        from_above(cloud.xyz[order], colors[order]),
     )
     labels = _on_image(scene, cloud, cloud.label)
     seen = len(np.unique(labels[labels > 0]))
@@ -326,7 +293,7 @@ def _clusters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
 def _on_image(scene: RegisteredFrame, cloud: Cloud, levels: NDArray[np.generic]) -> Image:
     """Levels (n,) of the points on the pixels (h, w) they fall on; 0 elsewhere. The nearest point counts."""
     camera, far_first = scene.frame.camera, np.argsort(-cloud.depth, kind="stable")
-    u, v, inside = project(cloud.points.xyz[far_first], scene.T, camera)
+    u, v, inside = project(cloud.xyz[far_first], scene.T, camera)
     picture = np.zeros((camera.height, camera.width), np.uint8)
     picture[v, u] = levels[far_first][inside]
     return picture

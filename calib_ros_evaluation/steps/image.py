@@ -25,6 +25,7 @@ from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.image import OPERATORS, gradient_edges
 
 preparation_step, edge_step = partial(Step, "3.2"), partial(Step, "3.4.2")
+wide_preparation_step, wide_edge_step = partial(preparation_step, wide=True), partial(edge_step, wide=True)
 METHODS = {
     "none": "none: as recorded",
     "global": "global: one curve for all pixels",
@@ -82,21 +83,19 @@ def _equalized(scene: RegisteredFrame, equalized: dict[str, Image]) -> Iterator[
             "differ. Not used: the method works on the grey image.",
             equalize(image),
         )
-    yield preparation_step(
+    yield wide_preparation_step(
         "Histograms",
         "Figure 3.3: share of pixels of each grey level (blue, eq. 3.1) and their distribution (orange, eq. 3.2 and 3.3). Global "
         "equalisation turns the distribution into a straight line, with gaps in the "
         "histogram; CLAHE bends it less than adaptive equalisation.",
         histograms({METHODS[method]: picture for method, picture in equalized.items()}),
-        wide=True,
     )
     window = busiest(outlines(equalized["clahe"]) - outlines(scene.gray), *_size(scene.gray))
-    yield preparation_step(
+    yield wide_preparation_step(
         "Equalisation, magnified",
         f"Figure 3.4: the part of the image where CLAHE strengthens outlines most, rows {window[0].start} to "
         f"{window[0].stop}, columns {window[1].start} to {window[1].stop}. Look for outlines that only the local methods show.",
         tiles([p[window] for p in equalized.values()], list(METHODS), 4, scene.frame.camera.width),
-        wide=True,
     )
 
 
@@ -113,11 +112,10 @@ def _filtered(scene: RegisteredFrame, equalized: Image) -> Iterator[Step]:
         text += f" A pixel changes by {change:.1f} grey levels on average.{USED if name == 'bilateral' else ''}"
         yield preparation_step(f"{name.capitalize()} filter", text, done[name])
     window = busiest(outlines(equalized), *_size(equalized))
-    yield preparation_step(
+    yield wide_preparation_step(
         "Filters, magnified",
         "Before, bilateral and Gaussian, where the image has its strongest outlines. Compare how sharp outlines and texture are.",
         tiles([p[window] for p in (equalized, *done.values())], ["before", *done], 3, scene.frame.camera.width),
-        wide=True,
     )
 
 
@@ -160,13 +158,12 @@ def edge_steps(scene: RegisteredFrame) -> Iterator[Step]:
         for e in (scene.unsmoothed, *scene.thesis.image_edges)
     ]
     names = ["not smoothed", *(f"sigma {sigma:g} px" for sigma in thesis.smoothing)]
-    yield edge_step(
+    yield wide_edge_step(
         "Smoothing, magnified",
         "Figure 3.11, where the image has its strongest outlines; each tile is scaled to its own brightest pixel. "
         "Without smoothing a LiDAR edge two pixels off its partner scores hardly anything. "
         f"{scene.semantic_edges.capitalize()} are blended in (figure 3.10, see Semantics).",
         tiles(pictures, names, len(names), scene.frame.camera.width),
-        wide=True,
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +21,6 @@ from calib_ros_evaluation.steps.pictures import (
     busiest,
     edge_picture,
     enlarged,
-    over,
     tiles,
 )
 from calib_ros_thesis.config import thesis_of
@@ -33,40 +31,26 @@ from calib_ros_thesis.maps import (
     EMPTY,
     LARGE,
     MIDDLE,
-    NEAREST,
     REFLECTIVITY_STEP,
     REFLECTIVITY_UNITS,
     SMALL,
     EdgeMaps,
     complete,
+    completion_stages,
     far_level,
 )
 from calib_ros_thesis.score import MAX_DISCONTINUITY
 
 Levels = NDArray[np.int16]
 SECTION = "3.4.3"
-step = partial(Step, SECTION)
-
-
-def completion_stages(sparse_depth: Levels, far: int) -> list[tuple[str, Levels]]:
-    """Sparse depth (h, w) -> the map after each step of figure 3.13, still inverted; the last is complete()'s result."""
-    square = {size: np.ones((size, size), np.uint8) for size in (SMALL, MIDDLE, LARGE)}
-    empty = np.int16(EMPTY)
-    stages = [("inversion", np.where(sparse_depth != empty, np.int16(far + 1) - sparse_depth, empty))]
-    stages.append(("dilation", np.asarray(cv2.dilate(stages[-1][1], NEAREST), np.int16)))
-    closed = cv2.morphologyEx(stages[-1][1], cv2.MORPH_CLOSE, square[SMALL])
-    stages.append(("closing", np.asarray(closed, np.int16)))
-    for name, size in (("middle holes", MIDDLE), ("large holes", LARGE)):
-        before = stages[-1][1]
-        stages.append((name, np.where(before == empty, np.asarray(cv2.dilate(before, square[size]), np.int16), before)))
-    stages.append(("blur", np.asarray(cv2.medianBlur(stages[-1][1], BLUR), np.int16)))
-    return stages
+step, wide_step = partial(Step, SECTION), partial(Step, SECTION, wide=True)
 
 
 def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Sparse depth to the map before the last step, which gives dense depth."""
     sparse_depth, far = scene.maps.lidar.sparse_depth, far_level(thesis_of(scene.config))
-    stages = completion_stages(sparse_depth, far)
+    inversion = np.where(sparse_depth != EMPTY, np.int16(far + 1) - sparse_depth, np.int16(EMPTY))
+    stages = {"inversion": inversion, **completion_stages(inversion)}
     seen = sparse_depth[sparse_depth != EMPTY]
     low, high = np.round((far + 1 - np.percentile(seen, [99, 1])) / DEPTH_UNITS) if len(seen) else (0, far / DEPTH_UNITS)
     inverted = Scale(f"{far / DEPTH_UNITS:g} m - depth, m", float(low), max(float(high), float(low) + 1), VIRIDIS)
@@ -80,7 +64,7 @@ def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
         f"to {LARGE // 2} px, which is why edges count only where a point lies.",
     }
     for name, text in texts.items():
-        levels = dict(stages)[name]
+        levels = stages[name]
         shown = levels != EMPTY
         draw = inverted.dots if name == "inversion" else inverted.dense
         yield step(
@@ -88,22 +72,22 @@ def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
             f"Figure 3.13. {text} {shown.mean():.1%} of the pixels are filled.",
             draw(levels / DEPTH_UNITS, shown),
         )
-    yield step(
+    yield wide_step(
         "Completion, magnified",
         "Figure 3.13 on the part of the picture with the strongest jumps, pixel by pixel: from single points to a surface. "
         "The last step but the inversion back is a median blur, which takes away what sticks out of a surface.",
         _magnified(stages, scene.maps.discontinuity, inverted),
-        wide=True,
     )
 
 
-def _magnified(stages: list[tuple[str, Levels]], interest: NDArray[np.float32], scale: Scale) -> Image:
+def _magnified(stages: dict[str, Levels], interest: NDArray[np.float32], scale: Scale) -> Image:
     h, w = interest.shape
     window = busiest(interest, max(h // 3, 2), max(w // 8, 2))
     pictures = [
-        scale.palette[np.where(levels[window] != EMPTY, scale.levels(levels[window] / DEPTH_UNITS), 0)] for _, levels in stages
+        scale.palette[np.where(levels[window] != EMPTY, scale.levels(levels[window] / DEPTH_UNITS), 0)]
+        for levels in stages.values()
     ]
-    return scale.below(tiles(pictures, [name for name, _ in stages], 3, w))
+    return scale.below(tiles(pictures, list(stages), 3, w))
 
 
 def map_steps(scene: RegisteredFrame) -> Iterator[Step]:
@@ -137,9 +121,9 @@ def _points(scene: RegisteredFrame) -> NDArray[np.uint8]:
     points, camera = scene.thesis.points, scene.frame.camera
     u, v, inside = project(points.xyz, scene.T, camera)
     scale = depth_scale(points.depth[inside])
-    levels = np.zeros((camera.height, camera.width), np.uint8)
-    levels[v, u] = scale.levels(points.depth[inside])
-    return scale.below(over(scene.gray, enlarged(levels), scale.palette))
+    depth = np.zeros((camera.height, camera.width), np.float32)
+    depth[v, u] = points.depth[inside]
+    return scale.over(scene.gray, depth, depth > 0)
 
 
 def _depth_scale(lidar: EdgeMaps) -> Scale:

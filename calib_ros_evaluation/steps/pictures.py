@@ -20,8 +20,7 @@ from calib_ros.image.enhance import prepare, to_gray
 from calib_ros.overlay import BAR, put, text_width
 from calib_ros.registration.classes import OF_CLASSES, OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.rendering import COLORS, above, draw_curves, empty_figure, pixels
+from calib_ros_evaluation.curves import COLORS, Curves, above, draw_curves, empty_figure, pixels
 from calib_ros_semantics.class_pictures import BACKGROUND, sizes
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures, semantic_share
@@ -176,6 +175,10 @@ class Scale:
     def dots(self, values: ArrayLike, shown: Mask) -> Image:
         """As dense, but what is shown are single pixels, drawn larger."""
         return self.below(self.palette[enlarged(np.where(shown, self.levels(values), 0))])
+
+    def over(self, image: Image, values: ArrayLike, shown: Mask) -> Image:
+        """As dots, over an image (h, w[, 3])."""
+        return self.below(over(image, enlarged(np.where(shown, self.levels(values), 0)), self.palette))
 
     def below(self, picture: Image) -> Image:
         """The picture with the scale's bar under it."""

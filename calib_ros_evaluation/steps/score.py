@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,20 +20,17 @@ from calib_ros_evaluation.steps.pictures import (
     PLASMA,
     WRONG_DEG,
     WRONG_M,
-    Image,
     Matrix,
     RegisteredFrame,
     Scale,
     Step,
-    enlarged,
     loss_curves,
-    over,
 )
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.score import MAX_DISCONTINUITY, RegistrationMaps, ThesisScore, registration_maps
 
 SECTION = "3.4.4"
-step = partial(Step, SECTION)
+step, wide_step = partial(Step, SECTION), partial(Step, SECTION, wide=True)
 ROTATION_DEG, TRANSLATION_M = 2.0, 0.3  # half widths of the curves
 EDGE_SHOWN = 0.1  # W D + E^L from here on is drawn over the image
 STRONG = 0.25  # E^I that counts as an edge beneath, in captions
@@ -71,7 +69,9 @@ def score_steps(scene: RegisteredFrame, samples: int) -> Iterator[Step]:
         Scale("W", 0, _round(maps.weight[occupied], 99), PLASMA).dots(maps.weight, occupied),
     )
     wrong = registration_maps(scene.thesis, scene.wrong, config)
-    fast = _fast(scene)
+    fast: Score | None = None
+    with contextlib.suppress(TooFewFeaturesError):
+        fast = FastScore([scene.features], scene.T, scene.config.score).at(-1)
     added = _matched(maps)
     high = _round(added[added > 0], 97)
     moved = f"moved {WRONG_DEG:g} deg and {100 * WRONG_M:g} cm to the side"
@@ -87,10 +87,11 @@ def _met(
     """Where edges of both sensors meet at T."""
     scores = f"J = {maps.edge_registration_score():.1f}; divided by the LiDAR edges in the picture, {_normalized(maps):.3f}"
     scores += "." if fast is None else f"; fast score {fast.value(T):.3f}."
+    added, edges = _matched(maps), np.asarray(255 * np.minimum(maps.image_edges / 0.5, 1), np.uint8)
     yield step(
         f"Score per pixel{suffix}",
         f"W D E^I + E^L E^I of eq. 3.12, {where}: what every pixel adds, over E^I in grey. The sum over the picture is {scores}",
-        _heat(maps, high),
+        Scale("what a pixel adds to J", 0, high, INFERNO).over(edges, added, added >= FAINT * high),
     )
     drawn = _lidar_edges(maps) >= EDGE_SHOWN
     hits = float((maps.image_edges[drawn] > STRONG).mean()) if drawn.any() else 0.0
@@ -98,7 +99,7 @@ def _met(
         f"Overlay{suffix}",
         f"LiDAR edges (W D + E^L from {EDGE_SHOWN:g} on) over the image, {where}: yellow where an image edge lies beneath, "
         f"purple where there is none. {hits:.0%} of them lie on an image edge stronger than {STRONG:g}. {scores}",
-        _overlay(scene.gray, maps),
+        Scale("image edge beneath", 0, 0.6, PLASMA).over(scene.gray, maps.image_edges, drawn),
     )
 
 
@@ -112,33 +113,12 @@ def _round(values: NDArray[np.float32], percentile: float) -> float:
     return max(float(f"{np.percentile(values, percentile):.1g}"), 0.05) if len(values) else 1.0
 
 
-def _heat(maps: RegistrationMaps, high: float) -> Image:
-    """What every pixel adds to J, over the image's edges."""
-    scale, added = Scale("what a pixel adds to J", 0, high, INFERNO), _matched(maps)
-    edges = np.asarray(255 * np.minimum(maps.image_edges / 0.5, 1), np.uint8)
-    return scale.below(over(edges, enlarged(np.where(added >= FAINT * high, scale.levels(added), 0)), INFERNO))
-
-
-def _fast(scene: RegisteredFrame) -> Score | None:
-    """The fast score of this frame; None if the scan shows too few edge points for it."""
-    try:
-        return FastScore([scene.features], scene.T, scene.config.score).at(-1)
-    except TooFewFeaturesError:
-        return None
-
-
 def _normalized(maps: RegistrationMaps) -> float:
     return maps.edge_registration_score() / max(maps.lidar_mass(), 1e-12)
 
 
 def _lidar_edges(maps: RegistrationMaps) -> NDArray[np.float32]:
     return np.asarray(maps.weight * maps.discontinuity + maps.lidar.lidar_edges, np.float32)
-
-
-def _overlay(image: Image, maps: RegistrationMaps) -> Image:
-    scale = Scale("image edge beneath", 0, 0.6, PLASMA)
-    dots = np.where(_lidar_edges(maps) >= EDGE_SHOWN, scale.levels(maps.image_edges), 0)
-    return scale.below(over(image, enlarged(dots), PLASMA))
 
 
 def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score | None, scene: RegisteredFrame) -> Step:
@@ -149,12 +129,11 @@ def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score |
         pairs["fast score"] = [fast.value(scene.T), fast.value(scene.wrong)]
     for name, (a, b) in pairs.items():
         rows.append((name, f"{a:.4g}", f"{b:.4g}", f"{a / b:.2f}" if b > 0 else "-"))
-    return step(
+    return wide_step(
         "Scores",
         f"The same frame at the extrinsic of this page and moved {WRONG_DEG:g} deg and {100 * WRONG_M:g} cm to the side. The "
         "more a score falls, the better it separates a right extrinsic from a wrong one.",
         table=tuple(rows),
-        wide=True,
     )
 
 
@@ -171,21 +150,19 @@ def _curve_steps(scene: RegisteredFrame, fast: Score | None, samples: int) -> It
     if fast is not None:
         found["fast score"] = curves(fast, scene.T, ROTATION_DEG, TRANSLATION_M, samples)
     missing = "" if fast is not None else " The scan shows too few edge points for the fast score."
-    yield step(
+    yield wide_step(
         "Loss curves",
         "Scores along each axis around the extrinsic of this page, the others at rest, as in figures 4.7 and 4.10; every "
         f"curve is scaled to 0..1 and its peak marked. Axes are the camera's: x right, y down, z ahead.{missing} A good score "
         "has one hill, which peaks at the true extrinsic.",
         loss_curves(found),
-        wide=True,
     )
     rows = [("peak at", *(f"{axis}, {'deg' if k < 3 else 'cm'}" for k, axis in enumerate(AXES)))]
     for name, curve in found.items():
         rows.append((name, *(f"{p:+.2f}" if k < 3 else f"{p:+.1f}" for k, p in enumerate(curve.peaks))))
-    yield step(
+    yield wide_step(
         "Peaks",
         f"Where each curve is highest, within {ROTATION_DEG:g} deg and {100 * TRANSLATION_M:g} cm. A single frame may show an "
         "axis badly: then its curve is flat and its peak far off.",
         table=tuple(rows),
-        wide=True,
     )

@@ -35,7 +35,7 @@ from calib_ros_thesis.features import importance
 from calib_ros_thesis.image import gradient_edges
 
 SECTION = "3.5"
-step = partial(Step, SECTION)
+step, wide_step = partial(Step, SECTION), partial(Step, SECTION, wide=True)
 MAGNIFIED = 6  # the width of the picture is so many times that of its magnified part
 C = SemanticClass
 Classes = NDArray[np.uint8]
@@ -93,12 +93,11 @@ def _edge_steps(scene: RegisteredFrame, semantics: FrameSemantics, edges: NDArra
     height, width = blended.shape
     window = busiest(np.asarray(semantic, np.float32), max(height // 3, 2), max(width // MAGNIFIED, 2))
     pictures = [scene.gray[window], *(np.asarray(255 * e[window], np.uint8) for e in (gradient, semantic, blended))]
-    yield step(
+    yield wide_step(
         "Blended edges, magnified",
         "Figure 3.10 where the most semantic edges lie. Edges that both kinds have stay strong; texture and shadows fade, and "
         "outlines of little contrast appear.",
         tiles(pictures, ["image", "gradient", "semantic", "blended"], 4, width),
-        wide=True,
     )
 
 
@@ -159,12 +158,11 @@ def _numbers(scene: RegisteredFrame, classes: Classes | None, labels: Classes | 
         shares = ["-" if own is None else f"{(own == c).mean():.1%}" for own in (classes, labels, of_edges)]
         weight = edge_weights(np.array([c], np.uint8))[0]
         rows.append(("unknown" if c == UNLABELLED else C(c).name.lower(), *shares, "-" if labels is None else f"{weight:g}"))
-    return step(
+    return wide_step(
         "Classes in numbers",
         "Shares of the classes among the image's pixels, the cloud's points, and the points on its edges, which the fast score "
         "uses; and what an edge of each class counts.",
         table=tuple(rows),
-        wide=True,
     )
 
 
@@ -198,13 +196,12 @@ def guess_steps(scene: RegisteredFrame) -> Iterator[Step]:
     rows: list[tuple[str, ...]] = [("hypothesis", "score", "margin", "from", "objects met", "away from this page's extrinsic")]
     for k, h in enumerate(guesses, start=1):
         rows.append((str(k), f"{h.score:.3f}", f"{h.margin:.3f}", h.kind, str(h.inliers), _off(scene, h.T)))
-    yield step(
+    yield wide_step(
         "Hypotheses",
         "What the classes would allow, best first, from centroids of objects (3.5) or from a sweep over all directions. Score: "
         "mean log likelihood ratio of the points in view times the root of their share, 0 by chance. Those that score nearly as "
         "much as the best are all registered, and their edges decide.",
         table=tuple(rows),
-        wide=True,
     )
 
 

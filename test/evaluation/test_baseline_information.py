@@ -13,9 +13,8 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros_evaluation.methods import information as jh
-from calib_ros_evaluation.methods.information import LitPoints
-from calib_ros_evaluation.methods.nid import DistanceScore, Nid, unhidden
-from calib_ros_evaluation.methods.pandey import InformationScore, Pandey
+from calib_ros_evaluation.methods.information import DistanceScore, InformationScore, Nid, Pandey, unhidden
+from calib_ros_evaluation.methods.method import PointFeatures
 
 METHODS = [Pandey(), Nid()]
 both = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
@@ -27,20 +26,19 @@ APART = np.full((2, 2), 0.25)  # independent: H(x) = H(y) = ln 2, H(x, y) = ln 4
 MIXED = np.array([[0.5, 0], [0.25, 0.25]])
 
 
-def test_mutual_information_by_hand() -> None:
-    assert jh.mutual_information(SAME) == pytest.approx(log(2))
-    assert jh.mutual_information(APART) == pytest.approx(0)
-    assert jh.mutual_information(MIXED) == pytest.approx(1.5 * log(2) - 0.75 * log(3))
-    assert jh.mutual_information(MIXED.T) == pytest.approx(jh.mutual_information(MIXED))
-
-
-def test_distance_by_hand() -> None:
-    """1 - MI / H(x, y)."""
-    assert jh.normalised_information_distance(SAME) == pytest.approx(0)  # 1 - ln 2 / ln 2
-    assert jh.normalised_information_distance(APART) == pytest.approx(1)  # 1 - 0 / ln 4
-    # 1 - (3/2 ln 2 - 3/4 ln 3) / (3/2 ln 2) = ln 3 / (2 ln 2)
-    assert jh.normalised_information_distance(MIXED) == pytest.approx(log(3) / (2 * log(2)))
-    assert jh.normalised_information_distance(np.array([[1.0, 0], [0, 0]])) == 1  # nothing varies: nothing can be told
+@pytest.mark.parametrize(
+    ("joint", "information", "distance"),  # 1 - MI / H(x, y)
+    [
+        (SAME, log(2), 0),
+        (APART, 0, 1),
+        (MIXED, 1.5 * log(2) - 0.75 * log(3), log(3) / (2 * log(2))),
+        (MIXED.T, 1.5 * log(2) - 0.75 * log(3), log(3) / (2 * log(2))),
+        (np.array([[1.0, 0], [0, 0]]), 0, 1),  # nothing varies: nothing can be told
+    ],
+)
+def test_information_by_hand(joint: np.ndarray, information: float, distance: float) -> None:
+    assert jh.mutual_information(joint) == pytest.approx(information)
+    assert jh.normalised_information_distance(joint) == pytest.approx(distance)
 
 
 def test_bandwidth_is_the_standard_deviation_by_the_sixth_root_of_n() -> None:
@@ -76,10 +74,10 @@ def test_the_distance_counts_pairs_of_bins_at_the_nearest_pixel() -> None:
     light[3, 5] = light[3, 6] = 9
     # The four points are seen at grey bins 9, 9, 0, 0 and reflect levels 2, 2, 2, 7: the table MIXED, turned.
     xyz = at_pixels((5, 3), (6.4, 2.6), (10, 10), (0, 12), (30, 3), (5, -2))  # the last two fall beside the image
-    frame = LitPoints(light, CAMERA, xyz, np.array([2, 2, 2, 7, 1, 1]))
+    frame = PointFeatures(CAMERA, light, xyz, np.array([2, 2, 2, 7, 1, 1]))
     assert DistanceScore([frame]).value(np.eye(4)) == pytest.approx(-log(3) / (2 * log(2)))
     # Two frames: the mean. The other's levels follow its grey values: distance 0.
-    other = dataclasses.replace(frame, level=np.array([2, 2, 7, 7, 1, 1]))
+    other = dataclasses.replace(frame, value=np.array([2, 2, 7, 7, 1, 1]))
     assert DistanceScore([frame, other]).value(np.eye(4)) == pytest.approx(-log(3) / (4 * log(2)))
     away = se3.perturb(np.eye(4), [0, 0, 0], [0, 0, -100])  # all points behind the camera
     assert DistanceScore([frame, other]).value(away) == -1
@@ -87,12 +85,12 @@ def test_the_distance_counts_pairs_of_bins_at_the_nearest_pixel() -> None:
 
 def test_information_takes_the_grey_value_between_pixels_and_pools_frames() -> None:
     light = np.tile(np.arange(17, dtype=np.uint8) * 10, (13, 1))  # grey = 10 u
-    frame = LitPoints(light, CAMERA, at_pixels((5, 3), (6.3, 4.5), (16, 12), (16.2, 3)), np.array([200, 100, 100, 100]))
+    frame = PointFeatures(CAMERA, light, at_pixels((5, 3), (6.3, 4.5), (16, 12), (16.2, 3)), np.array([200, 100, 100, 100]))
     counts = InformationScore([frame]).counts(np.eye(4))
     found = {(int(r), int(c)): int(counts[r, c]) for r, c in np.argwhere(counts)}
     assert found == {(200, 50): 1, (100, 63): 1, (100, 160): 1}  # 10 * 6.3 = 63; the last lies beyond the middle of column 16
     # One table for all frames, its rows reflectivity: the second frame's only point adds to it.
-    second = LitPoints(light, CAMERA, at_pixels((5, 3)), np.array([200]))
+    second = PointFeatures(CAMERA, light, at_pixels((5, 3)), np.array([200]))
     score = InformationScore([frame, second])
     pooled = score.counts(np.eye(4))
     assert (pooled - counts).sum() == pooled[200, 50] - counts[200, 50] == 1
@@ -106,11 +104,11 @@ def test_hidden_points_do_not_count() -> None:
     # In the middle at 10 m, and 5 cm and 20 cm behind; beside it 20 m, alone in its pixel; outside the image.
     middle = [at_pixels((8, 6), depth=d) for d in (10.2, 10, 10.05)]
     xyz = np.concatenate([*middle, at_pixels((9, 6), depth=20), at_pixels((40, 6))])
-    frame = LitPoints(np.zeros((13, 17), np.uint8), CAMERA, xyz, np.zeros(5, np.intp))
+    frame = PointFeatures(CAMERA, np.zeros((13, 17), np.uint8), xyz, np.zeros(5, np.intp))
     assert unhidden(frame, np.eye(4), 0.1).tolist() == [1, 2, 3]
     assert unhidden(frame, np.eye(4), 0.3).tolist() == [0, 1, 2, 3]
     # One behind the other at 10 and 20 m; 2 m to the side they are seen 2 px and 1 px off the middle.
-    apart = LitPoints(frame.light, CAMERA, at_pixels((8, 6), (8, 6)) * np.array([[1], [2]], np.float32), np.zeros(2, np.intp))
+    apart = PointFeatures(CAMERA, frame.image, at_pixels((8, 6), (8, 6)) * np.array([[1], [2]], np.float32), np.zeros(2, np.intp))
     assert unhidden(apart, np.eye(4), 0.1).tolist() == [0]
     assert unhidden(apart, se3.perturb(np.eye(4), [0] * 3, [2, 0, 0]), 0.1).tolist() == [0, 1]
 

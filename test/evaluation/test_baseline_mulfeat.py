@@ -10,10 +10,10 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.range_image import range_image, reflectivity
+from calib_ros.lidar.range_image import reflectivity
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import search_limits, typical_step_deg
-from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatFeatures, MulfeatScore, edge_probability
+from calib_ros_evaluation.methods.method import PointFeatures, search_limits, typical_step_deg
+from calib_ros_evaluation.methods.mulfeat import Mulfeat, MulfeatScore, edge_probability
 
 IDENTITY = np.eye(4)  # the points are given in the camera's frame
 CAMERA = Camera(np.array([[50.0, 0, 19.5], [0, 50.0, 11.5], [0, 0, 1]]), 40, 24)
@@ -28,12 +28,12 @@ def at_pixels(u: list[float], v: list[float], z: float = 10.0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def three() -> MulfeatFeatures:
+def three() -> PointFeatures:
     """P = 0.5, 0.25, 0.1 on pixels (3, 2), (10, 5), (20, 8), where E^C = 0.8, 0.2, 0.6; and one of P = 0.9 beside the image."""
     E = np.zeros((24, 40), np.float32)
     E[2, 3], E[5, 10], E[8, 20], E[5, 11] = 0.8, 0.2, 0.6, 0.4
     xyz = at_pixels([3, 10, 20, 45], [2, 5, 8, 5])
-    return MulfeatFeatures(CAMERA, xyz, np.array([0.5, 0.25, 0.1, 0.9], np.float32), E)
+    return PointFeatures(CAMERA, E, xyz, np.array([0.5, 0.25, 0.1, 0.9], np.float32))
 
 
 def test_the_score_by_hand(three):
@@ -51,27 +51,7 @@ def test_the_score_by_hand(three):
     assert score.value(se3.from_parts(np.eye(3), [0.2, 0, 0])) == pytest.approx(0.05, rel=1e-6)
 
 
-# ---- the cylinder -------------------------------------------------------------------------------------------------------
-
-
-def test_cells_of_the_cylinder_by_hand():
-    """Cells 0.1 high from height 0.25 down, 90 deg wide from azimuth -180 deg on."""
-    grid = Grid(top=0.25, row_step=0.1, rows=5, columns=4)
-    xyz = np.array([[-10, -1, 2.0], [1, -1, 0], [5, 5, -1], [-3, 4, 1.1], [10, 0.1, -9]], np.float32)
-    row, column = grid.cells(xyz)
-    # Heights on the cylinder of radius 1: 0.199, 0, -0.141, 0.22 and -0.9, which is below the last row.
-    assert row.tolist() == [0, 2, 3, 0, 4]
-    assert column.tolist() == [0, 1, 2, 3, 2]
-
-
-def test_the_grid_follows_rings_and_azimuth_step():
-    scan = Spinner(rings=25, low=-20, high=4, step=0.25).scan([GROUND, Plane((1, 0, 0), 20.0)])
-    grid = Grid.of(range_image(scan, CONFIG.lidar), scan.xyz, 4.0, 2.0)
-    assert grid.columns == 2 * 1440
-    assert grid.row_step == pytest.approx(np.deg2rad(1.0) / 4, rel=0.02)
-    row, _ = grid.cells(scan.xyz)
-    assert row.min() == 0
-    assert row.max() == grid.rows - 1
+# ---- the cylinder ---
 
 
 BEHIND = Plane((1, 0, 0), 15.0)

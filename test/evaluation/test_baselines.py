@@ -15,12 +15,10 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import curves
-from calib_ros_evaluation.methods.castorena import Castorena
-from calib_ros_evaluation.methods.levinson import Levinson
+from calib_ros_evaluation.methods.edges import Castorena, Levinson
+from calib_ros_evaluation.methods.information import Nid, Pandey
 from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.mulfeat import Mulfeat
-from calib_ros_evaluation.methods.nid import Nid
-from calib_ros_evaluation.methods.pandey import Pandey
 
 METHODS = (Pandey(), Levinson(), Castorena(), Mulfeat(), Nid())
 SIDES = np.eye(6)[:5] * np.repeat([1.0, 0.2], [3, 2])[:, None]  # deg and m; a street says little of what lies ahead

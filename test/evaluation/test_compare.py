@@ -14,8 +14,7 @@ from trial_rows import table as table_of
 
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import Comparison, PairedChange, as_text, compare, draws, interval, means, medians
-from calib_ros_evaluation.csv_files import read_trials, write_table
-from calib_ros_evaluation.results import COLUMNS
+from calib_ros_evaluation.results import COLUMNS, read_trials, write_table
 
 
 def trial(frame: int, rotation: float = 0.3, translation: float = 0.05, cpu: float = 2.0, **changes: object) -> dict[str, Any]:

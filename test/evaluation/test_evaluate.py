@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +21,6 @@ from calib_ros.frame import Frame, PointCloud, SemanticClass
 from calib_ros.result import Result
 from calib_ros_evaluation.commands import sources_in
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
-from calib_ros_evaluation.experiments.frames import classes_of_points
 from calib_ros_evaluation.experiments.job import job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import (
@@ -35,6 +36,7 @@ from calib_ros_evaluation.experiments.setup import (
     spread,
     worker_cache,
 )
+from calib_ros_evaluation.experiments.trial import classes_of_points
 from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.report.sections import sections
 from calib_ros_evaluation.results import TWIST_AXES
@@ -152,16 +154,6 @@ def test_weights_by_points_in_the_picture() -> None:
     assert importance(classes_of_points(frame, None, np.eye(4), Config())) is None
 
 
-def test_another_configuration_is_refused(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = tmp_path / "other.yaml"
-    config.write_text("search: {seed: 9}\n")
-    assert main.main(["evaluate", DRIVE, "--out", str(done), "--quick", "--config", str(config)]) == 2
-    error = capsys.readouterr().err
-    assert "configuration" in error
-    assert "--fresh" in error
-    assert error.count("\n") == 1
-
-
 def test_bad_requests_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, named in (
         ([], "at least one source"),
@@ -185,6 +177,14 @@ def test_bad_requests_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
         error = capsys.readouterr().err
         assert named in error
         assert error.count("\n") == 1
+
+
+def test_without_pandas_there_are_steps_but_no_tables() -> None:
+    code = "import sys; sys.modules['pandas'] = None; import calib_ros_evaluation.steps.page; from calib_ros.cli import main; "
+    done = subprocess.run([sys.executable, "-c", f"{code}sys.exit(main.main(['evaluate', 'x']))"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "pip install pandas" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -241,15 +241,20 @@ def test_a_damaged_answer_is_named() -> None:
         collect_results([one], {one.key: {}}, {"ours": "Ours"})
 
 
-def test_results_of_another_version_are_not_reused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_of_other_code_or_configuration_are_not_reused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--experiments", "cost", "--workers", "1"]
     command += ["--out", str(tmp_path)]
     assert main.main(command) == 0
     journal = tmp_path / "results.jsonl"
-    first, rest = journal.read_text().split("\n", 1)
-    journal.write_text(first.replace(code_fingerprint(), "0123456789abcdef") + "\n" + rest)
-    assert main.main(command) == 2
-    assert 'code was "0123456789abcdef"' in capsys.readouterr().err
+    whole = journal.read_text()
+    for name, own in (("code", code_fingerprint()), ("configuration", setup().fingerprint)):
+        journal.write_text(whole.replace(own, "0123456789abcdef"))
+        capsys.readouterr()
+        assert main.main(command) == 2
+        error = capsys.readouterr().err
+        assert f'{name} was "0123456789abcdef"' in error
+        assert "--fresh" in error
+        assert error.count("\n") == 1
 
 
 def test_labels_distinguish_sources() -> None:

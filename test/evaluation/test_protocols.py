@@ -18,7 +18,6 @@ from calib_ros.config import Config, SearchConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
 from calib_ros_check.outcome import CheckVerdict
-from calib_ros_evaluation.csv_files import read_trials
 from calib_ros_evaluation.experiments.answers import read_answers, run_jobs, trial_of
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, SourceSummary
 from calib_ros_evaluation.protocols.definitions import BORER, NAMES, PROTOCOLS, SINGLE_FRAME, UNICALIB, Protocol, Size
@@ -36,7 +35,7 @@ from calib_ros_evaluation.protocols.detection import (
     sets_table,
 )
 from calib_ros_evaluation.protocols.trials import Calibrations, drawn, size_table
-from calib_ros_evaluation.results import trials_table
+from calib_ros_evaluation.results import read_trials, trials_table
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"

@@ -19,11 +19,9 @@ from calib_ros.frame import MAIN_CLASSES, SemanticClass
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
 from calib_ros_evaluation.steps.cloud import Cloud
-from calib_ros_evaluation.steps.maps import completion_stages
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 from calib_ros_evaluation.steps.pictures import VIRIDIS, RegisteredFrame, Scale, Step, busiest, class_histogram, enlarged
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_thesis.maps import complete
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 SOURCE = "synthetic:seed=1,frames=2,rings=32,width=480,height=144"
@@ -79,17 +77,15 @@ def test_every_picture_shows_something(made: Path) -> None:
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert picture is not None, path.name
         assert picture.std() > 3, f"{path.name} is all but empty"
-        data = picture.tobytes()
-        assert data not in seen or "prepared" in path.name, f"{path.name} is the same as {seen[data]}"
-        seen[data] = path.name
+        first = seen.setdefault(picture.tobytes(), path.name)
+        assert first == path.name or "prepared" in path.name, f"{path.name} is the same as {first}"
 
 
 def test_twice_gives_the_same_bytes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = run(capsys, SOURCE, "--frame", "1", "--out", str(tmp_path / "deep" / "again"))
-    assert code == 0
-    again = content(tmp_path / "deep" / "again")
-    assert again == content(made)
-    assert out.splitlines()[0] == str(tmp_path / "deep" / "again" / "index.html")
+    again = tmp_path / "deep" / "again"
+    code, out, _ = run(capsys, SOURCE, "--frame", "1", "--out", str(again))
+    assert (code, content(again)) == (0, content(made))
+    assert out.splitlines()[0] == str(again / "index.html")
     assert "browser" in out
 
 
@@ -110,18 +106,6 @@ def test_captions_hold_the_numbers_of_the_frame(drive: SyntheticDrive) -> None:
     assert f"J = {float(rows['J, eq. 3.12'][0]):.1f}"[:6] in found["Overlay"].caption
     peaks = {row[0]: row[1:] for row in found["Peaks"].table}
     assert len(peaks["fast score"]) == 6
-
-
-def test_completion_ends_where_the_method_ends() -> None:
-    rng = np.random.default_rng(0)
-    sparse = np.where(rng.random((60, 90)) < 0.05, rng.integers(1, 6000, (60, 90)), 0).astype(np.int16)
-    stages = completion_stages(sparse, 6000)
-    assert [name for name, _ in stages] == ["inversion", "dilation", "closing", "middle holes", "large holes", "blur"]
-    inverted = np.where(sparse > 0, 6001 - sparse, 0).astype(np.int16)
-    np.testing.assert_array_equal(stages[0][1], inverted)
-    np.testing.assert_array_equal(stages[-1][1], complete(inverted))
-    filled = [np.count_nonzero(levels) for _, levels in stages]
-    assert filled[:5] == sorted(filled[:5])
 
 
 def test_a_source_without_colour_and_intensity(drive: SyntheticDrive, tmp_path: Path) -> None:
@@ -176,13 +160,18 @@ def masks_of(frame: Frame, folder: Path) -> Path:
     return folder
 
 
-def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> None:
-    text = (made / "index.html").read_text()
-    names = [path.name[3:-4] for path in sorted(made.glob("*.png"))]
-    assert names[-8:] == [
-        *("borders_of_classes", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "pixels_by_class"),
+def shows_semantics(folder: Path, edges: str) -> bool:
+    """Its last pictures are those of semantics, the first of them of such edges."""
+    names = [path.name[3:-4] for path in sorted(folder.glob("*.png"))]
+    return names[-8:] == [
+        *(edges, "blended_edges", "blended_edges_magnified", "classes_of_pixels", "pixels_by_class"),
         *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
     ]
+
+
+def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> None:
+    text = (made / "index.html").read_text()
+    assert shows_semantics(made, "borders_of_classes")
     assert "the builtin network sees" in text
     assert re.search("score (uses none|blends 0%) of them", text)
     assert "the rest are borders of classes, see Semantics" in text
@@ -191,14 +180,17 @@ def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> Non
     assert "No model" not in text
 
 
-def test_page_without_semantics_has_a_note(drive: SyntheticDrive) -> None:
-    made = list(make_steps(drive[1], drive.reference, NONE, FEW))
-    found = {step.name: step for step in made}
-    assert len(made) == EXPECTED - 9
-    assert [step.name for step in made if step.section == "3.5"] == ["No semantics"]
-    assert "No model is configured" in found["No semantics"].caption
-    assert "No semantic edges are blended in" in found["Smoothing, magnified"].caption
-    assert "this is E^I before its smoothing" in found["Mix edges"].caption
+def test_page_without_semantics_has_a_note(drive: SyntheticDrive, tmp_path: Path) -> None:
+    failing = {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "", "cloud_classes": ""}
+    cases = {"No semantics": (NONE, "No model is configured"), "Problem with a model": ({"semantics": failing}, "none.onnx")}
+    for name, (config, said) in cases.items():
+        made = list(make_steps(drive[1], drive.reference, config if config is NONE else Config.from_dict(config), FEW))
+        found = {step.name: step for step in made}
+        assert len(made) == EXPECTED - 9
+        assert [step.name for step in made if step.section == "3.5"] == [name]
+        assert said in found[name].caption
+        assert "No semantic edges are blended in" in found["Smoothing, magnified"].caption
+        assert "this is E^I before its smoothing" in found["Mix edges"].caption
 
 
 def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -224,21 +216,10 @@ def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pyte
     assert row
     assert float(row[1]) == pytest.approx(100 * np.mean(labels.image == 1), abs=0.06)
     assert float(row[2]) == pytest.approx(100 * np.mean(labels.points == 1), abs=0.06)
-    names = [path.name[3:-4] for path in sorted(out.glob("*.png"))]
-    assert names[-8:] == [
-        *("boundaries_of_masks", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "pixels_by_class"),
-        *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
-    ]
-    assert len({path.read_bytes() for path in out.glob("*.png")}) >= len(names) - 1  # one edge operator is that of the run
+    assert shows_semantics(out, "boundaries_of_masks")
+    pictures = [path.read_bytes() for path in out.glob("*.png")]
+    assert len(set(pictures)) >= len(pictures) - 1  # one edge operator is that of the run
     assert "Figure 3.21" in text
-
-
-def test_failing_model_is_shown_as_a_failed_step(drive: SyntheticDrive, tmp_path: Path) -> None:
-    own = {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "", "cloud_classes": ""}
-    made = list(make_steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
-    assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
-    assert "none.onnx" in made[-1].caption
-    assert len(made) == EXPECTED - 9
 
 
 def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:
