@@ -13,10 +13,8 @@ import yaml
 
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.cluster import ClusterPool
 from calib_ros_check.jobs.journal import Answer, Journal
-from calib_ros_check.jobs.local import LocalPool
-from calib_ros_check.jobs.pool import Pool, run
+from calib_ros_check.jobs.pool import run
 from calib_ros_evaluation.csv_files import TRIALS, write_table
 from calib_ros_evaluation.experiments.answers import Answers, collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
@@ -146,8 +144,8 @@ def evaluate(options: RunOptions, study: Study, facts: Mapping[str, str], progre
     about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint, **study.about}
     with Journal(out, about, options.fresh) as journal:
         same_frames(journal, summaries)
-        workers: Pool = ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers)
-        run(groups(planned), partial(study.work, setup), journal, workers, partial(progress, "trials"))
+        work, told = partial(study.work, setup), partial(progress, "trials")
+        run(groups(planned), work, journal, told, options.workers, options.scheduler)
         answers, damage = dict(journal.done), journal.notes
     found = study.report(setup, planned, answers)
     notes = [*models, *damage, *(text for one in summaries for text in one.notes), *found.notes]
