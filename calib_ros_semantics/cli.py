@@ -7,7 +7,7 @@ import textwrap
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,17 +27,9 @@ RUNS = 3  # the first is slower: libraries and memory are made ready
 WIDTH = 110  # letters of a line; some exports have a dozen tensors
 
 
-class Report(NamedTuple):
-    """lines: for a person. failed: a line per model that cannot be used. doubtful: per model whose output cannot be right,
-    or is of little use."""
-
-    lines: list[str]
-    failed: list[str]
-    doubtful: list[str]
-
-
-def models(source: Source, frame: int, config: Config, out: str | None) -> Report:
-    """Every configured model, tried on one frame.
+def models(source: Source, frame: int, config: Config, out: str | None) -> tuple[list[str], list[str], list[str]]:
+    """Every configured model, tried on one frame: lines for a person, one for each model that cannot be used, and one for each
+    whose output cannot be right, or is of little use.
 
     out: folder for pictures of what they see. BadInputError for a frame that is not there or a folder that cannot be made.
     """
@@ -47,7 +39,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
     if not configured:
         off = config.semantics.segmentation == "none"
         why = "no models: semantics.segmentation is none" if off else "no models are named: see the stage semantics of --config"
-        return Report([why], [], [])
+        return [why], [], []
     if out is not None:
         make_folder(out, "--out")
     shown = source[frame]
@@ -64,7 +56,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
                 advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
                 failed.append(f"semantics.{model.kind}: {error_line(error)}{advice}")
             step(k + 1, len(configured))
-    return Report(lines, failed, doubtful)
+    return lines, failed, doubtful
 
 
 def _tried(slot: ModelSlot, frame: Frame, config: SemanticsConfig, out: str | None) -> tuple[list[str], str]:

@@ -33,11 +33,11 @@ class ModelsCommand:
 
         named = {option: getattr(args, option) for option in MODELS if getattr(args, option) is not None}
         config = update(configuration(args.config), {"semantics": named})
-        report = models(open_named_source(args, config), args.frame, config, args.out)
-        print("\n".join(report.lines))
-        for line in (*report.failed, *report.doubtful):
+        lines, failed, doubtful = models(open_named_source(args, config), args.frame, config, args.out)
+        print("\n".join(lines))
+        for line in (*failed, *doubtful):
             print(f"calib-ros: {line}", file=sys.stderr)
-        return BAD_INPUT if report.failed else 1 if report.doubtful else 0
+        return BAD_INPUT if failed else 1 if doubtful else 0
 
 
 MODEL_COMMAND = ModelsCommand()

@@ -170,16 +170,10 @@ def _is_part(cells: Sequence[int], size: Size) -> bool:
 
 def _declared(model: OnnxModel, feeds: Mapping[str, Array]) -> list[tuple[int, ...]] | None:
     """Shapes of the outputs for these inputs, if the file declares them all."""
-    if any(None in t.shape[1:] or not t.shape for t in model.inputs if t.name in feeds):
-        return None
-    shapes = []
-    for t in model.outputs:
-        shape = (1, *t.shape[1:]) if len(t.shape) > 2 and t.shape[0] is None else t.shape
-        sizes = tuple(n for n in shape if n is not None)
-        if not shape or len(sizes) < len(shape):
-            return None
-        shapes.append(sizes)
-    return shapes
+    taken = [t.shape[1:] if t.shape else (None,) for t in model.inputs if t.name in feeds]
+    given = [(1, *t.shape[1:]) if len(t.shape) > 2 and t.shape[0] is None else t.shape or (None,) for t in model.outputs]
+    known = [tuple(n for n in shape if n is not None) for shape in given]
+    return None if any(None in shape for shape in taken) or known != given else known
 
 
 def _best_output(model: OnnxModel, maps: Mapping[int, ClassMapLayout]) -> int | None:

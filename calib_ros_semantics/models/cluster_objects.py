@@ -45,10 +45,7 @@ OBJECT_CELL = 0.2  # m; points nearer than this count once
 MIN_OBJECT_POINTS = 20
 MAX_OBJECT_HEIGHT = 2.4  # m; of cars and vans. Lorries are taller, but so are walls
 COLUMN_CELL = 0.4  # m; edge of the columns whose height excludes what is too tall
-MAX_COLUMN_GAP, MAX_COLUMN_GAP_SHARE = (
-    0.6,
-    0.03,
-)  # m, share of the range, empty below a crown or cable; rings: up to 2 deg
+MAX_COLUMN_GAP, MAX_COLUMN_GAP_SHARE = 0.6, 0.03  # m, share of the range, empty below a crown or cable; rings: up to 2 deg
 MAX_HIDDEN = 0.7  # m; hidden lower part of a column, by the body of a car before its cabin and roof
 PLAN = np.array([1, 1, 0], np.float32)
 

@@ -76,22 +76,15 @@ def surface_shape(xyz: Floats) -> Surfaces:
     return Surfaces(scatter[member].astype(np.float32), np.abs(vectors[:, 2, 0])[member].astype(np.float32))
 
 
-class Poles(NamedTuple):
-    """Masks (n,) of points on poles, on plates of poles, and on trunks below a crown."""
-
-    pole: NDArray[np.bool_]
-    plate: NDArray[np.bool_]
-    trunk: NDArray[np.bool_]
-
-
-def find_poles(xyz: Floats) -> Poles:
+def find_poles(xyz: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
     """Poles among points (n, 3) above the ground, z = height (m): thin slices above each other with nothing around them.
+    Masks (n,) of points on poles, on plates of poles, and on trunks below a crown.
 
     Source: stacked hollow cylinders (Brenner 2009).
     """
     nothing = np.zeros(len(xyz), bool)
     if len(xyz) < MIN_SLICES:
-        return Poles(nothing, nothing, nothing)
+        return nothing, nothing, nothing
     cell, n = cell_numbers(xyz, (POLE_CELL, POLE_CELL, SLICE))
     at = group_means(xyz, cell, n)
     layer = np.floor(at[:, 2] / SLICE).astype(np.intp)
@@ -113,7 +106,7 @@ def find_poles(xyz: Floats) -> Poles:
     kind[alone[trunk[stack]]] = 2
     of_point = kind[part[cell]]
     on_plate = (of_point == 1) & plate[part[cell]]
-    return Poles((of_point == 1) & ~on_plate, on_plate, of_point == 2)
+    return (of_point == 1) & ~on_plate, on_plate, of_point == 2
 
 
 class Slabs(NamedTuple):

@@ -87,13 +87,13 @@ def cluster_classes(cloud: PointCloud, seed: int = 0) -> Classes:
 def _classes_above_ground(xyz: Floats, light: Floats | None, cut: NDArray[np.bool_]) -> Classes:
     """Classes (n,) of points (n, 3) above the ground, z = height (m). light: (n,) reflectivity. cut: (n,) as of `_cut_off`."""
     shape = surface_shape(xyz)
-    poles = find_poles(xyz)
-    signs = find_signs(xyz, light) | poles.plate
+    pole, plate, trunk = find_poles(xyz)
+    signs = find_signs(xyz, light) | plate
     labels = buildings_and_vegetation(xyz, shape, cut)
-    labels[poles.trunk] = SemanticClass.VEGETATION
-    labels[poles.pole] = SemanticClass.POLE
+    labels[trunk] = SemanticClass.VEGETATION
+    labels[pole] = SemanticClass.POLE
     labels[signs] = SemanticClass.SIGN
-    objects = find_objects(xyz, shape, cut, ~(poles.pole | poles.trunk | signs))
+    objects = find_objects(xyz, shape, cut, ~(pole | trunk | signs))
     return np.where(objects == UNLABELLED, labels, objects)
 
 

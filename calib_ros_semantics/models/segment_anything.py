@@ -42,27 +42,20 @@ KNOWN = (
 )
 
 
-class Family(NamedTuple):
-    """How a family prepares an image. padded: the aspect ratio is kept and the rest of the input is zero; else the image is
-    stretched. own_pixels: prompts are in pixels of the original image."""
-
-    normalised: Normalisation
-    padded: bool = True
-    own_pixels: bool = False
-
-
 IMAGENET = Normalisation(1.0, (123.675, 116.28, 103.53), (58.395, 57.12, 57.375))  # of RGB, in nearly all families
+# How families prepare an image: its normalisation; whether the aspect ratio is kept and the rest of the input is zero, or the
+# image stretched; and whether prompts are in pixels of the original image.
 FAMILIES = {
-    **dict.fromkeys(("sam", "mobilesam", "edgesam", "nanosam"), Family(IMAGENET)),
-    "sam2": Family(IMAGENET, padded=False),
-    "efficientsam": Family(Normalisation(1 / 255), padded=False, own_pixels=True),
-    "samexporter": Family(Normalisation(1.0)),  # the graph does it all
+    **dict.fromkeys(("sam", "mobilesam", "edgesam", "nanosam"), (IMAGENET, True, False)),
+    "sam2": (IMAGENET, False, False),
+    "efficientsam": (Normalisation(1 / 255), False, True),
+    "samexporter": (Normalisation(1.0), True, False),  # the graph does it all
 }
 
 
 class Embedded(NamedTuple):
     """An encoded image. features: arrays by the name of the encoder's output. size: (H, W) of the image. frame: (h, w) of the
-    coordinate frame of prompts. content: (h, w) of the image within it, from the upper left corner. own_pixels: see Family."""
+    coordinate frame of prompts. content: (h, w) of the image within it, from the upper left corner. own_pixels: see FAMILIES."""
 
     features: dict[str, Array]
     size: tuple[int, int]
@@ -167,7 +160,7 @@ class Decoder:
 
 
 class SegmentAnything(MaskModel):
-    """Encoder, a graph from an image to an embedding, and decoder, prompted on a grid over the image. ModelError if the encoder is
+    """Encoder, a graph from an image to an embedding, and decoder, prompted on a grid over an image. ModelError if the encoder is
     none, or the two do not fit each other."""
 
     needed = f"a predicted IoU of {MIN_IOU:g} and a stability of {MIN_STABILITY:g}"

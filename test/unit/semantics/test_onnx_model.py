@@ -154,9 +154,3 @@ def test_a_wrong_entry_is_named(tmp_path: Path, entry: str, says: str) -> None:
     assert says in str(caught.value)
     assert str(tmp_path / "model.yaml") in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_wrong_yaml_stops_its_model(good: Path) -> None:
-    good.with_suffix(".yaml").write_text("size: 5")
-    with pytest.raises(ModelError, match="size = 5 must be"):
-        OnnxModel(good, CONFIG)

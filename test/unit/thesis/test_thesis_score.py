@@ -19,7 +19,7 @@ from calib_ros.frame import PointCloud
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.classes import ALL, IMAGE, MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros.registration.score.point_score import near_image, nearest_per_pixel, project
+from calib_ros.registration.score.point_score import near_image, project
 from calib_ros.result import RefusalCode
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.cloud import PointAttributes
@@ -102,11 +102,6 @@ def test_projection_rounds_to_the_nearest_pixel_and_leaves_out_what_is_behind():
     assert (u.tolist(), v.tolist(), index.tolist()) == ([3, 4, 0, 39], [2] * 4, [0, 1, 2, 4])
     near = wall(np.array([20.0, -7, -9, 47, 60]), np.full(5, 10.0), 5.0)  # kept for other extrinsics
     assert near_image(near, IDENTITY, CAMERA, 0.2).tolist() == [0, 1, 3]
-
-
-def test_of_points_on_one_pixel_the_last_is_shown():
-    pixels, points = nearest_per_pixel(np.array([7, 3, 7, 5, 3]), np.array([10, 11, 12, 13, 14]), 9)
-    assert dict(zip(pixels.tolist(), points.tolist(), strict=True)) == {7: 12, 5: 13, 3: 14}
 
 
 @dataclasses.dataclass
