@@ -27,8 +27,8 @@ EXTRAS = {
     "fleet": ["Jinja2", "distributed", "pyarrow"],
     # `calib-ros view`: the page in the browser.
     "view": ["nicegui"],
-    # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
-    "evaluation": ["Jinja2", "distributed", "matplotlib"],
+    # `calib-ros evaluate` and `calib-ros steps`: reports, tables, pages and plots.
+    "evaluation": ["Jinja2", "distributed", "matplotlib", "pandas"],
 }
 EXTRAS["all"] = sorted({library for libraries in EXTRAS.values() for library in libraries})
 EXTRAS |= {
@@ -90,7 +90,7 @@ setup(
     packages=find_packages(include=[pattern for name in PACKAGES for pattern in (name, f"{name}.*")]),
     package_data={name: ["py.typed"] for name in PACKAGES}
     | {
-        f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/*.yaml", "models/weights/LICENSE"],
+        f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/LICENSE"],
         f"{PACKAGE}_thesis": ["py.typed", "presets/*.yaml"],
     },
     data_files=[

@@ -1,9 +1,8 @@
 """Speed: features, classes, scores, calibration, the thesis's objective. CPU times, medians.
 
-    python -m benchmarks.bench [SOURCE] [--plot FILE] [--only PART]
+    python -m benchmarks.bench [SOURCE] [--only PART]
 
-SOURCE: by default the synthetic drive; a KITTI folder or a bag gives real frames. --plot draws cost against the number of frames
-(docs/cost.png).
+SOURCE: by default the synthetic drive; a KITTI folder or a bag gives real frames.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import CLOUD, IMAGE
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.frames import points_in_reach
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.maps import complete_depth, complete_fast, far_level
@@ -127,31 +126,6 @@ def cost_table(costs: Costs) -> str:
     return "\n".join(lines)
 
 
-def plot_costs(costs: Costs, path: str, source: str) -> None:
-    """Both axes logarithmic, as PNG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.2), dpi=140, layout="constrained")
-    axes = figure.subplots()
-    for step, ms in costs.items():
-        if step == MEMORY:
-            continue
-        (drawn,) = axes.loglog(COUNTS, ms, "o-", ms=4, lw=1.5)
-        axes.annotate(
-            f"{step}, slope {slope(ms):.2f}", (COUNTS[-1], ms[-1]), (6, 0), textcoords="offset points", va="center",
-            color=drawn.get_color(), fontsize=8,
-        )  # fmt: skip
-    axes.set_xlim(0.9, 900)
-    axes.set_xticks(COUNTS, [str(n) for n in COUNTS])
-    axes.minorticks_off()
-    axes.set_xlabel("frames")
-    axes.set_ylabel("CPU time of one core, ms")
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_title(source, fontsize=9, loc="left")
-    figure.savefig(path)
-
-
 def thesis(frame: Frame, reference: np.ndarray) -> None:
     """Eq. 3.12: features, density completion, one evaluation written out, fast and with its edges attached."""
     config = Config.from_dict({"refine": {"objective": "thesis"}})
@@ -177,7 +151,6 @@ def main() -> int:
     """Run the benchmarks on the source named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", nargs="?", default=f"synthetic:frames={FRAMES}", help="as for calib-ros (default synthetic)")
-    parser.add_argument("--plot", metavar="FILE", help="draw cost against the number of frames")
     parser.add_argument("--only", choices=PARTS, action="append", help="run this part only; may be given again")
     args = parser.parse_args()
     parts = args.only or PARTS
@@ -190,11 +163,8 @@ def main() -> int:
     cv2.setNumThreads(1)
     if "classes" in parts:
         classes(frames, source.reference)
-    if "cost" in parts or args.plot:
-        costs = cost_of_frames(frames, source.reference)
-        print(cost_table(costs))
-        if args.plot:
-            plot_costs(costs, args.plot, source.name)
+    if "cost" in parts:
+        print(cost_table(cost_of_frames(frames, source.reference)))
     if "thesis" in parts:
         thesis(frames[0], source.reference)
     return 0

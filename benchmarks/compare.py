@@ -1,7 +1,7 @@
 """Is a change better or worse? Two versions estimate from the same frames and starts, and every measure is compared in pairs.
 
     make compare BASE=COMMIT [TIP=COMMIT] [SETS="rigs kitti"] [TRIALS=2]
-    python -m benchmarks.compare BASE [--tip COMMIT] [--sets NAME ...] [--trials N] [--csv FILE]
+    python -m benchmarks.compare BASE [--tip COMMIT] [--sets NAME ...] [--trials N]
 
 BASE is A; B is --tip, by default the working tree. Each commit is unpacked into build/compare, and its kernels are built there.
 Both run side by side, so that their CPU times compare. Exit code: 0 if nothing has become significantly worse, else 1; 2 for bad
@@ -12,7 +12,6 @@ Sets (all that have data):"""
 from __future__ import annotations
 
 import argparse
-import csv
 import io
 import json
 import math
@@ -61,7 +60,6 @@ class Outcome(NamedTuple):
     translation: float = NAN
     nees_off: float = NAN
     cpu_s: float = NAN
-    nees: float = NAN
 
 
 MEASURES = (
@@ -94,7 +92,7 @@ def outcome(trial: PairedTrial, answer: dict[str, Any]) -> Outcome:
         off = se3.log(T @ se3.inverse(truth))
         nees = float(off @ np.linalg.solve(np.array(answer["covariance"]), off))
     off_by = math.exp(abs(math.log(nees / USUAL_NEES))) if nees > 0 else NAN
-    return Outcome(success, float(accepted and not right), rotation, translation, off_by, answer["cpu_s"], nees)
+    return Outcome(success, float(accepted and not right), rotation, translation, off_by, answer["cpu_s"])
 
 
 # ------------------------------------------------------------------------------------------------ the two sides
@@ -290,7 +288,6 @@ def main() -> int:
     parser.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS))
     parser.add_argument("--trials", type=int, default=1, metavar="N", help="starts of every case")
     parser.add_argument("--workers", type=int, default=max((os.cpu_count() or 1) // 2, 1), metavar="N", help="processes a side")
-    parser.add_argument("--csv", type=Path, help="every trial of both")
     args = parser.parse_args()
     if args.trials < 1 or args.workers < 1:
         parser.error("--trials and --workers must be at least 1")
@@ -305,8 +302,6 @@ def main() -> int:
     except CalibrationError as error:
         parser.error(str(error))
     a, b = ([outcome(*pair) for pair in zip(trials, own, strict=True)] for own in answers)
-    if args.csv:
-        write(args.csv, trials, answers, (a, b))
     lines, spent = lines_of(trials, a, b), spent_sets()
     print(f"A: {args.base}, B: {args.tip or 'working tree'}\n\n{as_table(lines, spent)}\n")
     errors = [sum("error" in answer for answer in own) for own in answers]
@@ -315,23 +310,6 @@ def main() -> int:
     print(f"Spent: chosen by them were constants of docs/figures/constants.csv ({', '.join(spent)}).")
     print(verdict_of(lines))
     return int(any(line.verdict == WORSE for line in lines))
-
-
-def write(
-    path: Path,
-    trials: Sequence[PairedTrial],
-    answers: Sequence[Sequence[dict[str, Any]]],
-    outcomes: Sequence[Sequence[Outcome]],
-) -> None:
-    """A row per trial and side."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["side", "set", "source", "frames", "status", *Outcome._fields])
-        for name, own, found in zip("AB", answers, outcomes, strict=True):
-            for trial, answer, one in zip(trials, own, found, strict=True):
-                frames = " ".join(map(str, trial.frames))
-                status = answer.get("status", answer.get("error", ""))
-                writer.writerow([name, trial.set, trial.source, frames, status, *one])
 
 
 if __name__ == "__main__":

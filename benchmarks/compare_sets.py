@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.sources import frames_of
 from benchmarks.study_registration import DRIVE, EXACT_SENSORS, ODOMETRY, bound, spread
-from benchmarks.study_runner import CLASSES_OFF
+from benchmarks.study_runner import CLASSES_OFF, frames_of
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import Frame

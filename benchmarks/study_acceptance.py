@@ -1,9 +1,8 @@
-"""Studies of the acceptance test: does it accept by chance as rarely as it says, and what hangs on its constants?"""
+"""Does the acceptance test accept by chance as rarely as it says?"""
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -14,9 +13,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks.records import markdown
-from benchmarks.sources import frames_of
-from benchmarks.study_registration import EXACT_SENSORS, FEW, rigs_of, short, spread, vehicles
-from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant, interval
+from benchmarks.study_registration import EXACT_SENSORS, FEW, rigs_of, short, spread
+from benchmarks.study_runner import Case, End, FeaturesOf, Record, Study, frames_of
 from calib_ros import se3
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
@@ -86,54 +84,4 @@ def chance_table(records: Sequence[Record]) -> str:
     return markdown(["images with scans", "trials", *(f"p <= {claimed:g}" for claimed in CLAIMED), "accepted"], rows)
 
 
-# ------------------------------------------------------------------------------------------------ sensitivity
-
-# Of the acceptance test and the covariance it rests on: those that are read off data instead of derived.
-ROOM = "calib_ros.registration."
-SIGNIFICANCE, CHECKS, COVARIANCE = ROOM + "acceptance.significance.", ROOM + "acceptance.checks.", ROOM + "covariance."
-PARAMETERS, HALVES = ROOM + "nuisance.parameters.", ROOM + "acceptance.split_half."
-CONSTANTS: dict[str, tuple[str, ...]] = {
-    "UNDOUBTED_Z": (SIGNIFICANCE, CHECKS, ROOM + "search.search.", ROOM + "joint."),
-    **dict.fromkeys(
-        ("HIGHEST_DECOY_Z", "LOWEST_DECOY_Z", "GUMBEL_SCALE", "WITH_90_PERCENT", "OUTLIER_SHARE", "MIN_MEDIAN_Z"), (SIGNIFICANCE,)
-    ),
-    **dict.fromkeys(("AGREEING", "MOST"), (HALVES,)),
-    "SYSTEMATIC_ERROR": (COVARIANCE, HALVES),
-    **dict.fromkeys(("USUAL_NOISE", "USUAL_CELLS", "FEW_POINTS", "LEAST_CURVATURE", "PROFILE_CHANGE"), (COVARIANCE,)),
-    **dict.fromkeys(("SIGNIFICANCE", "GROSSLY", "OPEN_PROBABILITY"), (PARAMETERS,)),
-    "SIGNIFICANT_Z": (PARAMETERS, ROOM + "nuisance.time_offset."),
-}
-FACTORS = (0.7, 1.3)
-
-
-def varied() -> dict[str, Variant]:
-    """All constants as they are, and each of them less and more."""
-    variants = {"": Variant(CLASSES_OFF)}
-    for name, places in CONSTANTS.items():
-        value = getattr(importlib.import_module(places[0].rstrip(".")), name)
-        for factor in FACTORS:
-            variants[f"{name} x {factor:g}"] = Variant(CLASSES_OFF, replaced={place + name: factor * value for place in places})
-    return variants
-
-
-def sensitivity_table(records: Sequence[Record]) -> str:
-    """A line per constant and factor, over all sources; the difference is paired."""
-    usual = {(r.group, r.case, r.trial): r for r in records if not r.variant}
-    rows = []
-    for variant in dict.fromkeys(r.variant for r in records):
-        own = [r for r in records if r.variant == variant]
-        pairs = [(r.case, r, usual[r.group, r.case, r.trial]) for r in own if (r.group, r.case, r.trial) in usual]
-        right, wrong = (
-            [(case, float(a.accepted and a.right is kind) - (b.accepted and b.right is kind)) for case, a, b in pairs]
-            for kind in (True, False)
-        )
-        counts = [sum(r.accepted and r.right is kind for r in own) for kind in (True, False)]
-        nees = [r.nees for r in own if np.isfinite(r.nees)]
-        rows.append([variant or "as it is", len(own), *counts, interval(right), interval(wrong), f"{np.mean(nees):.1f}"])
-    return markdown(["constant", "trials", "accepted right", "wrong", "more right", "more wrong", "NEES"], rows)
-
-
-STUDIES = {
-    "chance": Study(shuffled, searched, table=chance_table, variants={"": Variant(CLASSES_OFF)}),
-    "sensitivity": Study(vehicles, searched, variants=varied(), table=sensitivity_table),
-}
+STUDY = Study(shuffled, searched, chance_table)

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.records import markdown
-from benchmarks.sources import frames_of
-from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
+from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant, frames_of
 from calib_ros import se3
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame
@@ -151,4 +150,4 @@ def table(records: Sequence[Record]) -> str:
 
 
 # Triggered sensors: laps at one speed do not tell an offset of the clocks.
-STUDY = Study(drives, driven, {"": Variant({**CLASSES_OFF, "motion": {"max_time_offset_s": 0.0}})}, table=table)
+STUDY = Study(drives, driven, table, {"": Variant({**CLASSES_OFF, "motion": {"max_time_offset_s": 0.0}})})

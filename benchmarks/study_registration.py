@@ -1,4 +1,4 @@
-"""Studies of the registration: its accuracy, what each part brings, other vehicles, its covariances."""
+"""Studies of the registration: its accuracy, other vehicles, its covariances."""
 
 from __future__ import annotations
 
@@ -7,23 +7,19 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks.records import markdown
-from benchmarks.sources import frames_of
-from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
+from benchmarks.study_runner import NEAR, Case, End, FeaturesOf, Record, Study, frames_of
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.lidar.edges import UPWARD, upward_parts
 from calib_ros.lidar.range_image import range_image
 from calib_ros.lidar.rings import rings_by_order
@@ -61,7 +57,7 @@ def subset(frames: Sequence[Frame], size: int, number: int, rng: np.random.Gener
     return [frames[k] for k in chosen]
 
 
-# ------------------------------------------------------------------------------------------------ accuracy and ablation
+# ------------------------------------------------------------------------------------------------ accuracy
 
 
 @dataclass(frozen=True)
@@ -88,35 +84,13 @@ ROWS = {
     "odo10-16rings": Row(ODOMETRY, 10, 5, 0.3, 4),
     "synthetic16": Row("synthetic:seed=11,frames=16", 16, 10, 0.5),
 }
-ABLATION_ROWS = ("drive16", "odo10", "drive5")
-OUTWARD, TOP = ({f"calib_ros.lidar.edges.{name}": 0.0} for name in ("OUTWARD_SHIFT", "TOP_SPREAD"))
-# By the configuration, or, where users have no reason to switch a part off, from outside.
-ABLATION = {
-    "": Variant(CLASSES_OFF),
-    "edges of any direction": Variant(
-        CLASSES_OFF, replaced={"calib_ros.image.edges.oriented_edges": lambda *a: (np.sum(oriented_edges(*a), axis=0),) * 2}
-    ),
-    "edge points where they were measured": Variant(CLASSES_OFF, replaced=OUTWARD | TOP),
-    "upward edges not spread": Variant(CLASSES_OFF, replaced=TOP),
-    "no de-skewing": Variant({**CLASSES_OFF, "motion": {"deskew": "off"}}),
-    # All of the starts are optimised on all levels; their number must be a power of two.
-    "no halving": Variant(
-        {**CLASSES_OFF, "search": {"starts": 64}},
-        replaced={f"calib_ros.registration.search.search.{name}": 64 for name in ("DISTINCT", "CLIMBED")},
-    ),
-    "levels from 8 px": Variant(
-        CLASSES_OFF,
-        replaced={"calib_ros.image.edges.blurred_levels": partial(blurred_levels, sigmas=(8.0, 8.0, 4.0, 2.0, 1.2))},
-    ),
-    "one round": Variant({**CLASSES_OFF, "search": {"rounds": 1}}),
-}
 
 
-def rows(args: argparse.Namespace, default: Sequence[str]) -> Iterator[Case]:
+def rows(args: argparse.Namespace) -> Iterator[Case]:
     """A case for each row; without --kitti only for synthetic ones."""
     if unknown := set(args.sources) - set(ROWS):
         raise BadInputError(f"no row {', '.join(sorted(unknown))}; there are {', '.join(ROWS)}")
-    for name in args.sources or default:
+    for name in args.sources or ROWS:
         row = ROWS[name]
         is_synthetic = row.source.startswith("synthetic")
         if not args.kitti and not is_synthetic:
@@ -145,33 +119,33 @@ def from_row(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: in
     return End.at(result.T_camera_lidar, case.truth, result.status, result=result)
 
 
+def accuracy_table(records: Sequence[Record]) -> str:
+    """A line per row."""
+    lines = []
+    for group in dict.fromkeys(r.group for r in records):
+        own = [r for r in records if r.group == group]
+        success = f"{sum(r.right for r in own)} of {len(own)}"
+        deg, cm = (np.percentile(values, (50, 90)) for values in ([r.deg for r in own], [r.cm for r in own]))
+        counts = sum(r.accepted and not r.right for r in own), sum(not r.accepted for r in own)
+        cpu_s = np.median([r.cpu_s for r in own])
+        lines.append([group, success, f"{deg[0]:.3f}, {deg[1]:.2f}", f"{cm[0]:.1f}, {cm[1]:.1f}", *counts, f"{cpu_s:.2f}"])
+    head = ["cases", "success", "deg: median, 90 %", "cm: median, 90 %", "accepted wrong", "refused", "CPU s"]
+    return markdown(head, lines)
+
+
 # ------------------------------------------------------------------------------------------------ vehicles
 
 SOFT = (0.9, 25.0)  # deg, cm
 SINGLE, SEVERAL = ((5.0, 0.3),), ((5.0, 0.3), (10.0, 0.5), (20.0, 1.0))  # deg, m
 MOST_SINGLE, MOST, FEW = 12, 12, 5
 # Intrinsics and clocks of rendered drives are exact, and their covariances are to be compared with the errors that remain.
-EXACT_SENSORS = {"camera": {"focal_sigma": 0.0, "centre_sigma": 0.0}, "motion": {"time_offset_sigma_s": 0.0}}
-CONSTRAINTS = "calib_ros.registration.search.constraints.PoseConstraints"
-PARTS = {
-    "": Variant(CLASSES_OFF),
-    "contrast": Variant(CLASSES_OFF, replaced={"calib_ros.image.edges._normalised": lambda edge, sigma: edge}),
-    "rings": Variant({**CLASSES_OFF, "lidar": {"layout": "projection"}}),
-    "scanner_pose": Variant({**CLASSES_OFF, "lidar": {"scanner_pose": "given"}}),
-    "decoy": Variant({**CLASSES_OFF, "refine": {"max_p_value": 1.0}}),
-    "tolerance": Variant({**CLASSES_OFF, "refine": {"tolerance_deg": 180.0, "tolerance_m": 100.0}}),
-    "split_half": Variant(
-        CLASSES_OFF,
-        replaced={"calib_ros.registration.acceptance.checks.disagreement": lambda score, T, limits: 1.0},
-    ),
-    "trust_region": Variant(CLASSES_OFF, replaced={f"{CONSTRAINTS}.within_trust_region": lambda self, T, max_deg, max_m: self}),
-}
+EXACT_SENSORS = {"camera": {"focal_sigma": 0.0}, "motion": {"time_offset_sigma_s": 0.0}}
 
 
 def vehicles(args: argparse.Namespace) -> Iterator[Case]:
     """Of every source one frame at a time, and sets of 5 spread frames and of all. Frames of several calibrations make no set."""
-    sources = [(source, None) for source in args.sources] + [(source, SOFT) for source in args.soft]
-    sources += [(source, None) for source in rigs_of(args)]
+    sources = [(source, NEAR) for source in args.sources] + [(source, SOFT) for source in args.soft]
+    sources += [(source, NEAR) for source in rigs_of(args)]
     if not sources:
         raise BadInputError("this study needs a source, or --rigs")
     for name, limits in sources:
@@ -181,7 +155,7 @@ def vehicles(args: argparse.Namespace) -> Iterator[Case]:
             print(f"{name}: {error}", file=sys.stderr)
 
 
-def _sets(name: str, limits: tuple[float, float] | None, repeats: int) -> Iterator[Case]:
+def _sets(name: str, limits: tuple[float, float], repeats: int) -> Iterator[Case]:
     frames = frames_of(name)
     is_synthetic = name.startswith("synthetic")
     n, several = len(frames), not is_synthetic and len(frames) > 1 and frames[0].camera != frames[1].camera
@@ -210,21 +184,15 @@ def from_start(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: 
     return End.at(T, case.truth, result.status, f"{near.score:.6g}", result)._replace(cpu_s=spent)
 
 
-def vehicle_tables(records: Sequence[Record]) -> str:
-    """A line per source, number of frames and box, with all parts; and per part that is off, one over all sources."""
+def vehicle_table(records: Sequence[Record]) -> str:
+    """A line per source, number of frames and box."""
+    groups: dict[str, list[Record]] = {}
+    for r in records:
+        groups.setdefault(r.group, []).append(r)
     counts = ("trials", "accepted right", "accepted wrong", "refused", "of these right")
     last = ("median (deg cm)", "90 %", "NEES", "halves", "CPU s")
-    groups: dict[str, dict[tuple[str, ...], list[Record]]] = {"set": {}, "without": {}}
-    for r in records:
-        name, frames, deg = r.group.rsplit(", ", 2)
-        if not r.variant:
-            groups["set"].setdefault((name, frames, deg), []).append(r)
-        groups["without"].setdefault((r.variant or "nothing", frames, deg), []).append(r)
-    parts = []
-    for kind, found in groups.items():
-        lines = [[*key, *_counts(own), *_figures(own)] for key, own in found.items()]
-        parts.append(markdown([kind, "frames", "from", *counts, *last], lines))
-    return "\n\n".join(parts)
+    lines = [[*group.rsplit(", ", 2), *_counts(own), *_figures(own)] for group, own in groups.items()]
+    return markdown(["set", "frames", "from", *counts, *last], lines)
 
 
 def _counts(own: Sequence[Record]) -> list[int]:
@@ -324,25 +292,8 @@ def nees_table(records: Sequence[Record]) -> str:
     return markdown(["source", "estimates", "mean", "median", "above 97.5 %", axes, "error by its bound (deg m)"], lines)
 
 
-def nees_plot(records: Sequence[Record], path: Path) -> None:
-    """How the normalised errors are spread, against what they should be."""
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.subplots()
-    for group in dict.fromkeys(r.group for r in records):
-        values = np.sort([r.nees for r in records if r.group == group and np.isfinite(r.nees)])
-        axes.step(values, np.arange(1, len(values) + 1) / len(values), where="post", label=group)
-    x = np.linspace(0, 30, 300)
-    axes.plot(x, chi2.cdf(x, 6), "k--", label="chi squared, 6 degrees of freedom")
-    axes.axvline(QUANTILE, color="0.7")
-    axes.set(xlim=(0, 30), ylim=(0, 1), xlabel="normalised error squared", ylabel="share of estimates")
-    axes.legend(fontsize=8)
-    figure.savefig(path, dpi=120)
-
-
 STUDIES = {
-    "registration": Study(partial(rows, default=tuple(ROWS)), from_row, {"": Variant(CLASSES_OFF)}, trials=30),
-    "ablation": Study(partial(rows, default=ABLATION_ROWS), from_row, ABLATION, trials=30),
-    "vehicles": Study(vehicles, from_start, {"": PARTS[""]}, table=vehicle_tables),
-    "vehicle_parts": Study(vehicles, from_start, PARTS, table=vehicle_tables),
-    "covariance": Study(subsets, refined, {"": Variant(CLASSES_OFF)}, table=nees_table, plot=nees_plot),
+    "registration": Study(rows, from_row, accuracy_table, trials=30),
+    "vehicles": Study(vehicles, from_start, vehicle_table),
+    "covariance": Study(subsets, refined, nees_table),
 }

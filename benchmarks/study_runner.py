@@ -7,60 +7,57 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby, islice
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.records import markdown
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, update
+from calib_ros.config import Config, MotionConfig, update
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.source import Source, WithMotion
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import FrameSemantics
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import CONVERGED, Result
 
 Matrix = NDArray[np.float64]
-BOOTSTRAP = 2000
 KEPT = 100  # features of frames that are kept for the next cases
-NEAR, RIGHT = (0.5, 10.0), (0.3, 8.0)  # deg, cm: success from a start, and from nothing
+NEAR = (0.5, 10.0)  # deg, cm: success
 CLASSES_OFF = {"semantics": {"image_classes": "", "cloud_classes": ""}}
 NAN = float("nan")
 
 
+def frames_of(name: str, motion: MotionConfig | None = None) -> list[Frame]:
+    """All frames of a source by its name; with the vehicle's motion from neighbouring scans, if that is wanted."""
+    source: Source = open_dataset(name)
+    source = source if motion is None else WithMotion(source, motion)
+    return [source[k] for k in range(len(source))]
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Frames that are estimated together. group: a row of the table. number: from which starts are drawn. lidar: (4, 4) by which
-    the LiDAR's frame is moved. semantics: of each frame; None = what the configured models say. said: what is right. variant: by
-    which it is changed.
+    """Frames that are estimated together. group: a row of the table. number: from which starts are drawn.
 
     source: cases of one, in a row, have frames in common, whose features are made once; "" = alone. starts, box: (4, 4) of every
-    trial, and how far off it may be, where the case fixes them. config: changes for this case. limits: deg and cm, instead of the
-    study's.
+    trial, and how far off it may be, where the case fixes them. config: changes for this case. limits: deg and cm of a success.
     """
 
     group: str
     frames: Sequence[Frame]
     number: int = 0
-    lidar: Matrix = field(default_factory=partial(np.eye, 4))
-    semantics: Sequence[FrameSemantics] | None = None
-    said: str = ""
-    variant: str = ""
     source: str = ""
     starts: Sequence[Matrix] = ()
     box: SearchBox | None = None
     config: dict[str, Any] = field(default_factory=dict)
-    limits: tuple[float, float] | None = None
+    limits: tuple[float, float] = NEAR
 
     @property
     def truth(self) -> Matrix:
@@ -91,11 +88,10 @@ class End(NamedTuple):
 
 
 class Variant(NamedTuple):
-    """Changes of the configuration and of the frames. replaced: by the place of a name, what users have no option for."""
+    """Changes of the configuration and of the frames."""
 
     config: dict[str, Any] = {}  # noqa: RUF012
     frame: Callable[[Frame], Frame] = lambda frame: frame
-    replaced: Mapping[str, object] = {}
 
 
 FeaturesOf = Callable[[], list[FrameFeatures]]
@@ -104,17 +100,13 @@ Estimate = Callable[[Calibrator, Case, FeaturesOf, int], End]
 
 @dataclass(frozen=True)
 class Study:
-    """cases: by the command line. trials: of each case. limits: deg and cm of a success. remark: of the records of a row. table,
-    plot: instead of the usual one, and to a file."""
+    """cases: by the command line. table: of the records, for people. trials: of each case."""
 
     cases: Callable[[argparse.Namespace], Iterable[Case]]
     estimate: Estimate
-    variants: Mapping[str, Variant] = field(default_factory=lambda: {"": Variant()})
+    table: Callable[[Sequence[Record]], str]
+    variants: Mapping[str, Variant] = field(default_factory=lambda: {"": Variant(CLASSES_OFF)})
     trials: int = 1
-    limits: tuple[float, float] = NEAR
-    remark: Callable[[Sequence[Record]], str] = lambda records: ""
-    table: Callable[[Sequence[Record]], str] | None = None
-    plot: Callable[[Sequence[Record], Any], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -170,22 +162,21 @@ class Prepared:
 
     def changed(self, case: Case) -> Case:
         """The case as the variant has it."""
-        return replace(case, frames=[self.variant.frame(frame) for frame in case.frames], variant=self.name)
+        return replace(case, frames=[self.variant.frame(frame) for frame in case.frames])
 
     def features(self, case: Case) -> list[FrameFeatures]:
         """Of all frames."""
         began = time.process_time()
         try:
-            return [self._of(frame, case.semantics[k] if case.semantics else None) for k, frame in enumerate(case.frames)]
+            return [self._of(frame) for frame in case.frames]
         finally:
             self.spent += time.process_time() - began
 
-    def _of(self, frame: Frame, semantics: FrameSemantics | None) -> FrameFeatures:
+    def _of(self, frame: Frame) -> FrameFeatures:
         found = next((features for own, features in self._made if own is frame), None)
         if found is None:
             models, changed = self.calibrator.segmentation, self.variant.frame(frame)
-            seen = models(changed) if semantics is None and models.active else semantics
-            found = self.calibrator.extract(changed, seen)
+            found = self.calibrator.extract(changed, models(changed) if models.active else None)
             self._made = [*self._made[-KEPT:], (frame, found)]
         return found
 
@@ -202,16 +193,13 @@ class Worker:
 
     def __call__(self, task: Task) -> list[Record]:
         name, cases = task
-        variant, records = self.study.variants[name], []
+        records = []
         for number, case, trials in cases:
             if name not in self._kept or not self._kept[name].fits(case):
-                self._kept[name] = Prepared(name, variant, case, self.config)
+                self._kept[name] = Prepared(name, self.study.variants[name], case, self.config)
             for trial in trials:
                 try:
-                    with ExitStack() as stack:
-                        for place, value in variant.replaced.items():
-                            stack.enter_context(patch(place, value))
-                        records.append(self._record(self._kept[name], number, case, trial))
+                    records.append(self._record(self._kept[name], number, case, trial))
                 except CalibrationError as error:
                     print(f"{case.group}, {name}: {error}", file=sys.stderr)
         if cases[0][1].source:  # no other task has its frames
@@ -223,9 +211,8 @@ class Worker:
         began, before = time.process_time(), own.spent
         end = self.study.estimate(own.calibrator, changed, partial(own.features, case), trial)
         cpu = time.process_time() - began - (own.spent - before) if np.isnan(end.cpu_s) else end.cpu_s
-        limits = case.limits or self.study.limits
-        right = end.deg < limits[0] and end.cm < limits[1]
-        known = {} if end.result is None else _of_result(end.result, changed.truth @ se3.inverse(case.lidar))
+        right = end.deg < case.limits[0] and end.cm < case.limits[1]
+        known = {} if end.result is None else _of_result(end.result, changed.truth)
         about = case.group, own.name, number, trial, right, end.deg, end.cm, end.status, cpu, end.said, len(case.frames)
         return Record(*about, **known)
 
@@ -265,43 +252,3 @@ def _tasks(study: Study, args: argparse.Namespace, done: Sequence[Record]) -> It
                 left.append((n, case, [t for t in own if (case.group, name, n, t) not in known]))
             if any(own for _, _, own in left):
                 yield name, left
-
-
-def table(study: Study, records: Sequence[Record]) -> str:
-    """A row for each group and variant, or what the study has instead."""
-    if study.table is not None:
-        return study.table(records)
-    rows = []
-    for group in dict.fromkeys(r.group for r in records):
-        own = [r for r in records if r.group == group]
-        first = {(r.case, r.trial): r.right for r in own if r.variant == own[0].variant}
-        for variant in dict.fromkeys(r.variant for r in own):
-            found = [r for r in own if r.variant == variant]
-            pairs = [(r.case, float(r.right) - first[r.case, r.trial]) for r in found if (r.case, r.trial) in first]
-            rows.append(
-                [
-                    group,
-                    variant,
-                    f"{sum(r.right for r in found)} of {len(found)}",
-                    "{:.3f}, {:.2f}".format(*np.percentile([r.deg for r in found], (50, 90))),
-                    "{:.1f}, {:.1f}".format(*np.percentile([r.cm for r in found], (50, 90))),
-                    sum(r.accepted and not r.right for r in found),
-                    sum(not r.accepted for r in found),
-                    f"{np.median([r.cpu_s for r in found]):.2f}",
-                    "" if variant == own[0].variant else interval(pairs),
-                    study.remark(found),
-                ]
-            )
-    head = "cases, variant, success, deg: median 90 %, cm: median 90 %, accepted wrong, refused, CPU s, more successes, remark"
-    return markdown(head.split(", "), rows)
-
-
-def interval(pairs: Sequence[tuple[int, float]]) -> str:
-    """Mean of paired differences with its 95 % interval, by a bootstrap over the cases."""
-    groups = [[d for case, d in pairs if case == one] for one in dict.fromkeys(case for case, _ in pairs)]
-    if not groups:
-        return ""
-    rng = np.random.default_rng(0)
-    drawn = [np.mean(np.concatenate([groups[k] for k in rng.integers(len(groups), size=len(groups))])) for _ in range(BOOTSTRAP)]
-    low, high = np.percentile(drawn, (2.5, 97.5))
-    return f"{100 * np.mean([d for _, d in pairs]):+.0f} % ({100 * low:+.0f} to {100 * high:+.0f})"

@@ -7,7 +7,7 @@ The core imports none of them. What is not installed is missing as if it had nev
 ``calib_ros.sources``             a kind of dataset, opened as ``NAME`` or ``NAME:...``: a callable, text -> `Source`; with
                                   the camera, name or number, as second argument where one is asked for
 ``calib_ros.rigs``                one of several sensors, opened likewise: a callable, text -> `RecordedRig`, None = a pair
-``calib_ros.objectives``          a score by the name of ``refine.objective``: an `ObjectiveKind` of registration/objective.py
+``calib_ros.objectives``          a score by the name of ``refine.objective``: an `ObjectiveKind` of registration/features.py
 ``calib_ros.classes``             what recognises classes of points and pixels: a `ClassModels` of registration/classes.py
 ``calib_ros.stages``              a stage of the configuration: a frozen dataclass made with `calib_ros.config.options`
 ``calib_ros.presets``             configurations by one word: the YAML files that they are made of, in this order
@@ -42,7 +42,7 @@ class Command(Protocol):
 
 
 class NodeService:
-    """A service of the node, to be inherited from. Used on the executor's thread, but for add."""
+    """A service of the node, to be inherited from. Used on the executor's thread."""
 
     def stop(self) -> None:
         """The node ends: no thread of the service's own may go on. Called once, after the pipeline's threads have ended."""
@@ -52,9 +52,6 @@ class NodeService:
 
     def status(self) -> Any:
         """A diagnostic_msgs/DiagnosticStatus for /diagnostics, asked for every second; None = nothing to say."""
-
-    def add(self, event: Any) -> None:
-        """Any event of the pipeline (calib_ros/online/events.py); on any thread."""
 
 
 @cache

@@ -13,13 +13,13 @@ from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.acceptance.significance import LOWEST_DECOY_Z, p_value
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance
 from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.chance import LOWEST_DECOY_Z, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import search, search_decoy

@@ -21,13 +21,13 @@ from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.nuisance.parameters import noise_of
 from calib_ros.registration.progress import Callback, Progress
+from calib_ros.registration.score.chance import UNDOUBTED_Z
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import FRUITLESS_ROUNDS

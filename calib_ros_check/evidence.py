@@ -19,7 +19,6 @@ from scipy.special import ndtri
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
-from calib_ros.registration.acceptance.significance import null_distribution
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.covariance import REGIONS, USUAL_CELLS, effective_frames, effective_points
 from calib_ros.registration.nuisance.parameters import (
@@ -32,6 +31,7 @@ from calib_ros.registration.nuisance.parameters import (
     noise_of,
     refined,
 )
+from calib_ros.registration.score.chance import null_distribution
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, unlimited
 from calib_ros_check.outcome import Tolerance

@@ -9,28 +9,22 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros import se3
 from calib_ros.cli.output import progress_bar
 from calib_ros.config import Config, SemanticsConfig
 from calib_ros.datasets.source import Source
-from calib_ros.errors import BadInputError, BudgetError, CalibrationError
+from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.io import make_folder
 from calib_ros.overlay import write_png
 from calib_ros.registration.classes import IMAGE, MASKS
-from calib_ros_semantics.models.completion import MORPHOLOGICAL, CompletionModel, completion_file
 from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel
 from calib_ros_semantics.models.segmentation import ADVICE, ModelSlot, SegmentationModels, error_line, judge, load_model
-from calib_ros_semantics.models.weight_sets import weights_of
 
 RUNS = 3  # the first is slower: libraries and memory are made ready
 WIDTH = 110  # letters of a line; some exports have a dozen tensors
-AGREES = 0.1  # share of the depth within which a completion network should keep what was measured
-NEAREST = 3.0  # m; brightest in the picture of dense depths
 
 
 class Report(NamedTuple):
@@ -50,8 +44,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
     if not -len(source) <= frame < len(source):
         raise BadInputError(f"--frame {frame} is outside 0..{len(source) - 1} of this source")
     configured = SegmentationModels(config.semantics).models
-    completion = completion_of(config)
-    if not configured and completion == MORPHOLOGICAL:
+    if not configured:
         off = config.semantics.segmentation == "none"
         why = "no models: semantics.segmentation is none" if off else "no models are named: see the stage semantics of --config"
         return Report([why], [], [])
@@ -71,11 +64,6 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
                 advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
                 failed.append(f"semantics.{model.kind}: {error_line(error)}{advice}")
             step(k + 1, len(configured))
-    if completion != MORPHOLOGICAL:
-        try:
-            lines += ["", *_completed(completion, shown, source.reference, config, out)]
-        except CalibrationError as error:
-            failed.append(f"thesis.completion: {error}")
     return Report(lines, failed, doubtful)
 
 
@@ -104,38 +92,6 @@ def _tried(slot: ModelSlot, frame: Frame, config: SemanticsConfig, out: str | No
         if borders is not None:
             lines.append(f"  picture: {_picture(MASKS, borders, frame, Path(out), 'class_borders')}")
     return lines, doubt or little
-
-
-def completion_of(config: Config) -> str:
-    """The value of thesis.completion; morphology where the package of the thesis is missing."""
-    return str(config.to_dict().get("thesis", {}).get("completion", MORPHOLOGICAL))
-
-
-def _completed(choice: str, frame: Frame, T: NDArray[np.float64] | None, config: Config, out: str | None) -> list[str]:
-    """Lines about a completion network, run on the points at T_camera_lidar (4, 4)."""
-    path = completion_file(choice)
-    model, weights = CompletionModel(path, config.semantics), weights_of(path)
-    lines = [f"completion: {choice}", *([f"  weights: {weights.text}"] if weights else []), *_wrapped(model.describe())]
-    if T is None:
-        return [*lines, "  not run: the source has no extrinsic"]
-    xyz = se3.transform(T, frame.cloud.finite().xyz)
-    uv, inside = frame.camera.project(xyz)
-    far_first = np.flatnonzero(inside)[np.argsort(-xyz[inside, 2])]
-    u, v = np.rint(uv[far_first]).astype(int).T
-    sparse: NDArray[np.float32] = np.zeros(frame.image.shape[:2], np.float32)
-    sparse[v.clip(max=len(sparse) - 1), u.clip(max=frame.image.shape[1] - 1)] = xyz[far_first, 2]
-    began = time.perf_counter()
-    dense = model(sparse, frame.image, Deadline(config.semantics.budget_s))
-    taken, measured = time.perf_counter() - began, sparse > 0
-    kept = 100 * float((np.abs(dense[measured] - sparse[measured]) < AGREES * sparse[measured]).mean()) if measured.any() else 0.0
-    lines.append(f"  one run {taken:.2f} s; {kept:.0f} % of the measured depths kept to {100 * AGREES:.0f} %")
-    lines += [f"  NOTE: {model.fallback}"] * bool(model.fallback)
-    if out is not None:
-        path = Path(out) / "completion.png"
-        near = np.where(dense > 0, np.clip(255 * NEAREST / np.maximum(dense, NEAREST), 0, 255), 0).astype(np.uint8)
-        write_png(path, np.asarray(cv2.applyColorMap(near, cv2.COLORMAP_INFERNO), np.uint8))
-        lines.append(f"  picture: {path}")
-    return lines
 
 
 def _wrapped(text: str) -> list[str]:

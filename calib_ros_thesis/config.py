@@ -8,15 +8,6 @@ from typing import ClassVar
 from calib_ros.config import Config
 from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
-from calib_ros_thesis.completion import check_completion
-
-THESIS_ORDER = (
-    ("min_depth", "max_depth"),
-    ("min_height", "max_height"),
-    ("min_reflectivity", "max_reflectivity"),
-)  # of each pair the first must be less
-MORPHOLOGICAL = "morphological"
-MAX_SMOOTHINGS = 8  # each keeps a map per frame
 
 
 @dataclass(frozen=True)
@@ -27,26 +18,20 @@ class ThesisConfig(Stage):
     # Canny's thresholds, shares of a full edge, which is that of each picture itself.
     canny_low: ClassVar[float] = 0.3
     canny_high: ClassVar[float] = 0.6
-    smoothing: tuple[float, ...] = option(
-        (4.0, 1.5),
-        "Gaussian smoothing of the image's edge map (figure 3.10), px at 720 px focal length; one optimisation "
-        "per level, in this order",
-        low=0.0,
-        high=64.0,
-    )
-    semantic_share: float = option(
-        0.5, "share of semantic edges when blended with gradient edges, before smoothing", low=0.0, high=1.0
-    )
-    min_depth: float = option(2.0, "points closer than this are removed (eq. 3.8), m", low=0.1, high=50.0)
-    max_depth: float = option(60.0, "points farther than this are removed (eq. 3.8), m", low=5.0, high=300.0)
-    min_height: float = option(-5.0, "points below this height relative to the LiDAR are removed, m", low=-100.0, high=100.0)
-    max_height: float = option(20.0, "points above this height relative to the LiDAR are removed, m", low=-100.0, high=100.0)
-    min_reflectivity: float = option(0.0, "points of lower reflectivity are removed, share of full scale", low=0.0, high=1.0)
-    max_reflectivity: float = option(1.0, "points of higher reflectivity are removed, share of full scale", low=0.0, high=1.0)
-    azimuth_deg: float = option(
-        0.0, "centre of the azimuth range kept, counter-clockwise from the LiDAR's +x, deg", low=-180.0, high=180.0
-    )
-    azimuth_half_width_deg: float = option(180.0, "half width of the azimuth range kept, deg; 180 = all", low=1.0, high=180.0)
+    # Gaussian smoothing of the image's edge map (figure 3.10), px at 720 px focal length, with an optimisation at each: the first
+    # finds the optimum, the last locates it.
+    smoothing: ClassVar[tuple[float, ...]] = (4.0, 1.5)
+    semantic_share: ClassVar[float] = 0.5  # of masks, blended with gradient edges before smoothing: neither is better
+    # The filters of 3.3.1, eq. 3.8. Depth, m: nearer is the vehicle, farther are too few points for an edge. Height above the
+    # LiDAR, m; reflectivity, share of full scale; azimuth, deg: what no camera sees drops out anyway, so nearly all pass.
+    min_depth: ClassVar[float] = 2.0
+    max_depth: ClassVar[float] = 60.0
+    min_height: ClassVar[float] = -5.0
+    max_height: ClassVar[float] = 20.0
+    min_reflectivity: ClassVar[float] = 0.0
+    max_reflectivity: ClassVar[float] = 1.0
+    azimuth_deg: ClassVar[float] = 0.0
+    azimuth_half_width_deg: ClassVar[float] = 180.0
     # Algorithm 1, RANSAC: points this close to the plane are ground, m, and planes that are tried.
     ground_distance: ClassVar[float] = 0.2
     ground_iterations: ClassVar[int] = 128
@@ -55,14 +40,7 @@ class ThesisConfig(Stage):
     cluster_min_points: ClassVar[int] = 10
     cluster_max_depth: ClassVar[float] = 40.0
     closing: ClassVar[int] = 9  # of the object map, px: joins the points of an object
-    low_reflectivity: float = option(
-        0.3, "lower values of the dense reflectivity map are set to 0, share of full scale", low=0.0, high=1.0
-    )
-    completion: str = option(
-        MORPHOLOGICAL,
-        "how the sparse depth map becomes dense: morphological = eq. 3.11, network = the completion network of this package, or "
-        "the ONNX file of another one (sparse depth, image -> depth)",
-    )
+    low_reflectivity: ClassVar[float] = 0.3  # share of full scale: borders between dull things are chance
     normalize: bool = option(
         True, "divide J of eq. 3.12 by the number of LiDAR edges in the image, since a plain sum grows with it"
     )
@@ -72,23 +50,12 @@ class ThesisConfig(Stage):
         "attached to the points, which is quick enough for a node",
         choices=("every_evaluation", "once_per_level"),
     )
-    evaluations: int = option(240, "evaluations of J per level", low=20, high=100000)
+    evaluations: ClassVar[int] = 240  # of J per level: a simplex that is no smaller by then stands on a ridge
 
     def check_with(self, config: Config) -> None:
         """See Stage."""
-        for low, high in THESIS_ORDER:
-            first, second = getattr(self, low), getattr(self, high)
-            if not first < second:
-                raise ConfigError(f"thesis.{low} = {first:g} must be less than thesis.{high} = {second:g}")
-        if not 1 <= len(self.smoothing) <= MAX_SMOOTHINGS:
-            raise ConfigError(
-                f"thesis.smoothing has {len(self.smoothing)} levels; give 1 to {MAX_SMOOTHINGS}, each is an optimisation of its "
-                "own; 0 = no smoothing"
-            )
         if config.refine.objective != "thesis":
             return
-        if self.completion != MORPHOLOGICAL:
-            check_completion(self.completion, config.semantics)
         if config.image.projection == "sphere":
             raise ConfigError("image.projection = sphere does not go with refine.objective = thesis, which needs a pinhole")
         if self.dense_edges == "every_evaluation" and config.refine.optimizer == "levenberg_marquardt":

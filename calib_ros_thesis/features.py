@@ -17,8 +17,7 @@ from calib_ros.image.enhance import prepare
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.registration.classes import OF_CLASSES, OF_MASKS
 from calib_ros_thesis.cloud import PointAttributes, attributes
-from calib_ros_thesis.completion import FrameCompletion
-from calib_ros_thesis.config import MORPHOLOGICAL, ThesisConfig, thesis_of
+from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
 from calib_ros_thesis.maps import PointLevels
 
@@ -59,8 +58,7 @@ class ThesisFeatures:
 
     camera: pinhole of the maps. scan: points in the LiDAR frame, far ones first, and their levels in the maps. edges: of the
     image. importance: w_j of eq. 3.16; None where classes are not known, or frames are not weighted. blended: what semantic edges
-    in E^I are the boundaries of, see FrameSemantics; "" = there are none. completion: the network that makes the depth map dense;
-    None = eq. 3.11.
+    in E^I are the boundaries of, see FrameSemantics; "" = there are none.
     """
 
     camera: Camera
@@ -68,7 +66,6 @@ class ThesisFeatures:
     edges: Later[ImageEdges]
     importance: float | None = None
     blended: str = ""
-    completion: FrameCompletion | None = None
 
     @property
     def points(self) -> PointAttributes:
@@ -118,14 +115,12 @@ def thesis_features(
         levels = [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in thesis.smoothing]
         return ImageEdges(levels, blurred_levels([edges], focal_length))
 
-    learned = thesis.completion != MORPHOLOGICAL
     return ThesisFeatures(
         camera,
         Later(scan) if plain is None else plain.scan,
         Later(image_edges),
         importance,
         "" if semantic is None else edges_of,
-        FrameCompletion(thesis.completion, config.semantics, image) if learned else None,
     )
 
 

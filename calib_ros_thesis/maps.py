@@ -82,17 +82,10 @@ class EdgeMaps:
         return np.asarray(np.where(self.occupied, total * np.float32(1 / 3), np.float32(0)), np.float32)
 
 
-def edge_maps(
-    pixels: NDArray[np.intp],
-    levels: PointLevels,
-    shape: tuple[int, int],
-    config: ThesisConfig,
-    learned: Floats | None = None,
-) -> EdgeMaps:
+def edge_maps(pixels: NDArray[np.intp], levels: PointLevels, shape: tuple[int, int], config: ThesisConfig) -> EdgeMaps:
     """All maps of an image of `shape` (h, w). The readable form; FastEdgeMaps gives the same E^L.
 
-    pixels: (n,) flat indices, each at most once, of the nearest points. levels: of these points. learned: dense depth of a
-    network (h, w), m, 0 = unknown, in place of that of eq. 3.11 where that reaches: so the ground and the sky stay empty.
+    pixels: (n,) flat indices, each at most once, of the nearest points. levels: of these points.
     """
     empty = np.zeros(shape[0] * shape[1], np.int16)
     depth, reflectivity, label = empty.copy(), empty.copy(), empty.astype(np.uint8)
@@ -101,9 +94,6 @@ def edge_maps(
     occupied[pixels] = True
 
     dense_depth = complete_depth(depth.reshape(shape), far_level(config))
-    if learned is not None:
-        found = np.clip(np.rint(learned * np.float32(DEPTH_UNITS)), 1, far_level(config)).astype(np.int16)
-        dense_depth = np.where((dense_depth != EMPTY) & (learned > 0), found, dense_depth)
     completed = complete(reflectivity.reshape(shape))
     dense_reflectivity = np.where(completed > low_level(config), completed, np.int16(0))
     dense_object = close_gaps(label.reshape(shape), config.closing)

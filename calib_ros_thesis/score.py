@@ -62,7 +62,7 @@ class ThesisScore:
         keep = near_image(features.points.xyz, T_prior, self.camera, MARGIN)
         points = features.points.select(keep)
         matched = points.weight(self.thesis.min_depth) * normalized_discontinuity(points.discontinuity)
-        return _FramePoints(points.xyz, matched, features.map_levels.select(keep), points.depth)
+        return _FramePoints(points.xyz, matched, features.map_levels.select(keep))
 
     def leave_out(self, frames: NDArray[np.intp]) -> None:
         """Leave out frames (m,): their w_j becomes 0."""
@@ -84,16 +84,11 @@ class ThesisScore:
         return self._kept[key]
 
     def _shown(self, j: int, T: Matrix) -> Shown:
-        frame, camera, completion = self._frames[j], self.camera, self.features[j].completion
-        M = (camera.K @ T[:3]).astype(np.float32)
+        frame, K = self._frames[j], self.camera.K
+        M = (K @ T[:3]).astype(np.float32)
         u, v, points = self._maps.visible(M[:, :3] @ frame.xyz.T + M[:, 3:])
-        pixels = v.astype(np.intp) * camera.width + u
-        if completion is None:
-            edges = self._maps(u, v, points, frame.levels)
-        else:
-            learned, shape = completion(pixels, frame.depth[points]), (camera.height, camera.width)
-            edges = edge_maps(pixels, frame.levels.select(points), shape, self.thesis, learned).lidar_edges.ravel()[pixels]
-        return Shown(pixels, points, frame.matched[points] + edges)
+        pixels = v.astype(np.intp) * self.camera.width + u
+        return Shown(pixels, points, frame.matched[points] + self._maps(u, v, points, frame.levels))
 
     def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
         """J_j (n_frames,) at T_camera_lidar (4, 4), normalised if so configured; 0 for a frame without a point in the image."""
@@ -156,12 +151,11 @@ class Shown(NamedTuple):
 
 
 class _FramePoints(NamedTuple):
-    """Points of a frame near the image. matched: their W D. depth: d of eq. 3.8."""
+    """Points of a frame near the image. matched: their W D."""
 
     xyz: Map
     matched: Map
     levels: PointLevels
-    depth: Map
 
 
 def _frame_weights(weights: Sequence[float] | None, n: int) -> Matrix:
@@ -199,8 +193,7 @@ def registration_maps(features: ThesisFeatures, T: Matrix, config: ThesisConfig,
     discontinuity, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     discontinuity.ravel()[pixels] = normalized_discontinuity(points.discontinuity)[kept]
     weight.ravel()[pixels] = points.weight(config.min_depth)[kept]
-    learned = None if features.completion is None else features.completion(pixels, points.depth[kept])
-    lidar = edge_maps(pixels, features.map_levels.select(kept), shape, config, learned)
+    lidar = edge_maps(pixels, features.map_levels.select(kept), shape, config)
     return RegistrationMaps(discontinuity, weight, lidar, features.image_edges[smoothing])
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -15,15 +16,15 @@ from calib_ros import extensions, io
 from calib_ros.config.online import MonitorConfig as MonitorConfig
 from calib_ros.config.online import OnlineConfig as OnlineConfig
 from calib_ros.config.online import TrackerConfig as TrackerConfig
-from calib_ros.config.options import Stage, current_names
+from calib_ros.config.options import Stage
 from calib_ros.config.registration import NO_LIMIT_DEG as NO_LIMIT_DEG
 from calib_ros.config.registration import NO_LIMIT_M as NO_LIMIT_M
 from calib_ros.config.registration import ConstraintsConfig as ConstraintsConfig
-from calib_ros.config.registration import GuessConfig as GuessConfig
 from calib_ros.config.registration import InitialConfig as InitialConfig
 from calib_ros.config.registration import RefineConfig as RefineConfig
 from calib_ros.config.registration import ScoreConfig as ScoreConfig
 from calib_ros.config.registration import SearchConfig as SearchConfig
+from calib_ros.config.removed import FORMER_STAGES, REMOVED, notices
 from calib_ros.config.semantics import SemanticsConfig as SemanticsConfig
 from calib_ros.config.sensors import CameraConfig as CameraConfig
 from calib_ros.config.sensors import ImageConfig as ImageConfig
@@ -52,7 +53,6 @@ class Config:
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     initial: InitialConfig = field(default_factory=InitialConfig)
-    guess: GuessConfig = field(default_factory=GuessConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     online: OnlineConfig = field(default_factory=OnlineConfig)
@@ -133,33 +133,26 @@ def preset(name: str) -> Config:
     return config
 
 
-def former_names() -> dict[str, str]:
-    """Former name of a parameter (``stage.field``) -> its current name, of all that were renamed."""
-    return {
-        f"{stage}.{f.metadata['formerly']}": f"{stage}.{f.name}"
-        for stage, cls in stages().items()
-        for f in dataclasses.fields(cls)
-        if f.metadata["formerly"]
-    }
-
-
 def update(config: Config, values: dict[str, Any]) -> Config:
-    """`config` with the named values replaced. Former names are understood, with a FutureWarning. ConfigError names what is
-    unknown, out of range, or given under a former and the current name."""
+    """`config` with the named values replaced. Options that there were in former versions are left out, with a FutureWarning.
+    ConfigError names what is unknown or out of range."""
     known, changed = stages(), {}
     for name, stage_values in values.items():
-        if name not in known:
+        if name not in known and name not in FORMER_STAGES:
             raise ConfigError(f"unknown configuration stage '{name}'; there are {', '.join(known)}")
         if stage_values is None:  # all its lines are commented out
             continue
         if not isinstance(stage_values, dict):
             raise ConfigError(f"configuration stage '{name}' must hold names and values, got {stage_values!r}")
-        stage_values = current_names(known[name], stage_values)
-        fields = {f.name for f in dataclasses.fields(known[name])}
+        for notice in notices(f"{name}.{key}" for key in stage_values):
+            warnings.warn(notice, FutureWarning, stacklevel=3)
+        stage_values = {key: value for key, value in stage_values.items() if f"{name}.{key}" not in REMOVED}
+        fields = {f.name for f in dataclasses.fields(known[name])} if name in known else set()
         for key in stage_values:
             if key not in fields:
                 raise ConfigError(f"unknown parameter '{name}.{key}'; there are {', '.join(sorted(fields))}")
-        changed[name] = dataclasses.replace(_get(config, name), **stage_values)
+        if name in known:
+            changed[name] = dataclasses.replace(_get(config, name), **stage_values)
     own = {name: stage for name, stage in changed.items() if name in OWN_STAGES}
     new = {type(stage): stage for name, stage in changed.items() if name not in OWN_STAGES}
     others = tuple({**{type(stage): stage for stage in config.others}, **new}.values())

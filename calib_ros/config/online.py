@@ -21,7 +21,6 @@ class OnlineConfig(Stage):
         low=0.0,
         high=1.0,
     )
-    pair_queue: int = option(8, "images and clouds kept while they wait for their counterpart", low=1, high=100)
     similarity_threshold: float = option(
         0.92, "an image less similar to the last keyframe's than this becomes a keyframe (eq. 3.15)", low=0.0, high=1.0
     )
@@ -49,7 +48,6 @@ class OnlineConfig(Stage):
         low=0.05,
         high=1.0,
     )
-    max_speed: float = option(40.0, "no keyframes above this speed of the vehicle, m/s", low=0.1, high=200.0)
     max_turn_deg_s: float = option(30.0, "no keyframes above this turn rate of the vehicle, deg/s", low=0.1, high=1000.0)
 
 
@@ -57,20 +55,6 @@ class OnlineConfig(Stage):
 class TrackerConfig(Stage):
     """Which estimates are accepted, and how they are fused over time."""
 
-    process_noise_deg: float = option(
-        0.1,
-        "process noise of the pose filter, rotation per axis, deg per square root of a minute",
-        low=0.0,
-        high=10.0,
-        formerly="drift_deg",
-    )
-    process_noise_m: float = option(
-        0.01,
-        "process noise of the pose filter, translation per axis, m per square root of a minute",
-        low=0.0,
-        high=1.0,
-        formerly="drift_m",
-    )
     confirmations: int = option(
         5,
         "keyframes after the first accepted estimate that must be consistent with it before the status is converged; "
@@ -97,17 +81,4 @@ class MonitorConfig(Stage):
         "smaller movements, and earlier",
         low=1e-4,
         high=1e4,
-    )
-    confirm: int = option(3, "number of keyframes that must confirm a movement before the status becomes moved", low=1, high=20)
-    least_deg: float = option(
-        0.15, "smaller rotations are not reported as a movement: the estimates follow them, deg", low=0.0, high=10.0
-    )
-    least_m: float = option(
-        0.04, "smaller translations are not reported as a movement: the estimates follow them, m", low=0.0, high=1.0
-    )
-    frozen_images: int = option(
-        5,
-        "number of identical images in a row, while the scans change, after which the camera counts as frozen; 0 = never",
-        low=0,
-        high=1000,
     )

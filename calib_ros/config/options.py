@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
-from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
 
-from calib_ros.config.removed import REMOVED, notices
 from calib_ros.errors import ConfigError
 
 
@@ -21,12 +18,9 @@ def option(
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
     length: int | None = None,
-    formerly: str | None = None,
 ) -> Any:
-    """A field with its description and its allowed range (inclusive; for tuples, of every element). formerly: the name of the
-    field in earlier versions; files and parameters that use it are still read."""
-    meta = {"doc": doc, "low": low, "high": high, "choices": choices, "length": length, "formerly": formerly}
-    return field(default=default, metadata=meta)
+    """A field with its description and its allowed range (inclusive; for tuples, of every element)."""
+    return field(default=default, metadata={"doc": doc, "low": low, "high": high, "choices": choices, "length": length})
 
 
 def bounds(stage: type, name: str) -> tuple[float, float]:
@@ -55,24 +49,6 @@ class Stage:
 def stage_name(stage: type) -> str:
     """ImageConfig -> image."""
     return stage.__name__.removesuffix("Config").lower()
-
-
-def current_names(stage: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """`values` of a stage with former field names replaced by the current ones. Removed options are left out. Warns of them and
-    of each former name (FutureWarning). ConfigError if a field is given under both names."""
-    prefix = stage_name(stage)
-    out = {name: value for name, value in values.items() if f"{prefix}.{name}" not in REMOVED}
-    for notice in notices(f"{prefix}.{name}" for name in values):
-        warnings.warn(notice, FutureWarning, stacklevel=4)
-    for f in dataclasses.fields(stage):
-        former = f.metadata["formerly"]
-        if former is None or former not in out:
-            continue
-        if f.name in out:
-            raise ConfigError(f"{prefix}.{former} is the former name of {prefix}.{f.name}; give only {prefix}.{f.name}")
-        warnings.warn(f"{prefix}.{former} is now called {prefix}.{f.name}", FutureWarning, stacklevel=4)
-        out[f.name] = out.pop(former)
-    return out
 
 
 def checked(name: str, value: Any, f: dataclasses.Field[Any]) -> Any:

@@ -50,14 +50,6 @@ class InitialConfig(Stage):
 
 
 @dataclass(frozen=True)
-class GuessConfig(Stage):
-    """The first guess from classes (thesis 3.5). The LiDAR's z axis points up within tilt_deg; its yaw is unknown."""
-
-    tilt_deg: float = option(25.0, "largest angle between the camera's and the LiDAR's vertical, deg", low=1.0, high=60.0)
-    distance_m: float = option(2.0, "largest distance between camera and LiDAR, m", low=0.1, high=10.0)
-
-
-@dataclass(frozen=True)
 class ScoreConfig(Stage):
     """The fast edge registration score."""
 

@@ -10,6 +10,7 @@ from calib_ros.errors import ConfigError
 ESTIMATE = "estimate"  # of motion.time_offset
 GIVEN, REFINE = "given", "refine"  # of camera.intrinsics
 MAX_OFFSET_S = 0.5  # to either side of motion.time_offset_s, in which offsets are searched
+CENTRE_PER_FOCAL = 0.4  # uncertainty of the principal point, a share of the width, by that of the focal length, a share of it
 FARTHEST_OFFSET_S = 60.0  # of motion.time_offset_s: messages wait no longer, and other epochs are found
 
 
@@ -75,17 +76,16 @@ class CameraConfig(Stage):
     # Calibrations of one camera on different days, as KITTI's, differ by 0.4 %.
     focal_sigma: float = option(
         0.005,
-        "standard deviation of the focal length, as a share of it, which enters the covariance; 0 = exact",
+        "standard deviation of the focal length, as a share of it, which enters the covariance; that of the principal point, as "
+        "a share of the image width, is 0.4 of it; 0 = exact",
         low=0.0,
         high=0.1,
     )
-    # Calibrations with boards state 1 to 3 px.
-    centre_sigma: float = option(
-        0.002,
-        "standard deviation of the principal point, each way, as a share of the image width; 0 = exact",
-        low=0.0,
-        high=0.1,
-    )
+
+    @property
+    def centre_sigma(self) -> float:
+        """Standard deviation of the principal point, each way, as a share of the image width: boards tell it to 1 to 3 px."""
+        return CENTRE_PER_FOCAL * self.focal_sigma
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,6 @@ class LidarConfig(Stage):
         high=100.0,
         length=6,
     )
-    max_range: float = option(60.0, "edges farther than this are dropped, m", low=5.0, high=300.0)
 
     def check(self) -> None:
         """ConfigError for a box of the vehicle without volume."""

@@ -33,6 +33,7 @@ MAX_PARTS = 8
 MAX_CELL_POINTS = 12  # points of a cell that are examined, without rings
 # How many times the noise a reflectivity edge exceeds, share of unusually large steps, noise below which intensities are rounded.
 ABOVE_NOISE, UNUSUAL_SHARE, LEAST_NOISE = 6.4, 0.05, 6e-5
+MAX_RANGE = 60.0  # m; the points of a thing farther away are too few and too coarse for an edge
 REFLECTIVITY_STEP = 0.12  # share of full scale that makes an edge wherever it exceeds the noise: lane markings of usual paint
 REFLECTIVITY_MAX_RANGE = 40.0  # m; farther, the beam is wider than a lane marking
 REFLECTIVITY_MAX_JUMP = 0.2  # m; a step of the reflectivity at a larger one of the range is a range edge
@@ -133,7 +134,7 @@ def edge_cells(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
 def _side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
     """The near side of each left/right range jump from the continued surface; without rings also across one empty cell."""
     R = scan.range
-    usable = _measured(scan, config, config.max_range)
+    usable = _measured(scan, config)
     found: list[EdgeCells] = []
     for side in (1, -1):  # +1: the neighbour at the next column, counter-clockwise
         beside = np.roll(R, -side, 1)
@@ -164,7 +165,7 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     expected = _extrapolated(R, _below(R), steps)
     jump = above - expected
     with np.errstate(invalid="ignore"):
-        mask = _measured(scan, config, config.max_range) & (jump > np.maximum(JUMP_MIN, TOP_JUMP_RATIO * expected))
+        mask = _measured(scan, config) & (jump > np.maximum(JUMP_MIN, TOP_JUMP_RATIO * expected))
         mask &= ~(_continued_down(R, height) - R < np.maximum(JUMP_MIN, TOP_JUMP_RATIO * R))
     return _cells(mask & ~np.isnan(_below(R)), EdgeKind.TOP, 0, _jump_strength(jump))
 
@@ -182,7 +183,7 @@ def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDA
 def _sky_side_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> list[EdgeCells]:
     """Cells, but for fading ones (see _grazed), beside a gap of GAP_STEPS cells that is not the border of the field of view."""
     empty = np.isnan(scan.range)
-    usable = _measured(scan, config, config.max_range) & _inside_field(scan) & ~fading
+    usable = _measured(scan, config) & _inside_field(scan) & ~fading
     found = []
     for side in (1, -1):
         gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, GAP_STEPS + 1)])
@@ -207,7 +208,7 @@ def _sky_top_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> EdgeC
     for rows in range(1, CLEAR_RINGS + 1):
         above = np.isnan(_above(scan.range, rows))
         clear &= above & np.roll(above, 1, 1) & np.roll(above, -1, 1)
-    mask = _measured(scan, config, config.max_range) & clear & ~np.isnan(_below(scan.range))
+    mask = _measured(scan, config) & clear & ~np.isnan(_below(scan.range))
     mask[: CLEAR_RINGS - 1] = False  # nothing is measured above the top rings
     return _cells(mask & ~empty & ~fading, EdgeKind.SKY_TOP, 0)
 
@@ -237,7 +238,7 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     with np.errstate(invalid="ignore"):
         flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < REFLECTIVITY_MAX_JUMP
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
-        usable = _measured(scan, config, min(REFLECTIVITY_MAX_RANGE, config.max_range)) & flat
+        usable = _measured(scan, config, REFLECTIVITY_MAX_RANGE) & flat
         at_zero, slope = reflectivity_noise(step[usable], level[usable])
         ratio = step / np.maximum(at_zero + slope * level, np.float32(LEAST_NOISE))
         counted = ratio[usable & ~np.isnan(ratio)]
@@ -271,7 +272,7 @@ def _jump_strength(jump: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.sqrt(np.clip(jump, 0, JUMP_SATURATION))
 
 
-def _measured(scan: RangeImage, config: LidarConfig, max_range: float) -> Mask:
+def _measured(scan: RangeImage, config: LidarConfig, max_range: float = MAX_RANGE) -> Mask:
     """Cells that may be edges."""
     # The vehicle's own are none, but stay in the range image: what is beside them would be an edge against the sky.
     measured = (scan.index >= 0) & (scan.range < max_range)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
 
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Notice, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import BLINDED, INITIAL, MOVED, REFUSED, SUSPECT, Extrinsic, Result
 
@@ -23,19 +23,10 @@ KEYFRAMES_AFTER, LONGEST_AFTER_S = 4, 5.0
 SPACING_S = 60.0  # between records of a kind: a status that flaps would fill the disk with the same
 
 
-@dataclass(frozen=True, eq=False)
-class Occasion:
-    """Something worth a record. kind: of KINDS. result: the extrinsic that was used, with the status and reason of the occasion.
-    events: what has happened until now, as JSON lines, the occasion last."""
-
-    kind: str
-    result: Result
-    events: str
-
-
 @dataclass(eq=False)
-class _Pending:
-    """An occasion whose record waits for further keyframes. due: by the clock."""
+class Occasion:
+    """Something worth a record, which waits for further keyframes. kind: of KINDS. result: the extrinsic that was used, with the
+    status and reason of the occasion. event: the last one of the record. due: by the clock."""
 
     kind: str
     result: Result
@@ -45,16 +36,17 @@ class _Pending:
 
 
 class BlackBox:
-    """Hears the pipeline's events and keeps the newest; calls `record` with every occasion of a kind that is wanted. Thread-safe.
+    """Hears the pipeline's events and keeps the newest; records every occasion of a kind that is wanted. Thread-safe.
 
-    kinds: gives those wanted at present. record: must return at once. clock: s.
+    kinds: gives those wanted at present. record: takes an occasion, and what has happened until then as JSON lines; must return
+    at once. clock: s.
     """
 
     def __init__(
         self,
         pipeline: Pipeline,
         kinds: Callable[[], Sequence[str]],
-        record: Callable[[Occasion], None],
+        record: Callable[[Occasion, str], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._pipeline, self._kinds, self._record, self._clock = pipeline, kinds, record, clock
@@ -62,7 +54,7 @@ class BlackBox:
         self._events: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
         self._last: Extrinsic | None = None
         self._relied_on: Result | None = None  # the newest extrinsic that was usable
-        self._pending: list[_Pending] = []
+        self._pending: list[Occasion] = []
         self._begun: dict[str, float] = {}  # the newest occasion of each kind, by the clock
 
     def add(self, event: Event) -> None:
@@ -70,19 +62,19 @@ class BlackBox:
         with self._lock:
             if isinstance(event, ExtrinsicUpdated):
                 self._update(event.extrinsic, event.stamp)
-            elif isinstance(event, FrameIngested) and self._wants(event):
+            elif isinstance(event, FrameIngested) and self.wants(event):
                 self._events.append(self._keyframe(event.frame.stamp))
                 for pending in self._pending:
                     pending.keyframes -= 1
-        if isinstance(event, (Problem, Notice)):
+        if isinstance(event, Problem):
             self.note(event.message)
         self.check()
 
     def wants(self, event: FrameIngested) -> bool:
         """Whether the messages of a frame belong into records: a keyframe's, and those that show that a sensor is blind. To be
         asked before the event is added."""
-        with self._lock:
-            return self._wants(event)
+        blind = any(own.kind == BLINDED and own.keyframes == KEYFRAMES_AFTER for own in list(self._pending))
+        return event.is_keyframe or blind
 
     def note(self, message: str, kind: str = "problem") -> None:
         """Something else that has happened, in a line. The same again is counted: one may come with every frame."""
@@ -93,30 +85,20 @@ class BlackBox:
             else:
                 self._events.append(_event(kind, last.get("stamp_ns", 0), message=message))
 
-    def check(self) -> None:
-        """To be called about once a second: record the occasions whose time is up."""
-        self._record_all(lambda pending: pending.keyframes <= 0 or self._clock() >= pending.due)
-
-    def flush(self) -> None:
-        """Record all occasions now."""
-        self._record_all(lambda pending: True)
+    def check(self, flush: bool = False) -> None:
+        """To be called about once a second: record the occasions whose time is up. flush: all, now."""
+        with self._lock:
+            now = self._clock()
+            done = [own for own in self._pending if flush or own.keyframes <= 0 or now >= own.due]
+            self._pending = [own for own in self._pending if own not in done]
+            records = [(own, _lines([*self._events, own.event])) for own in done]
+        for record in records:
+            self._record(*record)
 
     def events(self) -> str:
         """What has happened until now, as JSON lines."""
         with self._lock:
             return _lines(self._events)
-
-    def _record_all(self, ripe: Callable[[_Pending], bool]) -> None:
-        with self._lock:
-            done = [pending for pending in self._pending if ripe(pending)]
-            self._pending = [pending for pending in self._pending if pending not in done]
-            occasions = [Occasion(p.kind, p.result, _lines([*self._events, p.event])) for p in done]
-        for occasion in occasions:
-            self._record(occasion)
-
-    def _wants(self, event: FrameIngested) -> bool:
-        blind = any(pending.kind == BLINDED and pending.keyframes == KEYFRAMES_AFTER for pending in self._pending)
-        return event.is_keyframe or blind
 
     def _update(self, extrinsic: Extrinsic, stamp: int) -> None:
         """With the lock held: a new extrinsic or status."""
@@ -151,13 +133,10 @@ class BlackBox:
             happens = (changed and kind == result.status) or (refused and kind == REFUSED)
             if happens and now - self._begun.get(kind, -math.inf) >= SPACING_S:
                 self._begun[kind] = now
-                occasion = {**event, "event": "capture", "kind": kind}
-                self._pending.append(_Pending(kind, self._used(result), occasion, now + LONGEST_AFTER_S))
-
-    def _used(self, result: Result) -> Result:
-        """The extrinsic that was used so far, with what is said of it now."""
-        said = ("status", "reason", "refusal", "refusal_figures", "optimum")
-        return replace(self._relied_on or result, **{name: getattr(result, name) for name in said})
+                said = ("status", "reason", "refusal", "refusal_figures", "optimum")
+                used = replace(self._relied_on or result, **{name: getattr(result, name) for name in said})
+                capture = {**event, "event": "capture", "kind": kind}
+                self._pending.append(Occasion(kind, used, capture, now + LONGEST_AFTER_S))
 
     def _keyframe(self, stamp: int) -> dict[str, Any]:
         pipeline, counts = self._pipeline, self._pipeline.synchronizer.counts

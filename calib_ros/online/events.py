@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -36,25 +35,12 @@ class ExtrinsicUpdated:
 
 @dataclass(frozen=True)
 class Problem:
-    """Something that a person should know, in one line. kind: what counts as the same, whatever figures the message gives."""
+    """Something that a person should know, in one line. kind: what counts as the same, whatever figures the message gives.
+    solved: it is well again."""
 
     message: str
     kind: str
-
-
-@dataclass(frozen=True)
-class Notice:
-    """The same of something that is well again."""
-
-    message: str
-    kind: str
-
-
-@dataclass(frozen=True, eq=False)
-class JobDone:
-    """A deferred job is done. outcome: what it has returned."""
-
-    outcome: Any
+    solved: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,7 +48,7 @@ class IntakeIdle:
     """All pairs so far are worked off."""
 
 
-Event = FrameIngested | ExtrinsicUpdated | Problem | Notice | JobDone | IntakeIdle
+Event = FrameIngested | ExtrinsicUpdated | Problem | IntakeIdle
 
 
 @dataclass(frozen=True)
@@ -83,44 +69,13 @@ class Inputs:
     vehicle_frames: Callable[[str, str], Mapping[str, Transform]] = lambda camera_frame, lidar_frame: {}
 
 
-class Announcer:
-    """Thread-safe. tell: takes every event. stamp: of the newest keyframe, ns."""
-
-    NO_CAMERA = Problem("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'", "camera")
-    OTHER_CAMERA = Problem("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays", "intrinsics")
-    JUMPED_BACK = Problem(
-        "time stamps jumped back (a looping bag, or a clock was set back): messages that waited for a partner were dropped",
-        "stamps",
-    )
+class Remarks:
+    """What a person is told of the inputs and the threads: when something begins, and when it is over. Not thread-safe."""
 
     def __init__(self, tell: Callable[[Event], None]) -> None:
-        self.stamp = 0
-        self.tell, self._lock = tell, threading.Lock()
-        self._published: Result | None = None
+        self._tell = tell
         self._missing: set[str] = set()  # kinds of what the newest keyframe lacked
         self._fault: SensorProblem | None = None
-
-    def publish(self, recalibrator: Recalibrator, in_use: Callable[[], bool], again: bool) -> None:
-        """The current extrinsic, if it or its status differs from the one published last; none of a replaced recalibrator.
-
-        The monitor's assessment of an extrinsic that is right goes to the diagnostics alone.
-        """
-        with self._lock:
-            extrinsic = recalibrator.current
-            if in_use() and (again or extrinsic.result is not self._published):
-                self._published = extrinsic.result
-                self.tell(ExtrinsicUpdated(extrinsic, self.stamp or extrinsic.estimated_at))
-
-    def read(self, reader: Callable[[Extrinsic, int], None], source: Callable[[], Recalibrator | None], wait: bool) -> None:
-        """See `Pipeline.read_current`."""
-        if not self._lock.acquire(blocking=wait):
-            return
-        try:
-            recalibrator = source()
-            if recalibrator is not None:
-                reader(recalibrator.current, self.stamp or recalibrator.current.estimated_at)
-        finally:
-            self._lock.release()
 
     def note_what_is_missing(self, recalibrator: Recalibrator, keyframe: Frame) -> None:
         """Tell what the estimates have to do without, once it begins to be missing."""
@@ -133,27 +88,20 @@ class Announcer:
             notes["intensity"] = "the cloud has no intensity: reflectivity edges are off, everything else works"
         missing = {kind for kind, note in notes.items() if note}
         for kind in sorted(missing - self._missing):
-            self.tell(Problem(notes[kind], kind))
+            self._tell(Problem(notes[kind], kind))
         self._missing = missing
 
-    def sensors(self, recalibrator: Recalibrator) -> None:
+    def note_sensors(self, recalibrator: Recalibrator) -> None:
         """Tell when a sensor begins to show nothing, when it is for another reason, and when both work again."""
         fault = recalibrator.tracker.sensor_problem
         if fault == self._fault or (fault is None and recalibrator.sensors.faulty_frames):  # in doubt after a restart
             return
         self._fault = fault
-        if fault is None:
-            self.tell(Notice("camera and LiDAR work again", "sensors"))
-        else:
-            self.tell(Problem(fault.message, fault.fault.value))
-
-    def other_sensors(self, names: Result, camera_frame: str, lidar_frame: str) -> None:
-        """A pair of other sensors than those of a result came."""
-        what = f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to"
-        self.tell(Problem(f"{what} {names.camera_frame}; give every camera-LiDAR pair its own node", "other sensors"))
+        well = Problem("camera and LiDAR work again", "sensors", solved=True)
+        self._tell(well if fault is None else Problem(fault.message, fault.fault.value))
 
     def report(self, error: Exception) -> None:
         """Of a worker, its kind being where it was raised: a defect of ours says what it is, and the node goes on."""
         if isinstance(error, TooFewFeaturesError) and self._fault is not None and self._fault.fault is SensorFault.LIDAR_BLIND:
             return  # which is told once, and not with every frame
-        self.tell(Problem(str(error) if isinstance(error, CalibrationError) else defect(error), raised_at(error)))
+        self._tell(Problem(str(error) if isinstance(error, CalibrationError) else defect(error), raised_at(error)))

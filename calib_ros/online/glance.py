@@ -43,7 +43,8 @@ Map = NDArray[np.float32]
 
 
 class Glance:
-    """Looks at frames, and tells those that are worth a test. in_step: with others, see `is_due`. Not thread-safe."""
+    """Looks at frames, and tells those that are worth a test. in_step: with others, see `is_due`. struck: one was, and has not
+    been tested yet. Not thread-safe."""
 
     def __init__(self, in_step: bool = False) -> None:
         self._in_step = in_step
@@ -53,6 +54,7 @@ class Glance:
         """Forget what is usual."""
         self._losses: deque[float] = deque(maxlen=KEPT)
         self._looked_at: int | None = None  # stamp, ns
+        self.struck = False
 
     def is_due(self, stamp: int, at_rest: bool = False) -> bool:
         """Whether the last look is long enough ago."""

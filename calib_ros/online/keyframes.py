@@ -25,6 +25,7 @@ from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs
 from calib_ros.online.pacing import is_due
 from calib_ros.registration.features import FrameFeatures
 
+MAX_SPEED = 40.0  # m/s: no keyframes above, where a millisecond between the clocks is as much as an estimate scatters by
 INTERVAL_S = 1.0  # without a keyframe, after which any image that has changed becomes one
 STATIC_SIMILARITY = 0.995  # images more similar show the same scene and never become a keyframe
 REMEMBERED_S = 3.0  # a vehicle that moved so long ago may still move
@@ -59,19 +60,12 @@ class KeyframeSelector:
         permit: asked only about an image that is to be a keyframe; where it refuses, the next image is as good. spacing_s:
         smallest time between keyframes, where that is longer than the configured one.
         """
-        if self._histogram is not None and self._is_too_early(stamp, spacing_s):
-            return False  # nobody needs to look at it
-        return self.select_histogram(histogram(image), stamp, permit)
-
-    def _is_too_early(self, stamp: int, spacing_s: float = 0.0) -> bool:
-        return not is_due(self._stamp, stamp, max(self.config.keyframe_spacing_s, spacing_s), self._in_step)
-
-    def select_histogram(self, new: Histogram, stamp: int, permit: Permit = lambda: True) -> bool:
-        """The same for the histogram of an image."""
         last = self._histogram  # reset() may come from another thread
+        spacing_s = max(self.config.keyframe_spacing_s, spacing_s)
+        if last is not None and not is_due(self._stamp, stamp, spacing_s, self._in_step):
+            return False  # nobody needs to look at it
+        new = histogram(image)
         if last is not None:
-            if self._is_too_early(stamp):
-                return False
             self.last_similarity = similarity(last, new)
             overdue = is_due(self._stamp, stamp, INTERVAL_S, self._in_step)
             changed = self.last_similarity < STATIC_SIMILARITY
@@ -187,24 +181,17 @@ class KeyframeBuffer:
         self.incomplete = True
 
 
-class MotionMeasurement(NamedTuple):
-    """The newest measurement of odometry or an IMU. stamp: ns. speed: m/s, turn_rate: deg/s, None if the source lacks it."""
-
-    stamp: int
-    speed: float | None
-    turn_rate: float | None
-
-
 class SpeedGate:
     """Rejects frames taken while the vehicle drives or turns too fast for a keyframe.
 
     Uses the newest measurement if it is of the frame's time, else the twist that the frame carries. Thread-safe. config may be
-    replaced at any time. rejected: frames rejected so far. last_rejection: why the newest of them was, for a person.
+    replaced at any time. newest: stamp, ns, speed, m/s, and turn rate, deg/s, of odometry or an IMU, None if the source lacks it.
+    rejected: frames rejected so far. last_rejection: why the newest of them was, for a person.
     """
 
     def __init__(self, config: OnlineConfig) -> None:
         self.config = config
-        self.newest: MotionMeasurement | None = None
+        self.newest: tuple[int, float | None, float | None] | None = None
         self.rejected = 0
         self.last_rejection = ""
         self._lock = threading.Lock()
@@ -212,14 +199,14 @@ class SpeedGate:
     def add_measurement(self, stamp: int, speed: float | None, turn_rate: float | None) -> None:
         """A measurement: stamp in ns, m/s and deg/s; None and values that are not finite are unknown."""
         known = [None if value is None or not math.isfinite(value) else abs(value) for value in (speed, turn_rate)]
-        self.newest = MotionMeasurement(stamp, known[0], known[1])
+        self.newest = stamp, known[0], known[1]
 
     def allows(self, frame: Frame) -> bool:
         """True if the frame is slow enough for a keyframe, or its speed is unknown."""
         speed, turn_rate = self.motion_at(frame)
         problem = ""
-        if speed is not None and speed > self.config.max_speed:
-            problem = f"{speed:.1f} m/s are above online.max_speed = {self.config.max_speed:g}"
+        if speed is not None and speed > MAX_SPEED:
+            problem = f"{speed:.1f} m/s are too fast for a keyframe, at most {MAX_SPEED:g} are allowed"
         elif turn_rate is not None and turn_rate > self.config.max_turn_deg_s:
             problem = f"{turn_rate:.1f} deg/s are above online.max_turn_deg_s = {self.config.max_turn_deg_s:g}"
         if problem:
@@ -231,8 +218,8 @@ class SpeedGate:
     def motion_at(self, frame: Frame) -> tuple[float | None, float | None]:
         """Speed, m/s, and turn rate, deg/s, at a frame; None where unknown."""
         measured, speed, turn_rate = self.newest, None, None
-        if measured is not None and abs(measured.stamp - frame.stamp) <= MAX_MEASUREMENT_AGE_S * NANOSECONDS:
-            speed, turn_rate = measured.speed, measured.turn_rate
+        if measured is not None and abs(measured[0] - frame.stamp) <= MAX_MEASUREMENT_AGE_S * NANOSECONDS:
+            _, speed, turn_rate = measured
         if frame.twist is not None:
             speed = float(np.linalg.norm(frame.twist[3:])) if speed is None else speed
             turn_rate = float(np.rad2deg(np.linalg.norm(frame.twist[:3]))) if turn_rate is None else turn_rate

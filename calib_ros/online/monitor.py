@@ -16,12 +16,12 @@ from calib_ros.config import MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, ShiftNoise, shift_evidence
 from calib_ros.online.glance import EVERY_S
-from calib_ros.registration.acceptance.significance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import REGIONS, covariance, distance, effective_frames, effective_points
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.time_offset import STAMP_SCATTER_S, ClockOffset
+from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
 
 # The test at a keyframe.
@@ -34,6 +34,8 @@ TESTS_PER_HOUR, MOVED_RARER = 3 * 3600 / EVERY_S, 10.0
 DOUBT = np.log(20.0)  # evidence from which on the next frames are tested as well, whatever they show
 # Of the usual number of edge points in view: a keyframe that has fewer, and fewer than MIN_POINTS, shows next to nothing.
 POOR_SHARE = 0.25
+CONFIRM = 3  # keyframes that confirm a movement: fewer may show one odd scene, more keep a wrong extrinsic in use
+LEAST_DEG, LEAST_M = 0.15, 0.04  # smaller movements are within what estimates scatter by, and these follow them
 # A vehicle in a city, for scans whose motion is unknown. KITTI drive 0005 at 3 to 6 m/s, not de-skewed, fits 0.2 deg / 8 cm
 # beside the extrinsic; with these and its camera 0.22 deg / 11 cm are allowed for.
 USUAL_TURN_DEG_S, USUAL_SPEED_M_S = 20.0, 10.0
@@ -113,31 +115,6 @@ class ShiftTest:
         return float(np.linalg.norm(self.shift[3:]))
 
 
-@dataclass(frozen=True)
-class OffsetAtKeyframes:
-    """The time offset of the images against the scans that explains some keyframes best.
-
-    seconds: positive where the images are late. score: with the offset. configured_s: motion.time_offset_s, which is
-    allowed for already.
-    """
-
-    seconds: float
-    score: float
-    configured_s: float = 0.0
-
-    def explains(self, score: float) -> bool:
-        """True if the offset fits the keyframes as well as a displaced mount, which reaches `score`."""
-        return abs(self.seconds) >= MIN_TIME_OFFSET_S and self.score >= EXPLAINED_SHARE * score
-
-    def describe(self) -> str:
-        """What is off and what to do, for a person."""
-        return (
-            f"the images are {1000 * abs(self.seconds):.0f} ms {'late' if self.seconds > 0 else 'early'} against the scans (that "
-            "alone explains the difference): synchronise the clocks, or set motion.time_offset_s to "
-            f"{self.configured_s + self.seconds:.3g}"
-        )
-
-
 class Monitor:
     """Tests the newest keyframe alone, where a mount displacement shows at once, and the newest few together, which show small
     errors.
@@ -190,12 +167,12 @@ class Monitor:
             self._match.add(alone.z_score, alone.points, same_scene)
         self._suspects = self._suspects + 1 if self._suspects else 0
         window = max(self._suspects, min(WINDOW, len(keyframes)) if not self._suspects else 1)
-        window = min(window, self.config.confirm if self._out_of_sync else FAILED_WINDOWS * WINDOW)
+        window = min(window, CONFIRM if self._out_of_sync else FAILED_WINDOWS * WINDOW)
         newest = keyframes[-window:]
         informative = self.informative(newest, T) or newest[-1:]
         together = alone if window == 1 else shift_of(informative)
         if self._suspects:
-            several = together.keyframes >= min(self.config.confirm, len(newest))  # not one of them, tested again and again
+            several = together.keyframes >= min(CONFIRM, len(newest))  # not one of them, tested again and again
             return self._decide(calibrator, informative, T, together, window, several)
         # What shows in the newest alone began with it: the others in a window that it spoils are still right.
         against = (
@@ -240,33 +217,30 @@ class Monitor:
         keyframes. several: they are enough to confirm a movement."""
         count, p_value = self._suspects, together.p_value
         evidence = max(self._evidence(together, newest), self._match.evidence)
-        if evidence >= self._threshold(MOVED_RARER) and several and count >= self.config.confirm:
-            offset = fit_time_offset(calibrator, newest, T)
-            if offset is not None and offset.explains(together.score):
+        if evidence >= self._threshold(MOVED_RARER) and several and count >= CONFIRM:
+            if out_of_sync := clocks_that_explain(calibrator, newest, T, together.score):
                 self._out_of_sync = True
-                return Assessment(Verdict.SUSPECT, offset.describe(), p_value, count)
+                return Assessment(Verdict.SUSPECT, out_of_sync, p_value, count)
             since = window if self._out_of_sync else count
             message = f"the calibration has moved: {self._describe(together, since)}"
             self.reset()
             return Assessment(Verdict.MOVED, message, p_value, since)
         limit = self._threshold() if count >= FAILED_WINDOWS * WINDOW else 0.0  # 0: they rather speak for it
-        if together.conclusive and evidence < limit and count >= min(2, self.config.confirm):
-            out_of_sync = max(count - window, 0) if self._out_of_sync else 0
+        if together.conclusive and evidence < limit and count >= 2:
+            without_sync = max(count - window, 0) if self._out_of_sync else 0
             self.reset()
             message = "the extrinsic fits the newest keyframes after all"
-            return Assessment(Verdict.CONSISTENT, message, p_value, count, out_of_sync)
+            return Assessment(Verdict.CONSISTENT, message, p_value, count, without_sync)
         return Assessment(Verdict.SUSPECT, self._describe(together, count), p_value, count)
 
     def _evidence(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> float:
         """What the shift of the tested keyframes says against the extrinsic; less than nothing where it cannot count."""
-        counts = test.conclusive and test.significant and not self._is_small(test, keyframes)
-        return test.evidence if counts else min(test.evidence, 0.0)
-
-    def _is_small(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> bool:
-        """Is the shift one that the estimates follow, or that a scan bent by unknown motion may have?"""
+        # A small shift may be one that the estimates follow, or that a scan bent by unknown motion has.
         seconds = max(k.unknown_motion_s for k in keyframes)
-        least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
-        return test.deg < least_deg and test.m < max(self.config.least_m, USUAL_SPEED_M_S * seconds)
+        least_deg = max(LEAST_DEG, USUAL_TURN_DEG_S * seconds)
+        is_small = test.deg < least_deg and test.m < max(LEAST_M, USUAL_SPEED_M_S * seconds)
+        counts = test.conclusive and test.significant and not is_small
+        return test.evidence if counts else min(test.evidence, 0.0)
 
     def _describe(self, test: ShiftTest, count: int) -> str:
         frames, verb = (f"the newest {count} keyframes", "") if count > 1 else ("the newest keyframe", "es")
@@ -354,19 +328,27 @@ def normalised_innovation(T_current: Transform, T_estimate: Transform) -> float:
     return rotation + se3.translation_error_m(T_current, T_estimate) / UNIT_TRANSLATION_M
 
 
-def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Transform) -> OffsetAtKeyframes | None:
-    """The time offset with which the keyframes fit T (4, 4) best. None if the vehicle moves in none, or its motion is unknown.
+def clocks_that_explain(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Transform, reached: float) -> str:
+    """What is off and what to do, for a person, if a time offset of the images against the scans fits the keyframes at T (4, 4)
+    as well as a displaced mount, which reaches a score; else "", also where the vehicle moves in none or its motion is unknown.
 
     Keyframes at rest take part: they fit at any offset, and a vehicle that stops behind a late camera keeps its mount.
     At time tau after the image's moment a static point is at exp(twist tau)^-1 of where it was, for all points alike.
     """
     twists = np.array([f.twist for f in keyframes if f.twist is not None])
     if len(twists) < len(keyframes) or not (np.abs(twists) >= MIN_TWIST).any():
-        return None
+        return ""
     try:
         score = calibrator.objectives.of_edges(keyframes, T).score
     except TooFewFeaturesError:
-        return None
+        return ""
     scores = ClockOffset(0.0, twists).scores_at(score, T, TIME_OFFSETS_S)
     best = int(np.argmax(scores))
-    return OffsetAtKeyframes(float(TIME_OFFSETS_S[best]), scores[best], calibrator.config.motion.time_offset_s)
+    seconds = float(TIME_OFFSETS_S[best])
+    if abs(seconds) < MIN_TIME_OFFSET_S or scores[best] < EXPLAINED_SHARE * reached:
+        return ""
+    return (
+        f"the images are {1000 * abs(seconds):.0f} ms {'late' if seconds > 0 else 'early'} against the scans (that "
+        "alone explains the difference): synchronise the clocks, or set motion.time_offset_s to "
+        f"{calibrator.config.motion.time_offset_s + seconds:.3g}"
+    )

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from calib_ros.config import OnlineConfig
-from calib_ros.config.online import CONTINUOUS, PERIODIC
+from calib_ros.config.online import MANUAL, PERIODIC
 from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.search.parallel import cpu_time
 
@@ -22,7 +22,7 @@ from calib_ros.registration.search.parallel import cpu_time
 # a minute's average is at most a twelfth above max_load.
 SAVED_S = 5.0
 # Whatever the budget says, one keyframe is taken in so many seconds, and one estimate made that is due: a node that tests nothing
-# is of no use. The test of a displaced mount takes monitor.confirm keyframes, 15 s at this rate.
+# is of no use. The test of a displaced mount takes three keyframes, 15 s at this rate.
 KEYFRAME_EVERY_S = 5.0
 ESTIMATE_EVERY_S = 30.0
 CLASSES_EVERY_S = 30.0  # of one keyframe
@@ -67,20 +67,6 @@ class LoadCounts:
     forced: int = 0
 
 
-class Meter:
-    """CPU time of one thread's work and of the threads that share it, booked under one kind of work after the other."""
-
-    def __init__(self, budget: LoadBudget, work: Work, charged: bool) -> None:
-        self._budget, self._work, self._charged = budget, work, charged
-        self._since = cpu_time()
-
-    def switch(self, work: Work) -> None:
-        """What comes from now on is this kind of work."""
-        now = cpu_time()
-        self._budget.add(self._work, now - self._since, self._charged)
-        self._work, self._since = work, now
-
-
 class Purse:
     """What has been saved up, s of CPU time, and until when, by the clock; of one budget, or of several that share it. lock:
     to be held. clock: s, never runs back."""
@@ -103,7 +89,6 @@ class LoadBudget:
     def __init__(self, config: OnlineConfig, clock: Callable[[], float] = time.monotonic, purse: Purse | None = None) -> None:
         self.config = config
         self._purse = purse or Purse(config, clock)
-        self._clock, self._lock = self._purse.clock, self._purse.lock
         self._seconds = dict.fromkeys(Work, 0.0)
         self._keyframes = self._postponed = self._forced = 0
         self._last = dict.fromkeys((Work.KEYFRAMES, Work.ESTIMATES, Work.CLASSES), -float("inf"))  # when the last one began
@@ -114,17 +99,25 @@ class LoadBudget:
     # ---- what is done -------------------------------------------------------------------------------------------------
 
     @contextmanager
-    def counting(self, work: Work, charged: bool = True) -> Iterator[Meter]:
-        """Counts the CPU time of this thread. charged: False for what somebody asked for, which comes on top of the budget."""
-        meter = Meter(self, work, charged)
+    def counting(self, work: Work, charged: bool = True) -> Iterator[Callable[[Work], None]]:
+        """Counts the CPU time of this thread and of the threads that share its work. Gives what is to be told when another kind
+        of work begins. charged: False for what somebody asked for, which comes on top of the budget."""
+        since = cpu_time()
+
+        def switch(to: Work) -> None:
+            nonlocal work, since
+            now = cpu_time()
+            self.add(work, now - since, charged)
+            work, since = to, now
+
         try:
-            yield meter
+            yield switch
         finally:
-            meter.switch(work)
+            switch(work)
 
     def add(self, work: Work, seconds: float, charged: bool = True) -> None:
         """So much CPU time went into this."""
-        with self._lock:
+        with self._purse.lock:
             self._update()
             self._seconds[work] += seconds
             if not charged:
@@ -142,7 +135,7 @@ class LoadBudget:
         """The calling thread receives the messages: its CPU time counts from now on. Does nothing where it cannot be told."""
         if not hasattr(time, "pthread_getcpuclockid"):
             return
-        with self._lock, suppress(OSError):
+        with self._purse.lock, suppress(OSError):
             own = time.pthread_getcpuclockid(threading.get_ident())
             if self._executor is None or self._executor[0] != own:
                 self._executor = own, time.clock_gettime(own)
@@ -151,7 +144,7 @@ class LoadBudget:
 
     def allows_keyframe(self) -> bool:
         """True if a frame that is to be a keyframe may be one; it is counted as one then."""
-        with self._lock:
+        with self._purse.lock:
             now = self._update()
             turn = not self._estimate_waits or self._keyframes_since_s < self._last_estimate_s
             affordable = self._purse.saved >= 0 and turn
@@ -165,7 +158,7 @@ class LoadBudget:
 
     def allows_estimate(self, due: bool) -> bool:
         """True if an estimate is due and may begin. If it is due and may not, keyframes make room for it."""
-        with self._lock:
+        with self._purse.lock:
             now = self._update()
             affordable = self._purse.saved >= 0 or now - self._last[Work.ESTIMATES] >= ESTIMATE_EVERY_S
             self._estimate_waits = due and not affordable
@@ -173,12 +166,12 @@ class LoadBudget:
 
     def start_estimate(self) -> None:
         """An estimate begins, on request or not."""
-        with self._lock:
-            self._last[Work.ESTIMATES], self._estimate_waits = self._clock(), False
+        with self._purse.lock:
+            self._last[Work.ESTIMATES], self._estimate_waits = self._purse.clock(), False
 
     def allows_classes(self, needed: bool = False) -> bool:
         """True if a keyframe may be given classes. needed: without them there will be no estimate."""
-        with self._lock:
+        with self._purse.lock:
             now = self._update()
             enough = self._purse.saved >= CLASSES_RESERVE * SAVED_S * self.config.max_load
             allowed = needed or enough or now - self._last[Work.CLASSES] >= CLASSES_EVERY_S
@@ -190,13 +183,13 @@ class LoadBudget:
 
     def counts(self) -> LoadCounts:
         """Everything so far."""
-        with self._lock:
+        with self._purse.lock:
             self._update()
             return LoadCounts(dict(self._seconds), self._keyframes, self._postponed, self._forced)
 
     def _update(self) -> float:
         """With the lock held: the time, with what was saved up and received until then."""
-        now = self._clock()
+        now = self._purse.clock()
         limit = self.config.max_load
         self._purse.saved = min(self._purse.saved + limit * (now - self._purse.at), SAVED_S * limit)
         self._purse.at = now
@@ -213,22 +206,32 @@ class LoadBudget:
 class Schedule:
     """When estimates are made, by online.mode over the data's own stamps: a recording gives the same ones at any speed.
 
-    config may be replaced at any time. Stamps are in ns.
+    While the extrinsic is at rest less is done, the less, the longer it has been steady: an estimate is worth its time once there
+    is as much to go on again as there was, and keyframes only test the extrinsic. config may be replaced at any time. newest:
+    stamp of the newest frame. Stamps are in ns.
     """
 
     def __init__(self, config: OnlineConfig) -> None:
         self.config = config
-        self.newest: int | None = None  # stamp of the newest frame
+        self.newest: int | None = None
         self._estimated: int | None = None
         self._estimated_before: int | None = None
+        self._steady_since: int | None = None
+        self._steady_s = self._steady_by_estimate_s = 0.0  # from then to the newest frame, and to the last estimate
 
-    def add_frame(self, stamp: int) -> None:
-        """A frame, keyframe or not, with its stamp."""
+    def add_frame(self, stamp: int, steady: bool = False) -> None:
+        """A frame, keyframe or not, with its stamp, and whether the extrinsic is steady by now."""
         self.newest = stamp
+        if not steady:
+            self._steady_since = None
+        elif self._steady_since is None or stamp < self._steady_since:
+            self._steady_since = stamp
+        self._steady_s = 0.0 if self._steady_since is None else (stamp - self._steady_since) / NANOSECONDS
 
     def start_estimate(self) -> None:
         """An estimate begins, on request or not: the next period counts from the newest frame."""
         self._estimated_before, self._estimated = self._estimated, self.newest
+        self._steady_by_estimate_s = self._steady_s
 
     def cancel_estimate(self) -> None:
         """The estimate that began last ended without a result."""
@@ -238,47 +241,23 @@ class Schedule:
         """True if new keyframes are to be estimated now; the first ones at once, as after a clock was set back.
 
         rest_s: between estimates of mode continuous, where the extrinsic is at rest, else 0. urgent: it has moved or
-        is to be confirmed, for which mode periodic does not.
+        is to be confirmed, for which mode periodic does not wait.
         """
-        if self.config.mode == CONTINUOUS:
-            return self._elapsed(rest_s)
-        return self.config.mode == PERIODIC and (urgent or self._elapsed(self.config.period_s))
-
-    def _elapsed(self, period_s: float) -> bool:
-        if self.newest is None or self._estimated is None:
+        if self.config.mode == MANUAL:
+            return False
+        periodic = self.config.mode == PERIODIC
+        if self.newest is None or self._estimated is None or (periodic and urgent):
             return True
         elapsed = (self.newest - self._estimated) / NANOSECONDS
-        return elapsed < 0 or elapsed >= period_s
-
-
-class Rest:
-    """How much less is done while the extrinsic is at rest: the less, the longer it has been steady. Stamps are in ns.
-
-    An estimate is worth its time once there is as much to go on again as there was. Keyframes only test the extrinsic.
-    """
-
-    def __init__(self) -> None:
-        self._since: int | None = None  # of the first frame since which it is steady
-        self._steady_s = self._estimated_after_s = 0.0  # from then to the newest frame, and to the last estimate
-
-    def add_frame(self, stamp: int, steady: bool) -> None:
-        """A frame with its stamp, and whether the extrinsic is steady by now."""
-        if not steady:
-            self._since = None
-        elif self._since is None or stamp < self._since:
-            self._since = stamp
-        self._steady_s = 0.0 if self._since is None else (stamp - self._since) / NANOSECONDS
-
-    def start_estimate(self) -> None:
-        """An estimate begins, on request or not."""
-        self._estimated_after_s = self._steady_s
-
-    def estimates_s(self, shortest: float) -> float:
-        """Time from the last estimate to the next, s: as long as it was steady by then."""
-        return max(shortest, min(self._estimated_after_s, LONGEST_REST_S))
+        return elapsed < 0 or elapsed >= (self.config.period_s if periodic else rest_s)
 
     @property
-    def keyframes_s(self) -> float:
+    def estimates_at_rest_s(self) -> float:
+        """Time from the last estimate to the next, s: as long as it was steady by then."""
+        return max(self.config.rest_period_s, min(self._steady_by_estimate_s, LONGEST_REST_S))
+
+    @property
+    def keyframes_at_rest_s(self) -> float:
         """Smallest time between keyframes, s."""
         shortest, longest = REST_SPACING_S
         return min(max(shortest, self._steady_s / KEYFRAMES_PER_REST), longest)

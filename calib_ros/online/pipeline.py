@@ -14,8 +14,9 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,20 +26,18 @@ from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.common import Common
-from calib_ros.online.deferred import Deferred, DeferredJob
-from calib_ros.online.events import Announcer, Event, FrameIngested, Inputs, IntakeIdle, JobDone, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Problem, Remarks
 from calib_ros.online.keyframes import SpeedGate
-from calib_ros.online.pacing import LoadBudget, Meter, Work
+from calib_ros.online.pacing import LoadBudget, Work
 from calib_ros.online.pairing.pairing import Intake, Pairing
 from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.requests import Requests
+from calib_ros.online.requests import ESTIMATE, Pending, Requests
 from calib_ros.online.worker import Worker
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.progress import Callback
 from calib_ros.result import Extrinsic, Result
 
-T = TypeVar("T")
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
 
@@ -65,17 +64,18 @@ class Pipeline:
         self._scans = None if common is None else common.scans(lidar)
         self.load = LoadBudget(config.online, purse=self._common.purse)
         self._inputs = inputs
-        self._segmentation = self._common.models(config.semantics)
-        self._requests, self._deferred = Requests(), Deferred()
+        self._requests = Requests()
         self.dropped_pairs = 0  # that a newer one replaced before they were ingested
         self.rested_pairs = 0  # that were left out, since there was no need to look at them
         self._lock = threading.Lock()
-        self._announcer = Announcer(sink)
+        self._tell, self._remarks, self._publishing = sink, Remarks(sink), threading.Lock()
+        self._published: Result | None = None
+        self._stamp = 0  # of the newest keyframe, ns
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
         self._handed = -float("inf")  # when the newest pair was handed over to be ingested
-        report = self._announcer.report
+        report = self._remarks.report
         self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, report, on_idle=lambda: sink(IntakeIdle()))
-        self._estimator: Worker[None] = Worker("calib_estimate", self._estimate_and_defer, report)
+        self._estimator: Worker[None] = Worker("calib_estimate", self._do_what_is_due, report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, report, SEMANTICS_NICE)
 
     # ---- input --------------------------------------------------------------------------------------------------------
@@ -93,13 +93,13 @@ class Pipeline:
         if self.recalibrator is not None:
             self._follow_clocks(self.recalibrator)
         if changed:
-            self._announcer.tell(Announcer.OTHER_CAMERA)
+            message = "the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays"
+            self._tell(Problem(message, "intrinsics"))
 
     def _recalibrator_at(self, camera: Camera, initial: Result, current: Result | None = None) -> Recalibrator:
         """A new one; its frames are those of the initial extrinsic."""
-        names = initial.camera_frame, initial.lidar_frame
-        shared = self._scans, self._common.models
-        return Recalibrator(camera, initial, self.config, *names, current, self.speed_gate, self.segmentation, *shared)
+        names, gate, models = (initial.camera_frame, initial.lidar_frame), self.speed_gate, self._common.models
+        return Recalibrator(camera, initial, self.config, *names, current, gate, self._scans, models)
 
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""
@@ -138,9 +138,10 @@ class Pipeline:
             jumped = self.synchronizer.counts.jumps_back > jumps
             clocks = self.clock_difference if self._pairing.clocks.ahead != ahead else ""
         if jumped:
-            self._announcer.tell(Announcer.JUMPED_BACK)
+            jump = "time stamps jumped back (a looping bag, or a clock was set back)"
+            self._tell(Problem(f"{jump}: messages that waited for a partner were dropped", "stamps"))
         if clocks:
-            self._announcer.tell(Problem(clocks, "clocks"))
+            self._tell(Problem(clocks, "clocks"))
 
     # ---- requests -----------------------------------------------------------------------------------------------------
 
@@ -151,17 +152,15 @@ class Pipeline:
         that waited for it; the extrinsic stays. progress: called on the thread of estimates; must not raise.
         """
         with self._lock:
-            future, needs_run = self._requests.add(self._keyframes_seen(), progress)
-        if needs_run:
-            self._estimator.put(None)
+            future = self._requests.add(Pending(ESTIMATE), self._keyframes_seen(), progress)
+        self._estimator.put(None)
         return future
 
-    def defer(self, job: DeferredJob[T], obstacle: str = "") -> Future[T]:
+    def defer(self, job: Pending, obstacle: str = "") -> Future[Any]:
         """A job for the thread of estimates, after those under way; its CPU time is not charged to online.max_load. The future
         holds what it returns, or an exception: a CalibrationError where it is not taken, for an obstacle among other reasons."""
-        future = self._deferred.add(job, obstacle)
-        if not future.done():
-            self._estimator.put(None)
+        future = self._requests.add(job, obstacle=obstacle)
+        self._estimator.put(None)
         return future
 
     def vehicle_frames(self) -> Mapping[str, NDArray[np.float64]]:
@@ -174,13 +173,11 @@ class Pipeline:
         """Take in no pairs, make no estimates and do no jobs; those under way end, requests fail with the reason, and the models
         leave out the keyframe that they are at. Keyframes and extrinsic stay."""
         self._requests.refuse(reason)
-        self._deferred.refuse(reason)
 
     def resume(self) -> None:
         """Go on after pause(). The data are as old as before the first pair: nobody has seen how the sensors stand meanwhile."""
         self._received = None
         self._requests.accept()
-        self._deferred.accept()
 
     @property
     def paused(self) -> bool:
@@ -199,7 +196,6 @@ class Pipeline:
     def restart(self) -> None:
         """Drop keyframes and extrinsic: the next pair asks for the initial one again."""
         with self._lock:
-            self._segmentation = self.segmentation
             self._requests.close()
             self.recalibrator = None
 
@@ -219,12 +215,19 @@ class Pipeline:
     def read_current(self, reader: Callable[[Extrinsic, int], None], wait: bool = True) -> None:
         """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile. wait:
         until a newer one that is being published is out; else nothing is done then."""
-        self._announcer.read(reader, lambda: self.recalibrator, wait)
+        if not self._publishing.acquire(blocking=wait):
+            return
+        try:
+            recalibrator = self.recalibrator
+            if recalibrator is not None:
+                reader(recalibrator.current, self._stamp or recalibrator.current.estimated_at)
+        finally:
+            self._publishing.release()
 
     def stop(self) -> bool:
         """End all threads, an estimate or job under way included; True if they ended."""
         self._estimator.stop(timeout=0)
-        self._deferred.refuse()
+        self._requests.refuse()
         self._segmenter.stop(timeout=0)
         ended = [self._ingester.stop(timeout=1.0), self._estimator.stop(timeout=1.5), self._segmenter.stop(timeout=1.0)]
         return all(ended)
@@ -237,9 +240,8 @@ class Pipeline:
 
     @property
     def segmentation(self) -> Segmentation:
-        """The models, loaded ones where there are some: loading takes seconds."""
-        last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
-        return last if last.config == self.config.semantics else self._common.models(self.config.semantics)
+        """The models."""
+        return self._common.models(self.config.semantics)
 
     @property
     def taking_in(self) -> bool:
@@ -262,14 +264,14 @@ class Pipeline:
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
     def _ingest(self, intake: Intake) -> None:
-        with self._common.intake.mine(self._ingester.check_cancelled) as waited, self.load.counting(Work.INTAKE) as meter:
+        with self._common.intake.mine(self._ingester.check_cancelled) as waited, self.load.counting(Work.INTAKE) as begin:
             newest = self._ingester.newer(intake) if waited else intake
             if newest is not intake:  # of an older one the scan before, which tells the motion, may be gone
                 with self._lock:
                     self.dropped_pairs += intake.paired
-            self._take_in(newest, meter)
+            self._take_in(newest, begin)
 
-    def _take_in(self, intake: Intake, meter: Meter) -> None:
+    def _take_in(self, intake: Intake, begin: Callable[[Work], None]) -> None:
         if self.paused:
             return
         try:
@@ -283,39 +285,42 @@ class Pipeline:
         frame_ids = self._inputs.frame_ids(*pair)
         names = recalibrator.tracker.initial
         if (names.camera_frame, names.lidar_frame) != frame_ids:
-            self._announcer.other_sensors(names, *frame_ids)
+            what = f"a pair of {frame_ids[1]} and {frame_ids[0]} arrived, but this node estimates {names.lidar_frame} to"
+            message = f"{what} {names.camera_frame}; give every camera-LiDAR pair its own node"
+            self._tell(Problem(message, "other sensors"))
             return
         frame = self._inputs.decode(*pair, recalibrator.camera)
         if (ahead := self._pairing.clocks.ahead) and frame.cloud_stamp is not None:
             frame = replace(frame, cloud_stamp=frame.cloud_stamp - ahead)
         try:
             is_keyframe = recalibrator.ingest(
-                frame, lambda since: self._scan_before(frame, since), lambda: self._allows_keyframe(meter)
+                frame, lambda since: self._scan_before(frame, since), lambda: self._allows_keyframe(begin)
             )
             self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
-            self._announcer.sensors(recalibrator)
+            self._remarks.note_sensors(recalibrator)
         self._learn_sweep(frame.cloud, recalibrator)
         if is_keyframe:
             self.last_keyframe = frame
-            self._announcer.stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
-            self._announcer.note_what_is_missing(recalibrator, frame)
-        meter.switch(Work.INTAKE)
+            self._stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
+            self._remarks.note_what_is_missing(recalibrator, frame)
+        begin(Work.INTAKE)
         if is_keyframe and recalibrator.segments_keyframes and self.load.allows_classes(recalibrator.first_guess.needs_classes):
             self._segmenter.put(None)
         if self._is_due(recalibrator):
             self._estimator.put(None)
         newest = recalibrator.newest()  # one that speaks against the extrinsic becomes a keyframe, too
         is_kept = is_keyframe or (newest is not None and newest.stamp == frame.stamp)
-        self._announcer.tell(FrameIngested(frame, is_kept, *pair))
+        self._tell(FrameIngested(frame, is_kept, *pair))
 
     def _prepare(self, intake: Intake) -> Recalibrator | None:
         """The recalibrator to ingest a pair; None while camera or start are unknown, and for messages that do not belong together
         by what this cloud tells of the sweep."""
         camera = self.camera
         if camera is None:
-            self._announcer.tell(Announcer.NO_CAMERA)
+            message = "images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"
+            self._tell(Problem(message, "camera"))
             return None
         recalibrator = self.recalibrator or self._start(camera, *self._inputs.frame_ids(intake.image, intake.cloud))
         if recalibrator is None:
@@ -331,11 +336,11 @@ class Pipeline:
         with self._lock:
             self._hand_over(self._pairing.use_sweep())
 
-    def _allows_keyframe(self, meter: Meter) -> bool:
+    def _allows_keyframe(self, begin: Callable[[Work], None]) -> bool:
         """What comes from now on is the work of a keyframe, if the budget allows for one."""
         allowed = self.load.allows_keyframe()
         if allowed:
-            meter.switch(Work.KEYFRAMES)
+            begin(Work.KEYFRAMES)
         return allowed
 
     def _scan_before(self, frame: Frame, since: int) -> tuple[int, PointCloud] | None:
@@ -362,42 +367,45 @@ class Pipeline:
         self._publish(recalibrator)
         return recalibrator
 
-    def _estimate_and_defer(self, _: None) -> None:
+    def _do_what_is_due(self, _: None) -> None:
         """An estimate if one is asked for or due, then a job if one waits, so that each has its turn."""
         with self._common.estimates.mine(self._estimator.check_cancelled):
             try:
                 self._estimate()
             finally:
-                if self._deferred.waiting:
-                    self._do_job()
+                self._do_job()
 
     def _do_job(self) -> None:
-        with self.load.counting(Work.CHECKS, charged=False):
-            outcome = self._deferred.run_next(self._estimator.check_cancelled)
-        if outcome is not None:
-            self._announcer.tell(JobDone(outcome))
-        if self._deferred.waiting:
+        job = self._requests.begin(estimate=False)
+        if job is not None and job.work is not None:
+            with suppress(Exception), self.load.counting(Work.CHECKS, charged=False):  # who has asked is told
+                self._requests.run(job, job.work, self._estimator.check_cancelled)
+        if self._requests.waiting:
             self._estimator.put(None)
 
     def _estimate(self) -> None:
-        asked_for = self._requests.begin(self._keyframes_seen())
         recalibrator = self.recalibrator
-        if not asked_for and (recalibrator is None or not self._is_due(recalibrator)):
-            return  # it was when it was put, but an estimate has been made since
-        try:
+        is_due = recalibrator is not None and self._is_due(recalibrator)  # or else an estimate has been made since it was put
+        job = self._requests.begin(True, self._keyframes_seen(), is_due)
+        if job is None:
+            return
+        asked_for = bool(job.asked)
+
+        def work(progress: Callback) -> Extrinsic:
             if recalibrator is None:
                 raise CalibrationError("no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'")
             self.load.start_estimate()
             with self.load.counting(Work.ESTIMATES, charged=not asked_for):
-                extrinsic = recalibrator.estimate(self._report_progress, force_search=asked_for)
-        except BaseException as error:
-            self._requests.fail(error)
-            raise
-        self._follow_clocks(recalibrator)
-        self._requests.answer(extrinsic)  # first: whatever goes wrong in publishing, who asked must not wait for ever
-        self._publish(recalibrator)
-        if self._is_due(recalibrator):
-            self._estimator.put(None)
+                extrinsic = recalibrator.estimate(progress, force_search=asked_for)
+            self._follow_clocks(recalibrator)
+            return extrinsic
+
+        # Who asked is answered first: whatever goes wrong in publishing, they must not wait for ever.
+        self._requests.run(job, work, self._estimator.check_cancelled)
+        if recalibrator is not None:
+            self._publish(recalibrator)
+            if self._is_due(recalibrator):
+                self._estimator.put(None)
 
     def _follow_clocks(self, recalibrator: Recalibrator) -> None:
         """Pair by the time offset that the recalibrator has found."""
@@ -405,10 +413,6 @@ class Pipeline:
             motion = recalibrator.config.motion
             if motion != self._pairing.sweep.config and recalibrator is self.recalibrator:
                 self._hand_over(self._pairing.configure(replace(self.config, motion=motion)))
-
-    def _report_progress(self, stage: str, share: float) -> None:
-        self._estimator.check_cancelled()
-        self._requests.report(stage, share)
 
     def _keyframes_seen(self) -> int:
         return 0 if self.recalibrator is None else self.recalibrator.keyframes_seen
@@ -419,7 +423,7 @@ class Pipeline:
             with self._common.classes.mine(self._segmenter.check_cancelled), self.load.counting(Work.CLASSES):
                 problems = recalibrator.segment_keyframe(lambda: self._segmenter.stopping or self.paused)
             for k, problem in enumerate(problems):
-                self._announcer.tell(Problem(problem, f"model {k}"))
+                self._tell(Problem(problem, f"model {k}"))
             if self._is_due(recalibrator):
                 self._estimator.put(None)
 
@@ -427,4 +431,12 @@ class Pipeline:
         return not self.paused and self.load.allows_estimate(recalibrator.ready())
 
     def _publish(self, recalibrator: Recalibrator, again: bool = False) -> None:
-        self._announcer.publish(recalibrator, lambda: recalibrator is self.recalibrator, again)
+        """The current extrinsic, if it or its status differs from the one published last; none of a replaced recalibrator.
+
+        The monitor's assessment of an extrinsic that is right goes to the diagnostics alone.
+        """
+        with self._publishing:
+            extrinsic = recalibrator.current
+            if recalibrator is self.recalibrator and (again or extrinsic.result is not self._published):
+                self._published = extrinsic.result
+                self._tell(ExtrinsicUpdated(extrinsic, self._stamp or extrinsic.estimated_at))

@@ -7,15 +7,16 @@ from scipy.special import chdtrc
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
-from calib_ros.config import TrackerConfig
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, free_axes, fused
+from calib_ros.registration.covariance import distance, free_axes, fused
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 
 # Part of every estimate's covariance. All estimates share it, so that fusing does not lower it.
 SYSTEMATIC_COVARIANCE = np.diag(SYSTEMATIC_ERROR**2)
 # Of the systematic covariance; an axis that a prior knows better than the systematic error would else count as fixed for ever.
 MIN_RANDOM_SHARE = 1e-6
 MIN_SHARE_NEW = 1e-3  # an estimate over no new keyframe at all still has a finite covariance
-SECONDS_PER_MINUTE = 60.0  # the process noise is given per square root of a minute
+# Per axis and square root of a minute: a mount that warms up in the sun is followed, one that stays is averaged over minutes.
+PROCESS_NOISE_DEG, PROCESS_NOISE_M, SECONDS_PER_MINUTE = 0.1, 0.01, 60.0
 
 
 class PoseFilter:
@@ -34,9 +35,9 @@ class PoseFilter:
         moves = free_axes(self.spread)
         return np.asarray(self.spread * np.outer(moves, moves) + SYSTEMATIC_COVARIANCE * moves)
 
-    def predict(self, seconds: float, config: TrackerConfig) -> None:
+    def predict(self, seconds: float) -> None:
         """Add the process noise of a span of time: the mount may have moved a little."""
-        step = np.concatenate([np.full(3, np.deg2rad(config.process_noise_deg)), np.full(3, config.process_noise_m)])
+        step = np.concatenate([np.full(3, np.deg2rad(PROCESS_NOISE_DEG)), np.full(3, PROCESS_NOISE_M)])
         self.spread = self.spread + np.diag(free_axes(self.spread) * step**2) * max(seconds, 0.0) / SECONDS_PER_MINUTE
 
     def probability(self, T: Transform, covariance: Covariance) -> float:

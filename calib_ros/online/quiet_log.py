@@ -2,24 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 REPEAT_S = 10.0
-
-Write = Callable[[str], object]
-
-
-@dataclass
-class _Told:
-    """at: when the last line of a kind was written, s. left_out: how many have come since; text and write: of the newest."""
-
-    at: float
-    left_out: int = 0
-    text: str = ""
-    write: Write = print
 
 
 class QuietLog:
@@ -30,28 +18,30 @@ class QuietLog:
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._now, self._lock = now, threading.Lock()
-        self._told: dict[str, _Told] = {}
+        # Of each kind when its last line was written, how many have come since, and what writes the newest of these.
+        self._told: dict[str, tuple[float, int, Callable[[str], object]]] = {}
 
-    def add(self, kind: str, text: str, write: Write) -> None:
+    def add(self, kind: str, text: str, write: Callable[[str], object]) -> None:
         """A line. kind: what counts as the same, whatever the text. write: takes the text when its time has come."""
         with self._lock:
-            now, last = self._now(), self._told.get(kind)
-            if last is None or now - last.at >= REPEAT_S:
-                self._told[kind] = _Told(now)
-                write(text + _more(last.left_out if last else 0))
+            now = self._now()
+            at, left_out, _ = self._told.get(kind, (-math.inf, 0, write))
+            if now - at >= REPEAT_S:
+                self._told[kind] = now, 0, write
+                write(text + _more(left_out))
             else:
-                last.left_out, last.text, last.write = last.left_out + 1, text, write
+                self._told[kind] = at, left_out + 1, lambda more: write(text + more)
 
     def catch_up(self) -> None:
         """Write what has been left out long enough; to be called about once a second."""
         with self._lock:
             now = self._now()
-            for kind, last in [item for item in self._told.items() if now - item[1].at >= REPEAT_S]:
-                if last.left_out:
-                    self._told[kind] = _Told(now)
-                    last.write(last.text + _more(last.left_out - 1))
-                else:
+            for kind, (at, left_out, write) in list(self._told.items()):
+                if now - at >= REPEAT_S:
                     del self._told[kind]
+                    if left_out:
+                        self._told[kind] = now, 0, write
+                        write(_more(left_out - 1))
 
 
 def _more(count: int) -> str:

@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +23,18 @@ from calib_ros.online.coach import Advice, Counted, advise
 from calib_ros.online.common import SharedScans
 from calib_ros.online.first_guess import FirstGuess
 from calib_ros.online.glance import Glance
-from calib_ros.online.keyframe_classes import KeyframeSegmenter
 from calib_ros.online.keyframes import Batch, EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, feature_config
-from calib_ros.online.monitor import Assessment, Monitor, Verdict
-from calib_ros.online.pacing import LONGEST_REST_S, REST_SPACING_S, Rest, Schedule
+from calib_ros.online.monitor import Monitor, Verdict
+from calib_ros.online.pacing import LONGEST_REST_S, REST_SPACING_S, Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
-from calib_ros.registration.acceptance.significance import leaves_doubt
+from calib_ros.registration.acceptance.checks import leaves_doubt
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import ALL, CLASSES, Segmentation
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, RefusalCode, Result
@@ -64,12 +65,10 @@ class Recalibrator:
         The extrinsic to go on with, where it is another than the initial one.
     speed_gate : SpeedGate, optional
         One that is fed with odometry from outside.
-    segmentation : Segmentation, optional
-        The models, where they are loaded already.
     scans : SharedScans, optional
         What is found out of the LiDAR's scans, shared with the recalibrators of other cameras beside it.
     models : callable, optional
-        Models of a configuration, shared as well.
+        The models of a configuration, which are loaded already where others use them.
     """
 
     def __init__(
@@ -81,7 +80,6 @@ class Recalibrator:
         lidar_frame: str = "lidar",
         current: Result | None = None,
         speed_gate: SpeedGate | None = None,
-        segmentation: Segmentation | None = None,
         scans: SharedScans | None = None,
         models: Callable[[SemanticsConfig], Segmentation] = models_of,
     ) -> None:
@@ -92,17 +90,18 @@ class Recalibrator:
         self.config = with_clocks(self._configured, current or start)
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
-        self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
+        self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth()
         self._scans, self._models = scans, models
         in_step = scans is not None
         self.glance, self.selector = Glance(in_step), KeyframeSelector(self.config.online, in_step)
-        self.segmentation = segmentation or models(self.config.semantics)
-        self.segmenter = KeyframeSegmenter()
+        self.segmentation = models(self.config.semantics)
+        self._to_segment: tuple[Frame, FrameFeatures] | None = None  # the newest keyframe: models are slower than a drive
+        self.segmented, self._segmented_s = 0, dict[str, float]()  # keyframes, and what the models took for the last one
         self.motion = EgoMotion(
             self.config.motion, self.config.lidar.accumulate_s, estimate_motion if scans is None else scans.motion
         )
         self.speed_gate = speed_gate or SpeedGate(self.config.online)
-        self.schedule, self.rest = Schedule(self.config.online), Rest()
+        self.schedule = Schedule(self.config.online)
         self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
         self._calibrator = self._calibrator_for(self.config)
         self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
@@ -111,7 +110,6 @@ class Recalibrator:
         self._in_doubt = True  # the last estimate was, or there was none
         self._seen_motion = SeenMotion()
         self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
-        self._test_wanted = False  # a look has struck, and the load has not allowed for a test yet
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
         self.refined_camera: RefinedCamera | None = None  # by the newest estimate that tells of it
         self.first_guess = FirstGuess(self.config, self.tracker.initial)
@@ -184,16 +182,13 @@ class Recalibrator:
         with self._lock:
             if self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < self.config.online.min_keyframes:
                 return False
-            waits = self._awaits_motion()
+            # Another estimate tells nothing new while all new keyframes move as those in the last one.
+            waits = self.tracker.awaits_motion and self._keyframes_fit
+            waits = waits and self._seen_motion.covers(list(self.buffer)[-self.keyframes.new :])
             rest_s = self.config.online.rest_period_s if waits else 0.0
             if self.at_rest:
-                rest_s = self.rest.estimates_s(self.config.online.rest_period_s)
+                rest_s = self.schedule.estimates_at_rest_s
             return self.schedule.due(rest_s, self.tracker.lost or (self.tracker.tentative and not waits)) and self._has_enough()
-
-    def _awaits_motion(self) -> bool:
-        """With the lock held: another estimate would tell nothing new, since all new keyframes move as those in the last one."""
-        waits = self.tracker.awaits_motion and self._keyframes_fit
-        return waits and self._seen_motion.covers(list(self.buffer)[-self.keyframes.new :])
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
@@ -217,7 +212,7 @@ class Recalibrator:
         """False if a frame of this `_moment`, ns, need not even be decoded: at rest, between two looks, and without any doubt."""
         if not self.at_rest or self.config.lidar.accumulate_s > 0:
             return True
-        return self._test_wanted or self.monitor.in_doubt or self.sensors.faulty_frames > 0 or self.glance.is_due(stamp, True)
+        return self.glance.struck or self.monitor.in_doubt or self.sensors.faulty_frames > 0 or self.glance.is_due(stamp, True)
 
     def ingest(
         self, frame: Frame, scan_before: ScanBefore = lambda since: None, permit: Callable[[], bool] = lambda: True
@@ -234,9 +229,8 @@ class Recalibrator:
         self.motion.add(frame)
         if self.first_guess.pending:
             self.first_guess.add(frame)
-        self.schedule.add_frame(frame.stamp)
-        self.rest.add_frame(frame.stamp, self.tracker.steady)
-        spacing_s, moment = self.rest.keyframes_s if self.at_rest else 0.0, self._moment(frame)
+        self.schedule.add_frame(frame.stamp, self.tracker.steady)
+        spacing_s, moment = self.schedule.keyframes_at_rest_s if self.at_rest else 0.0, self._moment(frame)
         if problem is not None or not self.speed_gate.allows(frame):
             return False
         is_keyframe = self.selector.select(frame.image, moment, permit, spacing_s)
@@ -267,7 +261,7 @@ class Recalibrator:
                 # Classes may come for one keyframe in many, and a first guess needs several.
                 self.keyframes.add(features, lambda f: self.first_guess.needs_classes and f.view is not None)
                 if self.segments_keyframes:
-                    self.segmenter.put(frame_with_twist, features)
+                    self._to_segment = frame_with_twist, features
         if current or is_keyframe:
             self._monitor_extrinsic(None if is_keyframe else features)
         return is_keyframe
@@ -282,41 +276,53 @@ class Recalibrator:
         if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(moment, self.at_rest)):
             return False
         self.glance.put_off(moment)
-        if self._test_wanted or self.monitor.in_doubt or self.tracker.suspect:
+        if self.glance.struck or self.monitor.in_doubt or self.tracker.suspect:
             return True  # no need to look, nor to get used to what may be a knock
-        self._test_wanted = self.glance.strikes(frame, self.tracker.T, self.config)
-        return self._test_wanted
+        self.glance.struck = self.glance.strikes(frame, self.tracker.T, self.config)
+        return self.glance.struck
 
     def segment_keyframe(self, cancelled: Callable[[], bool] = lambda: False) -> tuple[str, ...]:
         """Add semantics to the newest keyframe, if it has none yet, which takes seconds; returns a line for each model that
         failed. cancelled: see Segmentation."""
-        guessing, tracker = self.first_guess.needs_classes, self.tracker
-        # Where searches begin that come by themselves, and those on request.
-        starts = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
-        around = [] if guessing else [(T, self._search_box()) for T in starts]
-        kinds: tuple[str, ...]
-        if guessing:
-            kinds = CLASSES
-        elif self._in_doubt and self._estimated_at is not None:
-            kinds = ALL
-        else:
-            kinds = self.calibrator.kinds_without_doubt or ALL
-        segmented = self.segmenter.segment(self.calibrator, cancelled, kinds, around)
-        if segmented is None:
+        with self._lock:
+            waiting, self._to_segment = self._to_segment, None
+        if waiting is None:
             return ()
-        plain, features, problems = segmented
-        if features is not None:
-            with self._lock:
-                self.keyframes.replace(plain, features)
-                self.keyframes.new += self.first_guess.needs_classes  # the classes are what the guess waits for
-        return problems
+        (frame, plain), calibrator, tracker, points = waiting, self.calibrator, self.tracker, None
+        kinds: tuple[str, ...] = ALL
+        if self.first_guess.needs_classes:
+            kinds = CLASSES
+        else:
+            # Where searches begin that come by themselves, and those on request: other points need no classes.
+            starts = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
+            points = reduce(np.union1d, [points_in_reach(frame, calibrator.extract, T, self._search_box()) for T in starts])
+            if not (self._in_doubt and self._estimated_at is not None):
+                kinds = calibrator.kinds_without_doubt or ALL
+        semantics = calibrator.segmentation(frame, cancelled, kinds, points)
+        self._segmented_s = dict(semantics.seconds)
+        if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):
+            return semantics.problems
+        features = calibrator.extract(frame, semantics, plain)
+        with self._lock:
+            self.segmented += 1
+            self.keyframes.replace(plain, features)
+            self.keyframes.new += self.first_guess.needs_classes  # the classes are what the guess waits for
+        return semantics.problems
+
+    def describe_semantics(self) -> str:
+        """Progress, failures, and the weights in use, for people."""
+        models = self.segmentation.describe()
+        if not models:
+            return "none: no models are configured"
+        took = [f"{kind} {seconds:.1f} s" for kind, seconds in self._segmented_s.items()]
+        return "; ".join([f"{self.segmented} keyframes", *took, *models])
 
     def _monitor_extrinsic(self, tested: FrameFeatures | None = None) -> None:
         """Test the current extrinsic with the newest keyframe, or with a frame that becomes one if it speaks against it. Where it
         has moved, keyframes from before are dropped."""
         if not self.config.monitor.enabled:
             return
-        self._test_wanted = False
+        self.glance.struck = False
         with self._lock:
             generation, tracker, keyframes = self.keyframes.generation, self.tracker, list(self.buffer)
             if self._restart_monitor or not tracker.monitored or not keyframes:
@@ -342,14 +348,11 @@ class Recalibrator:
                 self.keyframes.keep_newest(assessment.since)
             elif assessment.out_of_sync:
                 self.keyframes.remove(assessment.since, assessment.out_of_sync)
-            self._keyframes_fit = self._keyframes_fit and self._fits(assessment)
+            # A keyframe that contradicts the extrinsic is a reason for another estimate, as is one that would if a shift of its
+            # size counted. What shows too little says nothing.
+            consistent = assessment.verdict is Verdict.CONSISTENT and assessment.p_value >= DOUBTFUL_P
+            self._keyframes_fit = self._keyframes_fit and (consistent or assessment.verdict is Verdict.INCONCLUSIVE)
             tracker.apply(assessment)
-
-    def _fits(self, assessment: Assessment) -> bool:
-        """True if a keyframe gives no reason for another estimate: neither does it contradict the extrinsic, nor would it if a
-        shift of its size counted. What shows too little says nothing."""
-        doubtful = assessment.p_value < DOUBTFUL_P
-        return assessment.verdict is Verdict.INCONCLUSIVE or (assessment.verdict is Verdict.CONSISTENT and not doubtful)
 
     # ---- estimates ----------------------------------------------------------------------------------------------------
 
@@ -363,7 +366,6 @@ class Recalibrator:
         with self._lock:
             batch = self.keyframes.batch(self._informative() or list(self.buffer))
             self.schedule.start_estimate()
-            self.rest.start_estimate()
             fitted, self._keyframes_fit = self._keyframes_fit, self.config.monitor.enabled  # until one from now on does not
         names, force_search = self.tracker.initial, force_search and bool(batch.features)
         try:
@@ -439,7 +441,7 @@ class Recalibrator:
         """Drop all keyframes and the baselines of the sensor check, and go back to the initial extrinsic."""
         with self._lock:
             self._clear_keyframes()
-            self.sensors = SensorHealth(self.config.monitor)
+            self.sensors = SensorHealth()
             self.glance.reset()
             placeholder = self.first_guess.begin_anew()
             if placeholder is None:
@@ -466,7 +468,7 @@ class Recalibrator:
             features_changed = self.first_guess.configure(config, self.tracker.current.accepted > 0) or features_changed
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
             self.motion.config, self.motion.accumulate_s = config.motion, config.lidar.accumulate_s
-            self.monitor.config = self.sensors.config = config.monitor
+            self.monitor.config = config.monitor
             self.tracker.config = config
             self.keyframes.resize(config.online.buffer_size)
             if not config.monitor.enabled:
@@ -479,5 +481,5 @@ class Recalibrator:
         """With the lock held. Features and estimates that are being computed from the old keyframes become void."""
         self.keyframes.clear()
         self._restart_monitor = self._in_doubt = True
-        self.segmenter.clear()
+        self._to_segment = None
         self.selector.reset()

@@ -1,113 +1,168 @@
-"""Requests for an estimate: who shares a run, hears of its progress, and may end it."""
+"""What others ask the thread of estimates for: who shares an estimate or another job, hears of its progress, and may end it."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 from calib_ros.errors import CalibrationError
 from calib_ros.online.worker import Cancelled
 from calib_ros.registration.progress import Callback
-from calib_ros.result import Extrinsic
+
+T = TypeVar("T")
+ESTIMATE = "estimate"  # the kind of job whose work is the recalibrator's
+# Of a kind: a job takes seconds, and somebody who asks in a loop must not keep estimates away for long.
+MAX_WAITING = 8
 
 
-@dataclass(frozen=True, eq=False)
-class _Request:
-    future: Future[Extrinsic]
-    progress: Callback | None
+@dataclass(eq=False)
+class Pending:
+    """Something to be done once for all who ask for it.
+
+    kind: a noun for people, as "check". key: while it waits, all who ask for the same kind and key share it. work: called with a
+    callback of progress, to be called now and then, which raises Cancelled where the job is to end. open_to: once it has begun,
+    those join it who ask with the same; None = nobody.
+    """
+
+    kind: str
+    key: Hashable = None
+    work: Callable[[Callback], Any] | None = None
+    open_to: Hashable = None
+    asked: list[tuple[Future[Any], Callback | None]] = field(default_factory=list)
 
     @property
-    def waits(self) -> bool:
-        return not self.future.cancelled()
+    def ended(self) -> str:
+        """What is said where it is not done any more."""
+        return f"the {self.kind} was ended: the node is stopping"
+
+    def is_wanted(self) -> bool:
+        """True while somebody waits for it."""
+        self.asked = [(future, progress) for future, progress in self.asked if not future.cancelled()]
+        return bool(self.asked)
+
+    def answer(self, outcome: Any = None, error: BaseException | None = None) -> None:
+        """To all who wait for it."""
+        for future, _ in self.asked:
+            if not future.set_running_or_notify_cancel():  # from here on it cannot be cancelled
+                continue
+            if error is None:
+                future.set_result(outcome)
+            else:
+                future.set_exception(error)
 
 
 class Requests:
-    """Requests that wait for a run, and those that the run under way answers. There is one run at a time. Thread-safe.
+    """Jobs that wait, and the one under way. One is done at a time, those of a kind in the order in which they came. Thread-safe.
 
-    A request is a future, whose cancel() ends it at once; a run that was asked for ends when nobody waits for it any more.
+    A request is a future, whose cancel() ends it at once; a job that was asked for ends when nobody waits for it any more.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: list[_Request] = []
-        self._answered: list[_Request] = []  # by the run under way
-        self._asked_for = False  # the run under way was
-        self._keyframes: int | None = None  # that the run under way is over; None = no request may join it
-        self._refusal = ""
+        self._waiting: list[Pending] = []
+        self._running: Pending | None = None
+        self._refusal: str | None = None  # "" = the node is stopping
 
     @property
     def refused(self) -> bool:
         """True between refuse() and accept()."""
-        return bool(self._refusal)
+        return self._refusal is not None
 
-    def add(self, keyframes: int, progress: Callback | None = None) -> tuple[Future[Extrinsic], bool]:
-        """A new request over so many keyframes so far, and whether it needs a run of its own, because it joins none.
+    @property
+    def waiting(self) -> bool:
+        """True while there is a job that has not begun."""
+        return bool(self._waiting)
 
-        progress: called on the thread of the run with its stage and share done, from when the request joins it; must not raise.
+    def add(self, job: Pending, joins: Hashable = None, progress: Callback | None = None, obstacle: str = "") -> Future[Any]:
+        """A new request; it fails at once with a CalibrationError for an obstacle, if requests are refused, or too many wait.
+
+        joins: see Pending.open_to. progress: called on the thread of the job with its stage and share done, from when the request
+        joins it; must not raise.
         """
-        request = _Request(Future(), progress)
+        future: Future[Any] = Future()
         with self._lock:
-            if self._refusal:
-                request.future.set_exception(CalibrationError(self._refusal))
-                return request.future, False
-            joins = self._keyframes == keyframes
-            (self._answered if joins else self._waiting).append(request)
-        return request.future, not joins
+            alike, running = [own for own in self._waiting if own.kind == job.kind], self._running
+            shared = next((own for own in alike if own.key == job.key), None)
+            if running is not None and running.kind == job.kind and joins is not None and running.open_to == joins:
+                shared = running
+            problem = obstacle if self._refusal is None else self._refusal or job.ended
+            if not problem and shared is None and len(alike) >= MAX_WAITING:
+                problem = f"{MAX_WAITING} {job.kind}s wait already; ask again when one of them is answered"
+            if not problem:
+                self._waiting += [] if shared else [job]
+                (shared or job).asked.append((future, progress))
+                return future
+        future.set_exception(CalibrationError(problem))
+        return future
 
-    def begin(self, keyframes: int) -> bool:
-        """A run begins, over so many keyframes so far; True if it was asked for, and answers the requests that wait."""
+    def begin(self, estimate: bool, open_to: Hashable = None, is_due: bool = False) -> Pending | None:
+        """The job that has waited longest, an estimate or another one, is under way from now on; None if there is none.
+
+        is_due: an estimate begins though nobody has asked for one. It is open to nobody: it does not search the whole box.
+        """
         with self._lock:
-            self._answered, self._waiting = [request for request in self._waiting if request.waits], []
-            self._asked_for = bool(self._answered)
-            self._keyframes = keyframes if self._asked_for else None
-            return self._asked_for
+            self._waiting = [job for job in self._waiting if job.is_wanted()]
+            job = next((own for own in self._waiting if (own.kind == ESTIMATE) == estimate), None)
+            if job is not None:
+                self._waiting.remove(job)
+                job.open_to = open_to
+            elif is_due and not self.refused:
+                job = Pending(ESTIMATE)
+            self._running = job
+            return job
 
     def close(self) -> None:
-        """No request joins the run under way from now on: it would give another result than a run of its own."""
+        """No request joins the job under way from now on: it would give another result than a run of its own."""
         with self._lock:
-            self._keyframes = None
+            if self._running is not None:
+                self._running.open_to = None
 
-    def report(self, stage: str, share: float) -> None:
-        """Progress of the run under way. Raises Cancelled if nobody waits for it any more, or requests are refused."""
+    def run(self, job: Pending, work: Callable[[Callback], T], check_cancelled: Callable[[], None]) -> T:
+        """Do the job that has begun, on this thread, and answer all who wait for it; what `work` raises they hear as well.
+
+        check_cancelled: raises Cancelled where the thread is to end.
+        """
+        asked_for = bool(job.asked)
+
+        def progress(stage: str, share: float) -> None:
+            check_cancelled()
+            with self._lock:
+                if job is not self._running or (asked_for and not job.is_wanted()):
+                    job.open_to = None  # under the same lock: who asks from now on gets a run of its own
+                    raise Cancelled
+                listeners = [listener for _, listener in job.asked if listener is not None]
+            for listener in listeners:
+                listener(stage, share)
+
+        try:
+            check_cancelled()
+            outcome = work(progress)
+        except BaseException as error:
+            self._end(job, error=CalibrationError(job.ended) if isinstance(error, Cancelled) else error)
+            raise
+        self._end(job, outcome)
+        return outcome
+
+    def _end(self, job: Pending, outcome: Any = None, error: BaseException | None = None) -> None:
         with self._lock:
-            self._answered = [request for request in self._answered if request.waits]
-            if self._refusal or (self._asked_for and not self._answered):
-                self._keyframes = None  # under the same lock: who asks from now on gets a run of its own
-                raise Cancelled
-            listeners = [request.progress for request in self._answered if request.progress is not None]
-        for listener in listeners:
-            listener(stage, share)
+            refused, self._running = job is not self._running, None
+        if not refused:  # else: answered already
+            job.answer(outcome, error)
 
-    def answer(self, extrinsic: Extrinsic) -> None:
-        """The run under way is done."""
-        _finish(self._take_answered(), lambda future: future.set_result(extrinsic))
-
-    def fail(self, error: BaseException) -> None:
-        """The run under way ended without a result."""
-        _finish(self._take_answered(), lambda future: future.set_exception(error))
-
-    def refuse(self, reason: str) -> None:
-        """Fail all requests with a CalibrationError, new ones too, and end the run under way, asked for or not."""
+    def refuse(self, reason: str = "") -> None:
+        """Fail all requests with a CalibrationError, new ones too, and end the job under way, asked for or not. reason: "" = the
+        node is stopping."""
         with self._lock:
             self._refusal = reason
-            waiting, self._waiting = self._waiting, []
-        _finish([*self._take_answered(), *waiting], lambda future: future.set_exception(CalibrationError(reason)))
+            ended = [*self._waiting, *filter(None, [self._running])]
+            self._waiting, self._running = [], None
+        for job in ended:
+            job.answer(error=CalibrationError(reason or job.ended))
 
     def accept(self) -> None:
         """Take requests again."""
         with self._lock:
-            self._refusal = ""
-
-    def _take_answered(self) -> list[_Request]:
-        with self._lock:
-            self._keyframes = None
-            taken, self._answered = self._answered, []
-        return taken
-
-
-def _finish(requests: Sequence[_Request], how: Callable[[Future[Extrinsic]], None]) -> None:
-    for request in requests:
-        if request.future.set_running_or_notify_cancel():  # from here on it cannot be cancelled
-            how(request.future)
+            self._refusal = None

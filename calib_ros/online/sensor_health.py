@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import MonitorConfig
 from calib_ros.frame import Frame, PointCloud
 
 SHRINK_FACTOR = 8  # px that make one: noise of a dark image averages out, houses and cars stay
@@ -21,6 +20,7 @@ ACCUSTOMED = 300  # frames of little in a row, half a minute, after which this i
 BLIND_CONTRAST, BLIND_RETURNS = 0.25, 0.2
 MIN_CONTRAST = 1.0  # grey levels between neighbouring squares; streets by day and night have 4 to 20
 COMPARED_POINTS = 500  # points that decide whether two scans are the same
+FROZEN_IMAGES = 5  # identical ones in a row while the scans change: a driver that repeats one now and then is none
 SOME_ROWS = 16  # one row in so many tells most images apart
 
 
@@ -41,13 +41,12 @@ class SensorProblem:
 
 
 class SensorHealth:
-    """Checks every frame, which takes a millisecond. Not thread-safe. config may be replaced at any time.
+    """Checks every frame, which takes a millisecond. Not thread-safe.
 
     faulty_frames: the newest ones, in a row.
     """
 
-    def __init__(self, config: MonitorConfig) -> None:
-        self.config = config
+    def __init__(self) -> None:
         self._contrasts: deque[float] = deque(maxlen=HISTORY)
         self._returns: deque[int] = deque(maxlen=HISTORY)
         self._image: NDArray[np.uint8] | None = None
@@ -92,7 +91,7 @@ class SensorHealth:
             self._repeated_images = 0
         elif not same_cloud:  # a simulation at rest repeats both
             self._repeated_images += 1
-        return 0 < self.config.frozen_images <= self._repeated_images
+        return self._repeated_images >= FROZEN_IMAGES
 
     def _check_lidar(self, cloud: PointCloud) -> SensorProblem | None:
         returns = int(cloud.finite_mask().sum())

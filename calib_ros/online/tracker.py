@@ -149,7 +149,7 @@ class Tracker:
         estimate. on_request: somebody wants it now, so that it may jump. covers_all: it rests on all keyframes that earlier ones
         rest on, and replaces them.
         """
-        self.filter.predict(seconds, self.config.tracker)
+        self.filter.predict(seconds)
         if abs(self._offset.used_s - self.config.motion.time_offset_s) > SAME_S:  # stated anew
             self._start_anew()
             self._offset = OffsetFilter(self.config.motion.time_offset_s)

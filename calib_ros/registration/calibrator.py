@@ -22,9 +22,8 @@ from calib_ros.config.sensors import REFINE
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import RefinedCamera
-from calib_ros.registration.acceptance.checks import Acceptance
+from calib_ros.registration.acceptance.checks import Acceptance, leaves_doubt
 from calib_ros.registration.acceptance.refusal import MAYBE_RAW, joined, semantic_note
-from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.camera_rounds import refined_with_camera
 from calib_ros.registration.classes import ALL, Segmentation, class_models
@@ -198,7 +197,7 @@ class Calibrator:
         try:
             if models is None:
                 raise TooFewFeaturesError(self.segmentation.missing())
-            hypotheses = models.first_guess(views, self.config.guess, self.config.search.seed, method != CENTROIDS)
+            hypotheses = models.first_guess(views, self.config.search.seed, method != CENTROIDS)
         except TooFewFeaturesError as error:
             return insufficient(error, nominal(), len(features), notes)
         result, tried = best_registration(

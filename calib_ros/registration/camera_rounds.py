@@ -14,8 +14,8 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig, RefineConfig
 from calib_ros.intrinsics import CENTRE, FOCAL, IntrinsicEstimate, RefinedCamera, change_between
+from calib_ros.registration.acceptance.checks import check_uncertainty
 from calib_ros.registration.acceptance.refusal import Refusal, joined
-from calib_ros.registration.acceptance.significance import check_uncertainty
 from calib_ros.result import REFUSED, Result
 
 ROUNDS = 3  # after two, changes are those by which pictures differ that are rectified a fraction of a pixel apart

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from calib_ros import extensions
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
-from calib_ros.config import GuessConfig, SemanticsConfig
+from calib_ros.config import SemanticsConfig
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.frame import SemanticClass as C
-
-if TYPE_CHECKING:
-    from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.score.point_score import PointScore
 
 OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
@@ -104,7 +102,7 @@ class ClassModels(Protocol):
     def consistency(self, views: Sequence[Any]) -> PointScore | None:
         """How well labelled points meet pixels of their class; None where the frames show too little in common."""
 
-    def first_guess(self, views: Sequence[Any], config: GuessConfig, seed: int, sweep: bool) -> list[Hypothesis]:
+    def first_guess(self, views: Sequence[Any], seed: int, sweep: bool) -> list[Hypothesis]:
         """Hypotheses of the extrinsic, best first (thesis 3.5); sweep: not by centroids alone. TooFewFeaturesError if too few."""
 
 

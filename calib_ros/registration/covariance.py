@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import PoseConstraints
 
-# rad and m; what the placing of edges within a pixel and an azimuth step leaves on synthetic streets, of any length
-SYSTEMATIC_ERROR = np.array([np.deg2rad(0.01)] * 3 + [0.004] * 3)
 REGIONS = 12  # of equal weight, side by side in the image; the slopes of regions and frames vary independently of each other
 # Noise of a score in units of its curvature, per frame (0.002 to 0.02 of five scanners), that counts as that of so many cells.
 USUAL_NOISE, USUAL_CELLS = 0.005, 6

@@ -12,13 +12,13 @@ from calib_ros.config import Config, MotionConfig
 from calib_ros.errors import CalibrationError
 from calib_ros.intrinsics import IntrinsicEstimate
 from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, Refusal, joined, outliers_note, unobservable_note
-from calib_ros.registration.acceptance.significance import NullDistribution, null_distribution
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate
 from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
 from calib_ros.registration.objective import Objective, penalised
 from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.registration.score.chance import NullDistribution, null_distribution
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SearchBox
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, RefusalCode, Result
 

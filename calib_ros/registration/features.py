@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import extensions, se3
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera, Rectifier, across_meridians
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
@@ -23,12 +24,32 @@ from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.registration.classes import EDGE_SHARE, OF_MASKS, FrameSemantics, class_models, edge_weights
 
-if TYPE_CHECKING:
-    from calib_ros.registration.objective import ObjectiveKind
-
 Map = NDArray[np.float32]
 KEY_STEP = 61  # of points that tell a scan from others, a few thousand
 WIDE_DEG = 125.0  # field from left to right border above which a pinhole cuts images down
+
+
+class ObjectiveKind(Protocol):
+    """Another objective, which joins by the entry point ``calib_ros.objectives``. pinholes_only: it cannot project onto
+    spheres. moves_points: the points that it keeps follow a time offset. uses: kinds of models, in doubt or not."""
+
+    pinholes_only: bool
+    moves_points: bool
+    uses: tuple[str, ...]
+
+    def extract(
+        self,
+        frame: Frame,
+        image: NDArray[np.uint8],
+        features: FrameFeatures,
+        semantics: FrameSemantics | None,
+        extractor: FeatureExtractor,
+    ) -> Any:
+        """What it keeps of a frame, as `FrameFeatures.own`. image: rectified, (h, w[, 3]) of features.camera. features: `own` is
+        what it has kept of the same frame without semantics, if anything."""
+
+    def __call__(self, edges: Any, T_prior: Transform, config: Config) -> Any:
+        """The `Objective` of the frames of `edges`, a FastObjective, around T_prior (4, 4). Raises TooFewFeaturesError."""
 
 
 def other_objective(config: Config) -> ObjectiveKind | None:

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
-from calib_ros.config import GuessConfig
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.result import INITIAL, InitialSource, Result
 
@@ -16,6 +15,8 @@ from calib_ros.result import INITIAL, InitialSource, Result
 SEMANTIC, CENTROIDS, MOTION, AUTO = "semantic", "centroids", "motion", "auto"
 BY_CLASSES = (SEMANTIC, CENTROIDS)
 GUESSES = (*BY_CLASSES, MOTION, AUTO)
+# Where classes look for the camera, which vehicles carry near the LiDAR and level; a wider search finds more optima of chance.
+MAX_TILT_DEG, MAX_DISTANCE_M = 25.0, 2.0  # between the verticals of camera and LiDAR, and between the two
 
 
 def nominal(yaw_deg: float = 0.0) -> Transform:
@@ -41,16 +42,16 @@ def poses(yaw: Matrix, pitch: Matrix, roll: Matrix, centre: Matrix) -> Matrix:
     return T
 
 
-def allowed(transforms: Matrix, config: GuessConfig) -> NDArray[np.bool_]:
-    """Which of the extrinsics (k, 4, 4) are as upright and as near as config says."""
+def allowed(transforms: Matrix) -> NDArray[np.bool_]:
+    """Which of the extrinsics (k, 4, 4) are as upright as MAX_TILT_DEG and as near as MAX_DISTANCE_M."""
     down = -transforms[:, 1, 2]  # of the camera's y axis, along the LiDAR's -z
     distance = np.linalg.norm(transforms[:, :3, 3], axis=1)
-    return np.asarray((down >= np.cos(np.deg2rad(config.tilt_deg))) & (distance <= config.distance_m))
+    return np.asarray((down >= np.cos(np.deg2rad(MAX_TILT_DEG))) & (distance <= MAX_DISTANCE_M))
 
 
-def near_lidar(T: Transform, config: GuessConfig) -> Limits:
+def near_lidar(T: Transform) -> Limits:
     """Limits for an optimisation from T (4, 4) that keep the camera at the LiDAR: free to turn, not to go away."""
-    half = np.array([np.inf] * 3 + [config.distance_m] * 3)
+    half = np.array([np.inf] * 3 + [MAX_DISTANCE_M] * 3)
     return Limits(se3.from_parts(T[:3, :3], np.zeros(3)), half)
 
 

@@ -14,13 +14,13 @@ import numpy as np
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import ESTIMATE
-from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.features import FrameFeatures, at_time_offset, other_objective
 from calib_ros.registration.nuisance.parameters import MIN_FRAMES, Effect
 from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, restamped, stamped_by_azimuth
 from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset, with_known_motion
 from calib_ros.registration.objective import Objective
 from calib_ros.registration.progress import Progress
+from calib_ros.registration.score.chance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult
 from calib_ros.result import Stamping

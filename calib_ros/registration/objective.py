@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,13 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.frame import Frame
 from calib_ros.lidar.deskew import moved
-from calib_ros.registration.classes import FrameSemantics, consistency_score
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective, views_of
+from calib_ros.registration.classes import consistency_score
+from calib_ros.registration.features import FrameFeatures, other_objective, views_of
 from calib_ros.registration.progress import SILENT, Observer, Progress
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import MARGIN, FastScore, PointScore, SmoothScore
+from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.score.point_score import MARGIN, PointScore, SmoothScore
 from calib_ros.registration.search.constraints import (
     REFINEMENT_DEG,
     REFINEMENT_M,
@@ -42,6 +41,8 @@ COARSE_TOLERANCE_DEG = 0.01  # where a level need not be optimised to the very t
 TOLERANCE_DEG = 0.001
 ITERATIONS = 20  # of Levenberg-Marquardt per level, which ends most often after 3 to 7
 BEYOND_BOX = 1.5  # half widths of the search box; beyond, an optimum is none of the box
+# Of the edges, rad and m; what their placing within a pixel and an azimuth step leaves on synthetic streets, of any length.
+SYSTEMATIC_ERROR = np.array([np.deg2rad(0.01)] * 3 + [0.004] * 3)
 
 
 class Objective(Protocol):
@@ -80,29 +81,6 @@ class Objective(Protocol):
 
     def smooth_score(self, T: Transform) -> PointScore:
         """A score with a slope that equals, or approximates, the objective near T: for the covariance."""
-
-
-class ObjectiveKind(Protocol):
-    """Another objective, which joins by the entry point ``calib_ros.objectives``. pinholes_only: it cannot project onto
-    spheres. moves_points: the points that it keeps follow a time offset. uses: kinds of models, in doubt or not."""
-
-    pinholes_only: bool
-    moves_points: bool
-    uses: tuple[str, ...]
-
-    def extract(
-        self,
-        frame: Frame,
-        image: NDArray[np.uint8],
-        features: FrameFeatures,
-        semantics: FrameSemantics | None,
-        extractor: FeatureExtractor,
-    ) -> Any:
-        """What it keeps of a frame, as `FrameFeatures.own`. image: rectified, (h, w[, 3]) of features.camera. features: `own` is
-        what it has kept of the same frame without semantics, if anything."""
-
-    def __call__(self, edges: FastObjective, T_prior: Transform, config: Config) -> Objective:
-        """The objective of the frames of `edges`, around T_prior (4, 4). Raises TooFewFeaturesError."""
 
 
 def penalised(objective: Objective, T: Transform) -> float:
@@ -292,7 +270,9 @@ class ObjectiveMaker:
         seen = self._seen_by_rows(features, T_prior if T_rows is None else T_rows)
         if other is None:
             return FastObjective(seen, T_prior, config, constraints, atlas, self.observer)
-        return other(FastObjective(seen, T_prior, self._of_edges, constraints, atlas, self.observer), T_prior, config)
+        edges = FastObjective(seen, T_prior, self._of_edges, constraints, atlas, self.observer)
+        objective: Objective = other(edges, T_prior, config)
+        return objective
 
     def of_edges(self, features: Sequence[FrameFeatures], T_prior: Transform, anchor: Transform | None = None) -> FastObjective:
         """The edges' own objective around T_prior (4, 4), whatever the configured one. Raises TooFewFeaturesError.

@@ -27,7 +27,6 @@ from calib_ros.datasets.capture import BAG, CONFIG, EVENTS, MASK, RESULT
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.io import ABANDONED_S, flush
 from calib_ros.messages import stamp_ns
-from calib_ros.online.black_box import Occasion
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
 from calib_ros.ros.conversions import Serialized
@@ -38,7 +37,7 @@ BLACK_BOX = re.compile(r"event_\d{8}T\d{6}Z_[a-z]+(_\d+)?")  # the newest has th
 SCRATCH = ".capture."  # hidden folders that are being written
 # Bytes beside images and points: of a keyframe its CameraInfo and headers, of a bag the message types and an index.
 KEYFRAME_BYTES, BAG_BYTES = 2_000, 30_000
-MEGABYTE = 1_000_000
+KEPT, MOST_BYTES = 10, 1_000_000_000  # of the black box, together: a week of alarms, and less than any disk of a vehicle
 
 
 class RawKeyframe(NamedTuple):
@@ -100,23 +99,20 @@ class Capture:
         result = recalibrator.current.result
         return _write(parameters, "capture_{}", frames, result, _files(parameters, result, events))
 
-    def write_occasion(self, occasion: Occasion) -> str:
-        """The same for the black box. The oldest of its captures make room by capture.keep and capture.max_mb; keyframes that do
+    def write_occasion(self, kind: str, result: Result, events: str) -> str:
+        """The same for the black box. The oldest of its captures make room by KEPT and MOST_BYTES; keyframes that do
         not fit, the oldest ones, are left out."""
         parameters, frames = self._parameters(), self._kept()
-        files, most = _files(parameters, occasion.result, occasion.events), parameters["capture.max_mb"] * MEGABYTE
-        rest = most - BAG_BYTES - sum(map(len, files.values()))
+        files = _files(parameters, result, events)
+        rest = MOST_BYTES - BAG_BYTES - sum(map(len, files.values()))
         while frames and sum(map(_size, frames)) > rest:
             del frames[0]
         if not frames:
-            raise BadInputError(
-                f"nothing captured of {occasion.kind}: capture.max_mb = {parameters['capture.max_mb']} is less than a keyframe "
-                "takes, or there is none; raise it"
-            )
-        size = most - rest + sum(map(_size, frames))
+            raise BadInputError(f"nothing captured of {kind}: there is no keyframe, or one takes all that captures may")
+        size = MOST_BYTES - rest + sum(map(_size, frames))
         with suppress(OSError):  # said by who writes there
-            _make_room(Path(parameters["capture_dir"]), parameters["capture.keep"] - 1, most - size)
-        return _write(parameters, f"event_{{}}_{occasion.kind}", frames, occasion.result, files)
+            _make_room(Path(parameters["capture_dir"]), KEPT - 1, MOST_BYTES - size)
+        return _write(parameters, f"event_{{}}_{kind}", frames, result, files)
 
     def _kept(self) -> list[RawKeyframe]:
         with self._lock:

@@ -205,7 +205,7 @@ class Diagnostics:
             "the newest of them": gate.last_rejection or "none",
             "motion from scans": _motion(recalibrator),
             "keyframes left out, motion unknown": str(recalibrator.motion.left_out if recalibrator else 0),
-            "semantics": recalibrator.segmenter.describe(recalibrator.segmentation) if recalibrator else "none yet",
+            "semantics": recalibrator.describe_semantics() if recalibrator else "none yet",
             "worker load": f"{sum(loads):.2f}",
             "estimate load": f"{loads[1]:.2f}",
             **self._budget(),

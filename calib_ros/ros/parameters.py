@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calib_ros import se3
-from calib_ros.config import Config, former_names, load_stages, preset, stages, update
+from calib_ros.config import Config, load_stages, preset, stages, update
 from calib_ros.config.options import checked, option
 from calib_ros.config.removed import REMOVED, notices
 from calib_ros.errors import CalibrationError, ConfigError
@@ -65,7 +65,7 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
     ),
     "motion_source": option(
         "none",
-        "source of the vehicle's velocity for online.max_speed and online.max_turn_deg_s: odom = topic odom (nav_msgs/Odometry), "
+        "source of the vehicle's velocity that online.max_turn_deg_s limits: odom = topic odom (nav_msgs/Odometry), "
         "imu (sensor_msgs/Imu, turn rate only), twist (geometry_msgs/TwistStamped); none = estimated from the scans if possible",
         choices=("none", "odom", "imu", "twist"),
     ),
@@ -134,12 +134,10 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
     "capture.on": option(
         (), "statuses at which a capture is written, as by a black box: " + ", ".join(KINDS) + "; empty = none", choices=KINDS
     ),
-    "capture.keep": option(10, "captures of the black box that are kept; the oldest are deleted", low=1, high=1000),
-    "capture.max_mb": option(1000, "size of these captures together, megabytes; the oldest are deleted", low=1, high=1_000_000),
 }
 # Those that may change while the node runs, as all constants of the stages may.
 LIVE = {"image_is_rectified", "reliability", "state_file", "publish_tf", "tf_parent", "tf_child", "max_data_age_s"}
-LIVE |= {"consumers", "overlay_period_s", "capture_dir", "capture_frames", "capture.on", "capture.keep", "capture.max_mb"}
+LIVE |= {"consumers", "overlay_period_s", "capture_dir", "capture_frames", "capture.on"}
 LIVE |= {"export.on_converged", "export.joint", "vehicle"}
 
 
@@ -208,12 +206,8 @@ def check_files(args: Sequence[str]) -> None:
 
 
 def declare(node: Node) -> Parameters:
-    """Declare everything with descriptors and ranges; a value given under a former name is taken over. What is declared already
-    keeps its value: a managed node may be configured again.
-
-    ConfigError names a value that is out of range, of another type, or given under both names.
-    """
-    _take_over_former_names(node)
+    """Declare everything with descriptors and ranges. What is declared already keeps its value: a managed node may be configured
+    again. ConfigError names a value that is out of range or of another type."""
     for name, f in SETTINGS.items():
         _declare(node, name, f.default, f, read_only=name not in LIVE)
     chosen = preset(node.get_parameter("preset").value).to_dict()
@@ -231,18 +225,12 @@ def declare(node: Node) -> Parameters:
     return parameters
 
 
-def misspelt(given: Mapping[str, Any], declared: Iterable[str], former_is: str = "its value is used") -> list[str]:
+def misspelt(given: Mapping[str, Any], declared: Iterable[str]) -> list[str]:
     """One line for each name given that no parameter has, with the nearest that there is; one for all that have been removed.
-
-    given: name -> value. former_is: what becomes of a value given under a former name.
-    """
-    known, former = sorted(declared), former_names()
-    lines = notices(given)
+    given: name -> value."""
+    known, lines = sorted(declared), notices(given)
     for name in sorted(set(given) - REMOVED.union(known)):
         if name.startswith(OF_EVERY_NODE):
-            continue
-        if name in former:
-            lines.append(f"parameter '{name}' is now called '{former[name]}'; {former_is}")
             continue
         near = difflib.get_close_matches(name, known, 1)
         lines.append(
@@ -268,7 +256,7 @@ def on_change(
     new: dict[str, dict[str, Any]] = {}
     known, settings = stages(), dict(parameters.settings)
     try:
-        unknown = misspelt({p.name: p.value for p in changed}, parameters.to_dict(), "set that")
+        unknown = misspelt({p.name: p.value for p in changed}, parameters.to_dict())
         if unknown:
             raise ConfigError("; ".join(unknown))
         for p in changed:
@@ -284,18 +272,6 @@ def on_change(
     except CalibrationError as error:
         return SetParametersResult(successful=False, reason=str(error)), parameters
     return SetParametersResult(successful=True), Parameters(settings, config)
-
-
-def _take_over_former_names(node: Node) -> None:
-    """Rename the given parameters that use a former name. ConfigError if the current name is given too."""
-    overrides = node._parameter_overrides
-    for former, name in former_names().items():
-        if former not in overrides or node.has_parameter(name):
-            continue
-        if name in overrides:
-            raise ConfigError(f"{former} is the former name of {name}; give only {name}")
-        given = overrides[former]
-        overrides[name] = Parameter(name, given.type_, given.value)
 
 
 def _plain(value: Any) -> Any:

@@ -44,7 +44,7 @@ def calib_node(args: list[str] | None = None) -> int:
 
 def calib_lifecycle_node(args: list[str] | None = None) -> int:
     """Entry point of the managed node."""
-    return _run("calib_lifecycle_node", "calib_ros.ros.lifecycle_node", "CalibLifecycleNode", args)
+    return _run("calib_lifecycle_node", "calib_ros.ros.node", "CalibLifecycleNode", args)
 
 
 def _run(name: str, module: str, node: str, args: list[str] | None) -> int:

@@ -23,7 +23,7 @@ from calib_ros.rig.live import PairState
 from calib_ros.ros.conversions import Serialized
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.parameters import Parameters
-from calib_ros.ros.rig_pairs import Decoded, Listener, SharedTopics
+from calib_ros.ros.shared_topics import Decoded, Listener, SharedTopics
 from calib_ros.ros.subscriptions import livox_forms, serialized
 
 SCANS_KEPT = 8  # messages of a LiDAR, among them the first one of a beat and that before it, while the other one is late

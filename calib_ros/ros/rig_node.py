@@ -6,11 +6,11 @@ Every pair has the interface of a node of its own, named by its LiDAR below the 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from calib_ros_msgs.msg import Rig
 from diagnostic_msgs.msg import DiagnosticArray
@@ -40,6 +40,7 @@ from calib_ros.ros.answers import ROUNDS, after_answers
 from calib_ros.ros.conversions import transform_message
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.executor import Beside
+from calib_ros.ros.pair import PairInterface
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import VALID_PERIODS
 from calib_ros.ros.rig_lidars import LidarsOfRig
@@ -49,31 +50,26 @@ from calib_ros.ros.rig_pairs import (
     OF_RIG,
     USED,
     PairOfRig,
-    SharedTopics,
     camera_pairs,
-    decoded_clouds,
-    decoded_images,
     lidar_pairs,
     node_of_pair,
 )
+from calib_ros.ros.shared_topics import SharedTopics, decoded_clouds, decoded_images
 from calib_ros.ros.tf import LATCHED, StaticTf
 from calib_ros.ros.write_back import WriteBack, check_files
-
-if TYPE_CHECKING:
-    from calib_ros.ros.node import RosInterface
 
 TF_CURE = "take what says otherwise out of the robot's description, or write the rig to its joints with calib-ros rig --out"
 Priors = dict[str, tuple[Transform, Covariance]]
 
 
 class RigInterface:
-    """Topics, services and parameters of a rig on a node, with the members of a `RosInterface`.
+    """Topics, services and parameters of a rig on a node, with the members of a `PairInterface`.
 
-    pairs: their interfaces, on nodes that spin along. state: the newest, None before the first second. make: the
-    interface of a pair. Raises a CalibrationError for a rig file or parameters that cannot work.
+    pairs: their interfaces, on nodes that spin along. state: the newest, None before the first second. Raises a CalibrationError
+    for a rig file or parameters that cannot work.
     """
 
-    def __init__(self, node: Node, declared: Parameters, make: Callable[[Node, PairOfRig], RosInterface]) -> None:
+    def __init__(self, node: Node, declared: Parameters) -> None:
         self._node, self.parameters, self.health = node, declared, Health(node.get_logger())
         self.description = read_rig(declared["rig_file"])
         wanted = camera_pairs(self.description, declared["rig_file"])
@@ -92,7 +88,7 @@ class RigInterface:
         common, self._shared = Common(declared.config.online), SharedTopics(node)
         self.load = LoadBudget(declared.config.online, purse=common.purse)  # of receiving messages
         decoded = {s.name: decoded_images() if s.kind == CAMERA else decoded_clouds() for s in self.description.sensors}
-        self.pairs: dict[Pair, RosInterface] = {}
+        self.pairs: dict[Pair, PairInterface] = {}
         self._views: list[PairOfRig] = []  # of pairs that are estimated only if they share a view
         self._beside = Beside(context=node.context)
         self._beside.spin_from(node)
@@ -105,7 +101,7 @@ class RigInterface:
                 pair.T = None if known is None else known[0]
                 own = node_of_pair(node, declared, self.description, (camera, lidar), known)
                 self._beside.add_node(own)
-                self.pairs[camera, lidar] = made = make(own, pair)
+                self.pairs[camera, lidar] = made = PairInterface(own, pair)
                 pair.on_reset = partial(self._reset_lidars, lidar)
                 if self.description.pairs is None:
                     pair.unseen = lambda why, made=made: self._unseen(made, why)
@@ -141,7 +137,7 @@ class RigInterface:
     # ---- states -------------------------------------------------------------------------------------------------------
 
     def activate(self) -> None:
-        """See `RosInterface`."""
+        """See `PairInterface`."""
         self._active = True
         for pair in self.pairs.values():
             pair.activate()
@@ -156,7 +152,7 @@ class RigInterface:
         self._node.get_logger().info(f"a rig of {len(self.description.sensors)} sensors: {names}")
 
     def deactivate(self) -> None:
-        """See `RosInterface`."""
+        """See `PairInterface`."""
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._timers = []
@@ -169,7 +165,7 @@ class RigInterface:
             self._forget()
 
     def stop(self) -> bool:
-        """See `RosInterface`."""
+        """See `PairInterface`."""
         if self._ended is None:
             with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
                 ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
@@ -178,7 +174,7 @@ class RigInterface:
         return self._ended
 
     def destroy(self) -> bool:
-        """See `RosInterface`."""
+        """See `PairInterface`."""
         if self._timers:
             self.deactivate()
         ended = self.stop()
@@ -216,7 +212,7 @@ class RigInterface:
         T, C = solve([], self._priors_given, reference).between(camera, lidar)
         return T, box_of(C)
 
-    def _unseen(self, pair: RosInterface, why: str) -> None:
+    def _unseen(self, pair: PairInterface, why: str) -> None:
         pair.pipeline.pause(why)
         self._node.get_logger().info(why)
 
@@ -269,7 +265,7 @@ class RigInterface:
                 self._edges_told = edges
             self._diagnostics_pub.publish(self._diagnostics(priors))
 
-    def _state_of(self, camera: str, lidar: str, pair: RosInterface) -> PairState:
+    def _state_of(self, camera: str, lidar: str, pair: PairInterface) -> PairState:
         recalibrator = pair.pipeline.recalibrator
         if recalibrator is None or pair.pipeline.paused:
             return PairState(camera, lidar, unchecked=pair.sensors.silent() if recalibrator is None else "")

@@ -16,9 +16,9 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros.online.deferred import DeferredJob
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.requests import Pending
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.parallel import cpu_time
 from calib_ros_check.alternatives import CheckInputs
@@ -86,7 +86,7 @@ def request_check(pipeline: Pipeline, request: CheckRequest) -> Future[CheckOutc
 
     recalibrator = pipeline.recalibrator
     obstacle = NO_PAIR if recalibrator is None else "" if len(recalibrator.buffer) else NO_KEYFRAME
-    return pipeline.defer(DeferredJob("check", request.key, work), obstacle)
+    return pipeline.defer(Pending("check", request.key, work), obstacle)
 
 
 def check_keyframes(

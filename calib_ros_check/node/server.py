@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from rclpy.node import Node
 
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.extensions import NodeService
-from calib_ros.online.events import JobDone
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.conversions import covariance_for_ros, matrix_from_transform, time_message, transform_message
@@ -30,7 +30,7 @@ LEVELS = {CheckVerdict.PASS: OK, CheckVerdict.INCONCLUSIVE: WARN, CheckVerdict.F
 
 
 class CheckServer(NodeService):
-    """The service, and what /diagnostics says of checks. To be used on the executor's thread, but for `add`."""
+    """The service, and what /diagnostics says of checks. To be used on the executor's thread."""
 
     def __init__(self, node: Node, pipeline: Pipeline, health: Health) -> None:
         self._node, self._pipeline, self._health = node, pipeline, health
@@ -40,11 +40,10 @@ class CheckServer(NodeService):
         # A callback that awaits blocks its group, and further requests are to be refused or to share a check meanwhile.
         self._service = node.create_service(Check, "~/check", self._answer, callback_group=ReentrantCallbackGroup())
 
-    def add(self, event: Any) -> None:
-        """A check is done, if the event says so; on any thread."""
-        if not isinstance(event, JobDone) or not isinstance(event.outcome, CheckOutcome):
+    def _note(self, check: Future[CheckOutcome]) -> None:
+        """A check is done, for all who share it; on any thread."""
+        if check.cancelled() or check.exception() is not None or (outcome := check.result()) is self._last:
             return
-        outcome = event.outcome
         self._last, self._made = outcome, self._made + 1
         of = "current extrinsic" if outcome.of_current else "extrinsic of the request"
         self._node.get_logger().info(f"check of the {of}: {outcome.result.verdict.value}: {outcome.result.reason}")
@@ -93,7 +92,9 @@ class CheckServer(NodeService):
         response.rotation, response.translation = deviation_message(nothing.rotation), deviation_message(nothing.translation)
         response.p_within, response.covariance = nothing.p_within, covariance_for_ros(None)
         try:
-            checked = await done(self._node, request_check(self._pipeline, check_request(request)))
+            asked = request_check(self._pipeline, check_request(request))
+            asked.add_done_callback(self._note)
+            checked = await done(self._node, asked)
             fill_response(response, checked.result())
         except CalibrationError as error:
             response.success, response.message = False, str(error)

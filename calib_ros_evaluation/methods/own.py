@@ -13,7 +13,8 @@ from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.score.point_score import FastScore, LevelScore
+from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.score.point_score import LevelScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.method import Extracting, Outcome
 

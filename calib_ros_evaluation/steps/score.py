@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.registration.score.point_score import FastScore, Score
+from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.score.point_score import Score
 from calib_ros_evaluation.curves import AXES, Curves, curves
 from calib_ros_evaluation.steps.pictures import (
     INFERNO,

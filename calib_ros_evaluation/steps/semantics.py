@@ -183,7 +183,7 @@ def guess_steps(scene: RegisteredFrame) -> Iterator[Step]:
     if view is None or scene.semantics is None or scene.semantics.labels is None:
         return
     try:
-        guesses = first_guess([view], scene.config.guess, scene.config.search.seed)
+        guesses = first_guess([view], scene.config.search.seed)
     except TooFewFeaturesError as error:
         yield step("First guess", f"Figure 3.21 is missing, for nothing can be guessed from this frame: {error}.")
         return

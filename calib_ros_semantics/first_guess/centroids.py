@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import GuessConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import MAIN_CLASSES
 from calib_ros.frame import SemanticClass as C
 from calib_ros.lidar.segmentation import cluster
-from calib_ros.registration.initial_guess import allowed, near_lidar, poses
+from calib_ros.registration.initial_guess import MAX_DISTANCE_M, MAX_TILT_DEG, allowed, near_lidar, poses
 from calib_ros.registration.search.constraints import Prior
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 from calib_ros_semantics.first_guess.score import distinct
@@ -263,7 +262,7 @@ class Consensus:
         return total, rates
 
 
-def find_pairs(views: Sequence[ClassView], config: GuessConfig) -> Consensus:
+def find_pairs(views: Sequence[ClassView]) -> Consensus:
     """Objects of image and cloud of a frame, class and size that some allowed extrinsic brings together."""
     a, b = image_objects(views), cloud_objects(views)
     i, j = np.nonzero((a.frame[:, None] == b.frame) & (a.cls[:, None] == b.cls))
@@ -271,7 +270,7 @@ def find_pairs(views: Sequence[ClassView], config: GuessConfig) -> Consensus:
     distance = np.linalg.norm(point, axis=1)
     rise = np.abs(np.arcsin(point[:, 2] / distance) + np.arcsin(ray[:, 1]))
     core = np.sqrt(RESOLUTION_DEG**2 + (PART[0] * np.minimum(of_image, of_cloud)) ** 2 + (PART[1] * (of_image - of_cloud)) ** 2)
-    keep = rise <= np.deg2rad(config.tilt_deg + 2) + np.arcsin(np.minimum(config.distance_m / distance, 1.0))
+    keep = rise <= np.deg2rad(MAX_TILT_DEG + 2) + np.arcsin(np.minimum(MAX_DISTANCE_M / distance, 1.0))
     keep &= a.width[i] <= SIZE_RATIO * b.width[j] + LINK_DEG[0]
     keep &= (b.width[j] <= SIZE_RATIO * a.width[i] + LINK_DEG[0]) | (a.cls[i] >= LEFT)
     similar = np.zeros((len(views), 3 * len(C)))
@@ -284,7 +283,7 @@ def find_pairs(views: Sequence[ClassView], config: GuessConfig) -> Consensus:
     )  # fmt: skip
 
 
-def agreed_poses(pairs: Consensus, config: GuessConfig, seed: int) -> Matrix:
+def agreed_poses(pairs: Consensus, seed: int) -> Matrix:
     """Allowed extrinsics (k, 4, 4) on which pairs of all frames agree, best first, after those of which the PnP problem is solved
     the rotations that fewer agree on. TooFewFeaturesError where there are none."""
     coarse = replace(pairs, parallax=PARALLAX_LEVELS[0])
@@ -292,7 +291,7 @@ def agreed_poses(pairs: Consensus, config: GuessConfig, seed: int) -> Matrix:
     if met >= MIN_INLIERS:
         rng, most = np.random.default_rng(seed), EVALUATED // len(pairs)
         T = np.concatenate([_upright(pairs), *_rotations(coarse, rng)])
-        T = T[allowed(T, config)]
+        T = T[allowed(T)]
         T = T if len(T) <= most else T[np.sort(rng.choice(len(T), most, replace=False))]
     if met < MIN_INLIERS or not len(T):
         raise TooFewFeaturesError(
@@ -301,8 +300,8 @@ def agreed_poses(pairs: Consensus, config: GuessConfig, seed: int) -> Matrix:
             "give more frames, scenes with more objects, or another first guess (semantic, motion)"
         )
     T = T[distinct(T, coarse.values(T), SAME_DEG[0])]
-    solved = np.array([_solved(pairs, own, config) for own in T[:STARTS]])
-    solved = solved[allowed(solved, config)]
+    solved = np.array([_solved(pairs, own) for own in T[:STARTS]])
+    solved = solved[allowed(solved)]
     if len(solved):
         solved = solved[distinct(solved, pairs.values(solved), SAME_DEG[1])]
     return np.concatenate([solved, T[STARTS : STARTS + FURTHER]])
@@ -343,10 +342,10 @@ def _frames(u: Matrix, v: Matrix) -> Matrix:
     return np.stack([x, np.cross(z, x), z], axis=2)
 
 
-def _solved(pairs: Consensus, T: Matrix, config: GuessConfig) -> Matrix:
+def _solved(pairs: Consensus, T: Matrix) -> Matrix:
     """The PnP problem of all pairs from T (4, 4), by Levenberg-Marquardt; what does not fit counts little."""
-    limits = near_lidar(T, config)
-    prior = Prior(limits.T, np.array([0.0] * 3 + [(config.distance_m / 2) ** -2] * 3))
+    limits = near_lidar(T)
+    prior = Prior(limits.T, np.array([0.0] * 3 + [(MAX_DISTANCE_M / 2) ** -2] * 3))
     for parallax in PARALLAX_LEVELS:
         T = levenberg_marquardt(replace(pairs, parallax=parallax), T, 12, prior, limits, tolerance_deg=0.02)[0]
     return T

@@ -10,12 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.classes import Hypothesis
-from calib_ros.registration.initial_guess import allowed, poses, rotation_distance_deg
+from calib_ros.registration.initial_guess import MAX_DISTANCE_M, MAX_TILT_DEG, allowed, poses, rotation_distance_deg
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.optimizers import Sobol
+from calib_ros.registration.starts import Sobol
 from calib_ros_semantics.first_guess.centroids import agreed_poses, find_pairs
 from calib_ros_semantics.first_guess.score import (
     AROUND_DEG,
@@ -39,38 +38,35 @@ SAME_DEG = (6.0, 2.0, 1.0)  # hypotheses nearer than this are one: at first, aft
 OTHER_WAY_DEG = 2 * AROUND_DEG  # nearer hypotheses are places of one direction
 
 
-def first_guess(
-    views: Sequence[ClassView], config: GuessConfig | None = None, seed: int = 0, sweep: bool = True
-) -> list[Hypothesis]:
-    """Hypotheses of the extrinsic that all views have in common, best first; at least one. config limits tilt and distance.
-    sweep: try all yaws, whatever the centroids say.
+def first_guess(views: Sequence[ClassView], seed: int = 0, sweep: bool = True) -> list[Hypothesis]:
+    """Hypotheses of the extrinsic that all views have in common, best first; at least one. The LiDAR's z axis points up within
+    MAX_TILT_DEG, its yaw is unknown. sweep: try all yaws, whatever the centroids say.
 
     BadInputError for views of different cameras; TooFewFeaturesError if they show too little in common, or nothing of it meets.
     """
-    config = config or GuessConfig()
     if not views:
         raise TooFewFeaturesError("a first guess needs at least one frame with classes of pixels and points; there is none")
     if any(view.camera != views[0].camera for view in views):
         raise BadInputError("the frames for a first guess are of different cameras; give only frames of one camera")
     views = select_views(views)
     score = label_score(views)
-    pairs = find_pairs(views, config)
-    agreed, swept = np.empty((0, 4, 4)), _sweep(score, config, seed) if sweep else np.empty((0, 4, 4))
+    pairs = find_pairs(views)
+    agreed, swept = np.empty((0, 4, 4)), _sweep(score, seed) if sweep else np.empty((0, 4, 4))
     try:
-        agreed = agreed_poses(pairs, config, seed)
+        agreed = agreed_poses(pairs, seed)
     except TooFewFeaturesError:
         if not sweep:
             raise
     starts = np.concatenate([agreed, swept])
     kinds = np.array([CENTROIDS] * len(agreed) + [SWEEP] * len(swept))
-    T, kinds = _optimised(score, starts, kinds, config, seed)
-    T, values, source = refine_positions(score, T, config, seed) if len(T) else (T, np.zeros(0), np.zeros(0, np.intp))
+    T, kinds = _optimised(score, starts, kinds, seed)
+    T, values, source = refine_positions(score, T, seed) if len(T) else (T, np.zeros(0), np.zeros(0, np.intp))
     values = values + pairs.per_object(T)
     order = np.argsort(-values, kind="stable")
     T, values, kinds = T[order], values[order], kinds[source][order]
     if not len(T):
         raise TooFewFeaturesError(
-            f"no extrinsic within {config.tilt_deg:g} deg of level and {config.distance_m:g} m of the LiDAR brings the classes "
+            f"no extrinsic within {MAX_TILT_DEG:g} deg of level and {MAX_DISTANCE_M:g} m of the LiDAR brings the classes "
             "of points and pixels together; check labels, topics and time stamps, or use more frames"
         )
     return [
@@ -85,19 +81,17 @@ def _margin(T: Matrix, values: Matrix) -> float:
     return float(values[0] - (others[0] if len(others) else 0.0))
 
 
-def _sweep(score: PointScore, config: GuessConfig, seed: int) -> Matrix:
+def _sweep(score: PointScore, seed: int) -> Matrix:
     """The best of many allowed extrinsics, by the coarsest level (k, 4, 4)."""
     unit = Sobol(6, seed=seed).next(SWEEP_POSES)
-    tilt, reach = np.deg2rad(config.tilt_deg), config.distance_m / np.sqrt(3)
+    tilt, reach = np.deg2rad(MAX_TILT_DEG), MAX_DISTANCE_M / np.sqrt(3)
     transforms = poses(np.pi * unit[:, 0], tilt * unit[:, 1], tilt * unit[:, 2], reach * unit[:, 3:])
-    transforms = transforms[allowed(transforms, config)]
+    transforms = transforms[allowed(transforms)]
     values = score.subset(SWEEP_POINTS, np.random.default_rng(seed)).values(transforms, 0)
     return transforms[np.argsort(-values, kind="stable")[: 8 * STARTS]]
 
 
-def _optimised(
-    score: PointScore, starts: Matrix, kinds: NDArray[np.str_], config: GuessConfig, seed: int
-) -> tuple[Matrix, NDArray[np.str_]]:
+def _optimised(score: PointScore, starts: Matrix, kinds: NDArray[np.str_], seed: int) -> tuple[Matrix, NDArray[np.str_]]:
     """The optima that the starts (k, 4, 4) lead to, level by level, best first: extrinsics and kinds (k,)."""
     rng = np.random.default_rng(seed)
     parts = [score.subset(n, rng) for n in (COARSE_POINTS, COARSE_POINTS, FINE_POINTS)]
@@ -105,8 +99,8 @@ def _optimised(
     values = np.zeros(len(starts))
     for level, part in enumerate(parts):
         T, kinds = T[kept], kinds[kept]
-        T = np.array([local_optimum(part.at(level), level, own, config) for own in T]).reshape(-1, 4, 4)
-        inside = allowed(T, config)
+        T = np.array([local_optimum(part.at(level), level, own) for own in T]).reshape(-1, 4, 4)
+        inside = allowed(T)
         T, kinds = T[inside], kinds[inside]
         finer = min(level + 1, score.n_levels - 1)
         values = parts[finer].values(T, finer) if len(T) else np.zeros(0)

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.config import GuessConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import EdgeLevel
-from calib_ros.registration.initial_guess import allowed, near_lidar, rotation_distance_deg
+from calib_ros.registration.initial_guess import MAX_DISTANCE_M, allowed, near_lidar, rotation_distance_deg
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore, ScoredPoints, SmoothScore
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, Prior
-from calib_ros.registration.search.optimizers import Sobol, levenberg_marquardt
+from calib_ros.registration.search.optimizers import levenberg_marquardt
+from calib_ros.registration.starts import Sobol
 from calib_ros_semantics.first_guess.view import MATCHED, ClassView
 
 Matrix = NDArray[np.float64]
@@ -100,9 +100,7 @@ def class_score(views: Sequence[ClassView], classes: Sequence[int]) -> PointScor
     return PointScore(joined, Atlas([_levels(view, classes) for view in views], views[0].camera))
 
 
-def refine_positions(
-    score: PointScore, transforms: Matrix, config: GuessConfig, seed: int
-) -> tuple[Matrix, Matrix, NDArray[np.intp]]:
+def refine_positions(score: PointScore, transforms: Matrix, seed: int) -> tuple[Matrix, Matrix, NDArray[np.intp]]:
     """Hypotheses (k, 4, 4) by the points in view, from those of (j, 4, 4) and places around each: best first, their scores (k,)
     and which of the given ones each is from (k,).
 
@@ -115,15 +113,15 @@ def refine_positions(
     parts = {level: InViewScore(few, level, least) for level in (middle, fine)}
     found, origin = [], []
     for j, T in enumerate(transforms):
-        tried = around(T, config, seed)
+        tried = around(T, seed)
         order = np.argsort(-parts[middle].values(tried), kind="stable")[:PLACES]
         for own in tried[np.union1d(order, [0])]:
             for level, part in parts.items():
-                own = local_optimum(part, level, own, config)
+                own = local_optimum(part, level, own)
             found.append(own)
             origin.append(j)
     ends, source = np.array(found), np.array(origin)
-    inside = allowed(ends, config)
+    inside = allowed(ends)
     ends, source = ends[inside], source[inside]
     values = _ranked_scores(InViewScore(all_points, fine, least), ends) if len(ends) else np.zeros(0)
     kept = distinct(ends, values, SAME_DEG, SAME_M)
@@ -131,10 +129,10 @@ def refine_positions(
     return ends[kept], values[kept], source[kept]
 
 
-def local_optimum(score: SmoothScore, level: int, T: Matrix, config: GuessConfig) -> Matrix:
+def local_optimum(score: SmoothScore, level: int, T: Matrix) -> Matrix:
     """The optimum that T (4, 4) leads to on a level, not far from the LiDAR."""
-    limits: Limits = near_lidar(T, config)
-    prior = Prior(limits.T, np.array([0.0] * 3 + [2 * PRIOR_STRENGTH[level] / (config.distance_m / 2) ** 2] * 3))
+    limits: Limits = near_lidar(T)
+    prior = Prior(limits.T, np.array([0.0] * 3 + [2 * PRIOR_STRENGTH[level] / (MAX_DISTANCE_M / 2) ** 2] * 3))
     return levenberg_marquardt(score, T, 12, prior, limits, tolerance_deg=0.02)[0]
 
 
@@ -193,11 +191,11 @@ def _ranked_scores(view: InViewScore, ends: Matrix) -> Matrix:
     return ranked
 
 
-def around(T: Matrix, config: GuessConfig, seed: int) -> Matrix:
+def around(T: Matrix, seed: int) -> Matrix:
     """T (4, 4), and extrinsics of about the same viewing direction from anywhere near the LiDAR (k, 4, 4)."""
     unit = Sobol(6, seed=seed).next(AROUND)
     out = se3.exp_many(np.pad(np.deg2rad(AROUND_DEG) * unit[:, :3], ((0, 0), (0, 3)))) @ se3.from_parts(T[:3, :3], np.zeros(3))
-    out[:, :3, 3] = -np.einsum("kij,kj->ki", out[:, :3, :3], config.distance_m / np.sqrt(3) * unit[:, 3:])
+    out[:, :3, 3] = -np.einsum("kij,kj->ki", out[:, :3, :3], MAX_DISTANCE_M / np.sqrt(3) * unit[:, 3:])
     out[0] = T
     return out
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -29,6 +29,13 @@ APERTURE, KERNEL_GAIN = 7, 64 * 32  # KERNEL_GAIN makes the slope of a ramp of 1
 STEP_SLOPE = 5 / 16  # slope beside a step from 0 to 1 between two cells, blurred so
 IMAGE_BORDER = 4  # px; the border of the image is none of a class or a mask
 EPSILON = np.float32(1e-6)
+
+
+class PixelClasses(NamedTuple):
+    """classes: (H, W) uint8 SemanticClass, UNLABELLED where unknown. borders: (2, H, W), if requested."""
+
+    classes: Classes
+    borders: Map | None
 
 
 def borders_of_scores(scores: NDArray[Any], meaning: Classes, size: tuple[int, int]) -> Map:

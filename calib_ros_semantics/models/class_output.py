@@ -1,4 +1,4 @@
-"""The output of a segmentation network: which output holds classes, in which layout, and reading it."""
+"""The image that a segmentation network takes, and its output: which one holds classes, in which layout, and reading it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import ModelError
 from calib_ros.frame import SemanticClass
 from calib_ros_semantics.models.labels import Classes, Names, resized, table_of
-from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel
+from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, Tensor
 
 Size = tuple[int, int]
 MAX_STRIDE = 64  # pixels of the input per cell of the output; 32 is the deepest stride in use
@@ -27,7 +27,7 @@ class ClassOutput:
 
     example: inputs by name and their (height, width), to run the network on if its file does not declare sizes of outputs.
     by_count, by_number: see `labels.table_of`. conventions: known outputs, for the error. count: of classes; None = the output
-    holds class numbers. name: of the output; empty until settled. is_pidnet: whether the network has the three of PIDNet.
+    holds class numbers. is_pidnet: whether the network has the three of PIDNet.
     """
 
     def __init__(
@@ -44,65 +44,56 @@ class ClassOutput:
         self._model, self._feeds, self._size = model, *example
         self._by_count, self._by_number, self._conventions = by_count, by_number, conventions
         self.count: int | None = None
-        self.name, self.is_pidnet = "", False
+        self._name, self.is_pidnet = "", False
         shapes = _declared(model, self._feeds)
         if shapes is not None:
             self._choose(shapes)
 
     def settle(self, deadline: Deadline) -> None:
         """Choose the output if that has not been done. Raises ModelError if none holds classes, BudgetError."""
-        if not self.name:
+        if not self._name:
             self._choose([out.shape for out in self._model.run(self._feeds, deadline)])
 
     def _choose(self, shapes: Sequence[tuple[int, ...]]) -> None:
-        model, size = self._model, self._size
+        model, size, names = self._model, self._size, [t.name for t in self._model.outputs]
         layouts = [layout_of(shape, size) for shape in shapes]
         maps = {k: layout for k, layout in enumerate(layouts) if layout is not None}
         is_pidnet = not model.sidecar.output and _is_pidnet(model, maps, size)
         at = 1 if is_pidnet else _best_output(model, maps)
         if at is None:
-            sizes = ", ".join(f"{t.name} {'x'.join(map(str, s))}" for t, s in zip(model.outputs, shapes, strict=True))
-            none = f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes})"
+            sizes = ", ".join(f"{name} {_text(shape)}" for name, shape in zip(names, shapes, strict=True))
+            none = f"none of its outputs is a map of classes for an input of {_text(size)} ({sizes})"
             raise model.error(f"{none}; known are {self._conventions}")
-        self._bounded(at, shapes[at])
+        _check_memory(model, at, shapes[at], size)
         self._table = table_of(model, maps[at].classes, self._by_count, self._by_number)
-        if not self._table.known - {SemanticClass.OTHER}:
+        if not self.known - {SemanticClass.OTHER}:
             raise model.error(
                 "none of its classes is of use here: they are all other things, or unknown; name them by 'labels:' in "
                 f"{model.yaml}, or take a network for streets"
             )
-        self.count, self.name, self.is_pidnet = maps[at].classes, model.outputs[at].name, is_pidnet
-
-    def _bounded(self, at: int, shape: tuple[int, ...]) -> None:
-        """ModelError for an output that takes too much memory, with the size of the input at which it would not."""
-        model, size = self._model, self._size
-        taken = math.prod(shape) * np.dtype(model.outputs[at].dtype).itemsize
-        if taken <= MAX_OUTPUT_BYTES:
-            return
-        shrunk = math.sqrt(MAX_OUTPUT_BYTES / taken)
-        fitting = "x".join(str(int(n * shrunk) // 32 * 32) for n in size)
-        raise model.error(
-            f"its output {model.outputs[at].name}, {'x'.join(map(str, shape))}, takes {taken / 1e9:.1f} GB for an input of "
-            f"{size[0]}x{size[1]}, and at most {MAX_OUTPUT_BYTES / 1e9:g} GB are taken; export it for {fitting} or less, without "
-            "its last upsampling, or with its argmax inside"
-        )
+        self.count, self._name, self.is_pidnet = maps[at].classes, names[at], is_pidnet
 
     @property
     def text(self) -> str:
         """Name and kind, as text."""
-        if not self.name:
+        if not self._name:
             return "output known after its first run"
         if self.count is not None:
-            return f"{self.name}: scores of {self.count} classes"
+            return f"{self._name}: scores of {self.count} classes"
         guess = self._table.guess
-        return f"{self.name}: class numbers" + (f", assumed to be {guess} without labels: in its YAML" if guess else "")
+        return f"{self._name}: class numbers" + (f", assumed to be {guess} without labels: in its YAML" if guess else "")
+
+    @property
+    def known(self) -> frozenset[int]:
+        """The SemanticClasses that the network tells apart, once settled."""
+        return self._table.known
 
     def values(self, feeds: Mapping[str, Array], deadline: Deadline, size: Size) -> Array:
         """Scores (C, h, w), or class numbers (h, w) without a count, for inputs of a size (height, width), once settled."""
-        found = self._model.run(feeds, deadline, [self.name])[0]
+        found = self._model.run(feeds, deadline, [self._name])[0]
         layout = layout_of(found.shape, size)
         if layout is None or layout.classes != self.count:
-            raise self._model.error(f"its output {self.name} has become {'x'.join(map(str, found.shape))}")
+            raise self._model.error(f"its output {self._name} has become {_text(found.shape)}")
         values = found.reshape(layout.shape)
         return values if layout.axis is None else np.moveaxis(values, layout.axis, 0)
 
@@ -115,16 +106,38 @@ class ClassOutput:
                 raise ModelError("it has one channel, but holds no class numbers: a network for a single class cannot be used")
             return resized(self._table.classes(values.astype(np.int64)), size)  # some exports give floats
         except ModelError as error:
-            raise self._model.error(f"output {self.name}: {error}") from None
-
-    @property
-    def known(self) -> frozenset[int]:
-        """The SemanticClasses that the network tells apart, once settled."""
-        return self._table.known
+            raise self._model.error(f"output {self._name}: {error}") from None
 
     def meaning(self) -> Classes:
         """SemanticClass (count,) of each score."""
         return self._table.classes(np.arange(self.count or 0))
+
+
+class InputImage(NamedTuple):
+    """The input of a network that takes an image: its tensor, axis of the channels, and their number."""
+
+    tensor: Tensor
+    axis: int
+    channels: int
+
+    @staticmethod
+    def of(tensors: Sequence[Tensor], counts: Sequence[int]) -> InputImage | None:
+        """The only one of the tensors that takes one image of so many channels, first or last; None if there is no such one."""
+        found = []
+        for tensor in tensors:
+            shape, first = tensor.shape, len(tensor.shape) - 3
+            if not shape:  # unknown rank: the usual layout
+                found.append(InputImage(tensor, 1, counts[0]))
+            elif len(shape) == 3 or (len(shape) == 4 and shape[0] in (None, 1)):
+                axis = next((axis for axis in (first, len(shape) - 1) if shape[axis] in counts), first)
+                if shape[axis] in (*counts, None):
+                    found.append(InputImage(tensor, axis, shape[axis] or counts[0]))
+        return found[0] if len(found) == 1 else None
+
+    def arranged(self, image: NDArray[Any]) -> Array:
+        """An image (h, w, channels) as the network takes it."""
+        batch = image if len(self.tensor.shape) == 3 else image[None]
+        return np.ascontiguousarray(np.moveaxis(batch, -1, self.axis), self.tensor.dtype)
 
 
 class ClassMapLayout(NamedTuple):
@@ -137,11 +150,6 @@ class ClassMapLayout(NamedTuple):
     def classes(self) -> int | None:
         """Number of classes, if known."""
         return None if self.axis is None else self.shape[self.axis]
-
-    @property
-    def columns(self) -> int:
-        """Number of columns."""
-        return [n for k, n in enumerate(self.shape) if k != self.axis][1]
 
 
 def layout_of(shape: Sequence[int], size: Size) -> ClassMapLayout | None:
@@ -182,7 +190,7 @@ def best_classes(scores: NDArray[Any], size: Size) -> NDArray[np.int16]:
 def _is_part(cells: Sequence[int], size: Size) -> bool:
     """Whether rows and columns are those of the input, or of a coarser or finer grid over it."""
     finer = any(n > MAX_UPSAMPLING * own for n, own in zip(cells, size, strict=True))
-    if min(cells) < 1 or finer or max(cells) * MAX_STRIDE < max(size):
+    if min(cells) < 2 or finer or max(cells) * MAX_STRIDE < max(size):
         return False
     return abs(cells[0] - size[0] * cells[1] / size[1]) <= 1 or abs(cells[1] - size[1] * cells[0] / size[0]) <= 1
 
@@ -215,6 +223,23 @@ def _is_pidnet(model: OnnxModel, maps: Mapping[int, ClassMapLayout], size: Size)
     """Whether three outputs are those of PIDNet: two alike, at an eighth of the input unless enlarged, and boundaries."""
     if len(model.outputs) != 3 or not {0, 1} <= set(maps) or maps[0].classes is None or maps[0].shape != maps[1].shape:
         return False
-    in_eighths = abs(size[1] / maps[1].columns - 8) < 1
+    columns = [n for k, n in enumerate(maps[1].shape) if k != maps[1].axis][1]
+    in_eighths = abs(size[1] / columns - 8) < 1
     boundaries = 2 in maps and maps[2].classes is None
     return in_eighths or boundaries or model.sidecar.family.lower() == "pidnet"
+
+
+def _check_memory(model: OnnxModel, at: int, shape: Sequence[int], size: Size) -> None:
+    """ModelError for an output that takes too much memory, with the size of the input at which it would not."""
+    taken = math.prod(shape) * np.dtype(model.outputs[at].dtype).itemsize
+    if taken > MAX_OUTPUT_BYTES:
+        fitting = _text([int(n * math.sqrt(MAX_OUTPUT_BYTES / taken)) // 32 * 32 for n in size])
+        raise model.error(
+            f"its output {model.outputs[at].name}, {_text(shape)}, takes {taken / 1e9:.1f} GB for an input of {_text(size)}, and "
+            f"at most {MAX_OUTPUT_BYTES / 1e9:g} GB are taken; export it for {fitting} or less, without its last upsampling, or "
+            "with its argmax inside"
+        )
+
+
+def _text(shape: Sequence[int]) -> str:
+    return "x".join(map(str, shape))

@@ -1,24 +1,20 @@
-"""Classes of the points of a frame (thesis 3.5), from a network for range images or from ready labels."""
+"""Classes of the points of a frame (thesis 3.5), from a network for range images."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import SOURCE
 from calib_ros.errors import ModelError
 from calib_ros.frame import UNLABELLED, Frame, PointCloud
 from calib_ros.lidar.range_image import reflectivity
 from calib_ros.lidar.rings import azimuth_step, ring_of_points
 from calib_ros_semantics.models import labels
-from calib_ros_semantics.models.class_output import ClassOutput
-from calib_ros_semantics.models.label_files import LabelScans, SourceClasses
+from calib_ros_semantics.models.class_output import ClassOutput, InputImage
 from calib_ros_semantics.models.labels import SQUEEZESEG, Classes
 from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, SegmentationModel, Tensor
 
@@ -62,43 +58,54 @@ FAMILIES: dict[str, tuple[tuple[str, ...], Statistics]] = {
 }
 
 
-def point_model(path: str, config: SemanticsConfig) -> SegmentationModel:
-    """The model that gives SemanticClass of each point (n,) uint8, UNLABELLED where unknown or without a return.
-
-    path: ONNX file of a network for range images, folder of .label files, or "source" for the labels of the dataset. Raises
-    ModelError if unusable.
-    """
-    if path == SOURCE or Path(path).is_dir():
-        return GivenPoints(SourceClasses("points") if path == SOURCE else LabelScans(path))
-    return CloudNetwork(path, config)
-
-
-class GivenPoints(SegmentationModel):
-    """Classes of points that a folder or the source provides."""
-
-    def __init__(self, read: SourceClasses | LabelScans) -> None:
-        self._read = read
-
-    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Classes:
-        deadline.check()
-        return np.where(frame.cloud.finite_mask(), self._read(frame), np.uint8(UNLABELLED))
-
-    def describe(self) -> str:
-        return self._read.text
-
-
 class CloudNetwork(SegmentationModel):
     """An ONNX network for classes of the pixels of a range image. ModelError if it fits no known convention."""
 
-    def __init__(self, path: str, config: SemanticsConfig) -> None:
-        self.model = OnnxModel(path, config)
-        self.fallback = self.model.fallback
-        self._input = CloudInput(self.model)
+    def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
+        self.model, self.fallback, own = model, model.fallback, model.sidecar
+        masks = [t for t in model.inputs if len(model.inputs) == 2 and _is_mask(t)]
+        counts = (len(CHANNELS) - 1, len(CHANNELS)) if isinstance(own.channels, str) else (len(own.channels),)
+        image = InputImage.of([t for t in model.inputs if t not in masks], counts)
+        if image is None or len(model.inputs) != 1 + len(masks):
+            raise model.error(
+                f"a network for classes of points takes one range image as 1xCxHxW or 1xHxWxC of {' or '.join(map(str, counts))} "
+                f"channels ({', '.join(CHANNELS)}; name others as 'channels:' in {model.yaml}), and perhaps its mask; groups of "
+                "neighbours, as 3D-MiniNet takes them beside the image, are not made here: export the part behind them, or take "
+                "another network"
+            )
+        self._input, self._mask = image, masks[0] if masks else None
+        rows, self._columns = model.size_of(image.tensor, image.axis)
+        self._rows, self._fov = rows or ROWS, own.fov_deg or DEFAULT_FOV_DEG
         numbers = labels.NUMBERS_OF_CLOUDS
-        if self._input.family in ("squeezeseg", "squeezesegv2"):  # its four numbers also fit SemanticKITTI
+        if _family(model, None, bool(masks)) in ("squeezeseg", "squeezesegv2"):  # its four numbers also fit SemanticKITTI
             numbers = {"squeezeseg": SQUEEZESEG, **numbers}
-        self._output = ClassOutput(self.model, self._input.example(), labels.OF_CLOUDS, numbers, CONVENTIONS)
-        self._input.settle(self._output.count)
+        size = self._rows, self._columns or WIDTHS[0]
+        empty = self._feeds(np.zeros(size, bool), np.zeros((*size, image.channels), np.float32))
+        self._output = ClassOutput(model, (empty, size), labels.OF_CLOUDS, numbers, CONVENTIONS)
+        self._set_channels()
+
+    def _set_channels(self) -> None:
+        """Of the YAML, else of the family, which the number of classes may tell. ModelError if they do not fit."""
+        model, own = self.model, self.model.sidecar
+        given = () if isinstance(own.channels, str) else own.channels
+        names = tuple(SYNONYMS.get(name.lower(), name.lower()) for name in given)
+        if own.channels in ("rgb", "bgr") or not set(names) <= set(CHANNELS) or len(set(names)) < len(names):
+            raise model.error(f"'channels:' of a range image must be a list of {', '.join(CHANNELS)}, each once")
+        self.family = _family(model, self._output.count, self._mask is not None)
+        order, statistics = FAMILIES[self.family]
+        self._names = names or order[: self._input.channels]
+        for name, values in (("mean", own.mean), ("std", own.std)):
+            if values and len(values) != len(self._names):
+                raise model.error(f"'{name}:' must have {len(self._names)} numbers, one for each channel")
+        mean, std = zip(*(statistics[name] for name in self._names), strict=True)
+        self._mean, self._std = np.array(own.mean or mean, np.float32), np.array(own.std or std, np.float32)
+        self._source = f"of {self.family}, assumed; its YAML may say otherwise"
+        if own.mean and own.std:
+            self._source = "as its YAML says"
+        elif (
+            not own.family and self.family == "bonnetal" and len(model.outputs) > 1
+        ):  # as CENet has them, whose statistics differ
+            self._source = "of bonnetal, assumed; say family: cenet, or mean and std, for others"
 
     def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Classes:
         deadline.check()
@@ -106,8 +113,8 @@ class CloudNetwork(SegmentationModel):
         if int(returns.sum()) < MIN_POINTS:
             raise ModelError(f"the cloud has {int(returns.sum())} usable points; check that the LiDAR is not covered")
         self._output.settle(deadline)
-        self._input.settle(self._output.count)
-        feeds, view, self.note = self._input.feed(frame.cloud.select(returns))
+        self._set_channels()
+        feeds, view, self.note = self.feed(frame.cloud.select(returns))
         size = view.index.shape
         pixels = self._output.classes(self._output.values(feeds, deadline, size), size)
         self.known = self._output.known
@@ -116,57 +123,17 @@ class CloudNetwork(SegmentationModel):
         return found
 
     def describe(self) -> str:
-        return f"{self._input.family}: {self._input.text} -> {self._output.text}, on {self.model.provider}"
-
-
-class CloudInput:
-    """The range image input of a network, in some exports with a mask of its pixels. ModelError if unusable."""
-
-    def __init__(self, model: OnnxModel) -> None:
-        self._model = model
-        masks = [t for t in model.inputs if len(model.inputs) == 2 and _is_mask(t)]
-        images = [t for t in model.inputs if t not in masks and len(t.shape) in (0, 3, 4)]
-        if len(images) != 1 or len(model.inputs) != 1 + len(masks):
-            raise model.error(
-                "a network for classes of points takes one range image as 1x5xHxW or 1xHxWx5, and perhaps its mask; groups of "
-                "neighbours, as 3D-MiniNet takes them beside the image, are not made here: export the part behind them, or take "
-                "another network"
-            )
-        self._image, self._mask = images[0], masks[0] if masks else None
-        if len(self._image.shape) == 4 and self._image.shape[0] not in (None, 1):
-            raise model.error("it takes several scans at once; export it for one")
-        self._axis, count = self._layout(self._image)
-        self._channels = channels_of(model, count, None, bool(masks))
-        rows, self._columns = model.size_of(self._image, self._axis)
-        self._rows = rows or ROWS
-        self._fov = model.sidecar.fov_deg or DEFAULT_FOV_DEG
-
-    @property
-    def family(self) -> str:
-        """Family of networks that decides the channels."""
-        return self._channels.family
-
-    def settle(self, classes: int | None) -> None:
-        """Set order and normalisation of the channels by the family, once the number of classes is known."""
-        self._channels = channels_of(self._model, len(self._channels.names), classes, self._mask is not None)
-
-    @property
-    def text(self) -> str:
-        """Size, channels and field of view, as text."""
         columns = self._columns or " or ".join(map(str, WIDTHS))
-        text = f"{self._rows}x{columns} {' '.join(self._channels.names)}, {self._fov[1]:+g} to {self._fov[0]:+g} deg"
-        mean, std = (", ".join(f"{v:.4g}" for v in values) for values in (self._channels.mean, self._channels.std))
-        return f"{text}, fed as (v - [{mean}]) / [{std}] of m and reflectivity 0..1, empty pixels 0 ({self._channels.source})"
-
-    def example(self) -> tuple[dict[str, Array], tuple[int, int]]:
-        """Inputs of an empty scan, and their height and width, to try a network with."""
-        size = (self._rows, self._columns or WIDTHS[0])
-        nothing = np.empty((0, 3), np.float32)
-        return self._feeds(range_view(nothing, size, self._fov), dict.fromkeys(CHANNELS, nothing[:, 0])), size
+        mean, std = (", ".join(f"{v:.4g}" for v in values) for values in (self._mean, self._std))
+        return (
+            f"{self.family}: {self._rows}x{columns} {' '.join(self._names)}, {self._fov[1]:+g} to {self._fov[0]:+g} deg, fed as "
+            f"(v - [{mean}]) / [{std}] of m and reflectivity 0..1, empty pixels 0 ({self._source}) -> {self._output.text}, on "
+            f"{self.model.provider}"
+        )
 
     def feed(self, cloud: PointCloud) -> tuple[dict[str, Array], RangeView, str]:
         """Inputs by name, their range image, and notes on what does not fit, for a cloud of finite points."""
-        turn = self._model.sidecar.azimuth_deg
+        turn = self.model.sidecar.azimuth_deg
         distance = np.linalg.norm(cloud.xyz, axis=1)
         elevation = np.arctan2(cloud.xyz[:, 2], np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1]))
         density = _columns_per_turn(cloud, elevation)
@@ -177,16 +144,14 @@ class CloudInput:
         nothing, one = np.zeros(len(cloud), np.float32), np.ones(len(cloud), np.float32)
         x, y, z = cloud.xyz.T
         values = dict(zip(CHANNELS, (distance, x, y, z, nothing if light is None else light, one), strict=True))
-        return self._feeds(view, values), view, "; ".join(notes)
+        points, there = np.stack([values[name] for name in self._names], axis=1), view.index >= 0
+        image = np.zeros((*there.shape, len(self._names)), np.float32)
+        image[there] = (points[view.index[there]] - self._mean) / self._std
+        return self._feeds(there, image), view, "; ".join(notes)
 
-    def _feeds(self, view: RangeView, values: Mapping[str, NDArray[np.float32]]) -> dict[str, Array]:
-        """values: (n,) of each channel by its name."""
-        there, channels = view.index >= 0, self._channels
-        image = np.zeros((*there.shape, len(channels.names)), np.float32)
-        points = np.stack([values[name] for name in channels.names], axis=1)
-        image[there] = (points[view.index[there]] - channels.mean) / channels.std
-        batch = image if len(self._image.shape) == 3 else image[None]
-        feeds = {self._image.name: np.moveaxis(batch, -1, self._axis)}
+    def _feeds(self, there: NDArray[np.bool_], image: NDArray[np.float32]) -> dict[str, Array]:
+        """there: (h, w) pixels of the image (h, w, channels) that have a point."""
+        feeds = {self._input.tensor.name: self._input.arranged(image)}
         if self._mask is not None:
             shape = self._mask.shape
             ahead = (1,) * (len(shape) - 2 if shape else 2)
@@ -195,40 +160,22 @@ class CloudInput:
         return feeds
 
     def _notes(self, columns: float, density: float, elevation: NDArray[np.floating], has_light: bool) -> list[str]:
-        notes = []
+        notes, name = [], self.model.path.name
         if not 1 / MAX_STRETCH < columns / density < MAX_STRETCH:
             notes.append(
-                f"{self._model.path.name} takes {columns:.0f} columns per turn, but the scan has {density:.0f}; expect worse "
-                f"classes; export it for {_nearest_width(density)}, or if its columns cover a part of the turn, declare it as "
-                "'azimuth_deg:'"
+                f"{name} takes {columns:.0f} columns per turn, but the scan has {density:.0f}; expect worse classes; export it "
+                f"for {_nearest_width(density)}, or if its columns cover a part of the turn, declare it as 'azimuth_deg:'"
             )
         high, low = np.deg2rad(self._fov)
         outside = float(np.mean((elevation > high) | (elevation < low)))
         if outside > MAX_OUTSIDE:
             notes.append(
                 f"{100 * outside:.0f} % of the points lie outside of the elevations {self._fov[1]:+g} to {self._fov[0]:+g} deg "
-                f"that {self._model.path.name} takes; its YAML may declare another range as 'fov_deg:'"
+                f"that {name} takes; its YAML may declare another range as 'fov_deg:'"
             )
         if not has_light:
-            notes.append(f"the scan has no intensity, which {self._model.path.name} takes; it gets zeros")
+            notes.append(f"the scan has no intensity, which {name} takes; it gets zeros")
         return notes
-
-    def _layout(self, tensor: Tensor) -> tuple[int, int]:
-        """Axis and number of the channels."""
-        shape, given = tensor.shape, self._model.sidecar.channels
-        counts = (len(given),) if given and not isinstance(given, str) else (len(CHANNELS) - 1, len(CHANNELS))
-        if not shape:
-            return 1, counts[0]
-        first = len(shape) - 3
-        for axis in (first, len(shape) - 1):
-            if shape[axis] in counts:
-                return axis, int(shape[axis] or 0)
-        if shape[first] is None:
-            return first, counts[0]
-        raise self._model.error(
-            f"{tensor.name} has no axis of {' or '.join(map(str, counts))} channels ({', '.join(CHANNELS)}); name them as "
-            f"'channels:' in {self._model.yaml}"
-        )
 
 
 def _is_mask(tensor: Tensor) -> bool:
@@ -245,44 +192,6 @@ def _columns_per_turn(cloud: PointCloud, elevation: NDArray[np.floating]) -> flo
     """Measurements of a ring per revolution, estimated from the points."""
     azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
     return 2 * np.pi / azimuth_step(ring_of_points(cloud, azimuth, elevation), azimuth)
-
-
-class Channels(NamedTuple):
-    """Channels of a range image: names in order; mean, std (c,) float32, subtracted and divided by. source: of these, as text."""
-
-    family: str
-    names: tuple[str, ...]
-    mean: NDArray[np.float32]
-    std: NDArray[np.float32]
-    source: str
-
-
-def channels_of(model: OnnxModel, count: int, classes: int | None, has_mask: bool) -> Channels:
-    """Channels of a network with `count` of them: of its YAML, else of its family. ModelError for a YAML that does not fit.
-
-    classes: number of scores, None = unknown. has_mask: the mask is an input of its own.
-    """
-    sidecar = model.sidecar
-    given = () if isinstance(sidecar.channels, str) else sidecar.channels
-    names = tuple(SYNONYMS.get(name.lower(), name.lower()) for name in given)
-    if sidecar.channels in ("rgb", "bgr") or not set(names) <= set(CHANNELS):
-        raise model.error(f"'channels:' of a range image must be a list of {', '.join(CHANNELS)}")
-    if len(set(names)) < len(names):
-        raise model.error("'channels:' of a range image must name each channel once")
-    family = _family(model, classes, has_mask)
-    order, statistics = FAMILIES[family]
-    names = names or order[:count]
-    for name, values in (("mean", sidecar.mean), ("std", sidecar.std)):
-        if values and len(values) != len(names):
-            raise model.error(f"'{name}:' must have {len(names)} numbers, one for each channel")
-    mean, std = (tuple(statistics[name][k] for name in names) for k in (0, 1))
-    source = f"of {family}, assumed; its YAML may say otherwise"
-    if sidecar.mean and sidecar.std:
-        source = "as its YAML says"
-    elif not sidecar.family and family == "bonnetal" and len(model.outputs) > 1:  # as CENet has them, whose statistics differ
-        source = "of bonnetal, assumed; say family: cenet, or mean and std, for others"
-    mean, std = sidecar.mean or mean, sidecar.std or std
-    return Channels(family, names, np.array(mean, np.float32), np.array(std, np.float32), source)
 
 
 def _family(model: OnnxModel, classes: int | None, has_mask: bool) -> str:

@@ -8,11 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
-from calib_ros_semantics.models.masks import NMS_IOU, Mask, found_mask, sample_logits, without_duplicates
+from calib_ros_semantics.models.masks import NMS_IOU, Mask, MaskModel, found_mask, sample_logits, without_duplicates
 from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel
-from calib_ros_semantics.models.sam_models import DEFAULT_SIDE, declared_family, to_rgb
+from calib_ros_semantics.models.segment_anything import DEFAULT_SIDE, declared_family, to_rgb
 
 Floats = NDArray[np.float32]
 BORDER_GREY = 114.0  # grey level around the letterboxed image
@@ -21,10 +20,11 @@ BORDER_GREY = 114.0  # grey level around the letterboxed image
 MIN_CONFIDENCE, MAX_BOX_IOU = 0.4, 0.9
 MAX_DETECTIONS = 300  # whose masks are made
 MAX_NMS_ROWS = 300  # default of exports with NMS inside; without it there are thousands
+NMS_INSIDE = "it was exported with NMS inside; export it with nms=False, and end2end=False where there is such a choice"
 MIN_OTHER_COLUMNS = 5  # beside the coefficients: box and confidence of one class
 
 
-class FastSam:
+class FastSam(MaskModel):
     """FastSAM: detections (1, c, n) and prototypes (1, p, h, w). Raises ModelError for other tensors."""
 
     needed = f"a confidence of {MIN_CONFIDENCE:g}"
@@ -39,18 +39,16 @@ class FastSam:
         if declared and declared not in detections:
             raise model.error(f"'{declared}', which 'output:' of the YAML beside it names, is no output with detections 1xCxN")
         if _says_nms(model.metadata):
-            raise _nms_inside(model)
+            raise model.error(NMS_INSIDE)
         self._outputs = [declared or detections[0], *maps]
         self._normalised = Normalisation.of(model, Normalisation(1 / 255))
         self._size = model.sidecar.size or (shapes[0][2] or DEFAULT_SIDE, shapes[0][3] or DEFAULT_SIDE)
 
     def describe(self) -> str:
-        """Input size and tensors, as text."""
         height, width = self._size
         return f"FastSAM, {width}x{height} RGB, fed as {self._normalised.text}, on {self.model.provider}; {self.model.tensors}"
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> list[Mask]:
-        """Masks of a frame's image. Raises ModelError, BudgetError."""
+    def masks(self, frame: Frame, deadline: Deadline) -> list[Mask]:
         size = frame.image.shape[0], frame.image.shape[1]
         tensor, factor, corner = self._letterboxed(frame.image)
         found, *maps = (array[0] for array in self.model.run({self.model.inputs[0].name: tensor}, deadline, self._outputs))
@@ -82,8 +80,9 @@ class FastSam:
 
     def _prototypes(self, found: Array, maps: Sequence[Array]) -> Floats:
         """Prototypes (p, h, w) among the maps: the last for which the detections have enough coefficients."""
-        if any(_looks_like_nms(found, len(m)) for m in maps):
-            raise _nms_inside(self.model)
+        # Few rows of corners, confidence, class number and coefficients.
+        if found.shape[0] <= MAX_NMS_ROWS and any(found.shape[1] == 6 + len(m) for m in maps):
+            raise self.model.error(NMS_INSIDE)
         fitting = [m for m in maps if len(m) <= min(found.shape) - MIN_OTHER_COLUMNS]  # other exports also give feature maps
         if not fitting:
             raise self.model.error(f"it gave detections {found.shape}, which do not fit prototypes {[m.shape for m in maps]}")
@@ -124,16 +123,3 @@ def _says_nms(metadata: Mapping[str, str]) -> bool:
     """Whether the metadata declares NMS or an end-to-end head: keys nms, end2end, or within args."""
     keys = (metadata.get(key, "").lower() == "true" for key in ("nms", "end2end"))
     return any(keys) or re.search(r"'nms':\s*True", metadata.get("args", "")) is not None
-
-
-def _looks_like_nms(found: Array, prototypes: int) -> bool:
-    """Whether rows (n, c) are corners, confidence, class number and coefficients: few rows, and integer classes."""
-    if found.shape[0] > MAX_NMS_ROWS or found.shape[1] != 6 + prototypes:
-        return False
-    return bool((found[:, 5] == np.rint(found[:, 5])).all())
-
-
-def _nms_inside(model: OnnxModel) -> ModelError:
-    return model.error(
-        "it was exported with NMS inside; export it with nms=False, and end2end=False where there is such a choice"
-    )

@@ -1,28 +1,20 @@
-"""Classes of the pixels of a frame (thesis 3.5), from a segmentation network or from ready labels."""
+"""Classes of the pixels of a frame (thesis 3.5), from a segmentation network."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import SOURCE
 from calib_ros.frame import Frame
 from calib_ros_semantics.models import labels
-from calib_ros_semantics.models.class_borders import Map, borders_of_classes, borders_of_scores
-from calib_ros_semantics.models.class_output import ClassOutput
-from calib_ros_semantics.models.label_files import LabelPictures, SourceClasses
-from calib_ros_semantics.models.labels import Classes
-from calib_ros_semantics.models.network_kinds import NetworkKind, kind_of
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, SegmentationModel
+from calib_ros_semantics.models.class_borders import PixelClasses, borders_of_classes, borders_of_scores
+from calib_ros_semantics.models.class_output import ClassOutput, InputImage
+from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, SegmentationModel, fitted
 from calib_ros_semantics.models.tiles import Tiling
-from calib_ros_semantics.models.weight_sets import file_of
 
 # Exports by the name that a YAML may give as 'family:' (lower case) and as shown.
 FAMILIES = {
@@ -42,58 +34,29 @@ MAX_PIXELS = 2048 * 4096
 EXAMPLE_SIZE = (256, 512)  # px; height and width to try a network of any size at
 
 
-class PixelClasses(NamedTuple):
-    """classes: (H, W) uint8 SemanticClass, UNLABELLED where unknown. borders: (2, H, W), see class_borders, if requested."""
-
-    classes: Classes
-    borders: Map | None
-
-
-def pixel_model(path: str, config: SemanticsConfig) -> SegmentationModel:
-    """The model that gives PixelClasses at the size of the image. ModelError if unusable.
-
-    path: "builtin" for the network of this package, an ONNX file, a folder of label pictures, or "source" for the labels of the
-    dataset.
-    """
-    if path == SOURCE or Path(path).is_dir():
-        return GivenPixels(SourceClasses("pixels") if path == SOURCE else LabelPictures(path))
-    return ImageNetwork(file_of(path), config)
-
-
-class GivenPixels(SegmentationModel):
-    """Classes of pixels that a folder or the source provides."""
-
-    def __init__(self, read: SourceClasses | LabelPictures) -> None:
-        self._read = read
-
-    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> PixelClasses:
-        deadline.check()
-        classes = self._read(frame)
-        return PixelClasses(classes, borders_of_classes(classes) if borders else None)
-
-    def describe(self) -> str:
-        return self._read.text
-
-
 class ImageNetwork(SegmentationModel):
-    """An ONNX network for classes of pixels. ModelError if it fits no known convention."""
+    """An ONNX network for classes of pixels. ModelError if it fits no known convention, or its YAML contradicts it."""
 
-    def __init__(self, path: str | Path, config: SemanticsConfig) -> None:
-        self.model = OnnxModel(path, config)
-        self.fallback = self.model.fallback
-        family = self.model.sidecar.family
+    def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
+        self.model, self.fallback = model, model.fallback
+        family = model.sidecar.family
         if family and family.lower() not in FAMILIES:
-            raise self.model.error(f"family '{family}' is unknown; known are {', '.join(FAMILIES)}")
-        kind, own = kind_of(self.model), self.model.sidecar
-        if kind not in (NetworkKind.CLASSES, NetworkKind.OTHER) and not own.labels and not own.output:
-            raise self.model.error(
-                f"this looks like {kind.value}; semantics.image_classes takes a network for classes of pixels. If it is one, "
-                f"name its classes by 'labels:' in {self.model.path.with_suffix('.yaml')}"
+            raise model.error(f"family '{family}' is unknown; known are {', '.join(FAMILIES)}")
+        found = InputImage.of(model.inputs, (3, 1))
+        if found is None or len(model.inputs) != 1:
+            raise model.error("a network for classes of pixels takes one picture as 1x3xHxW or 1xHxWx3")
+        self._input, self._size = found, model.size_of(found.tensor, found.axis)
+        rows, columns = (n or 1 for n in self._size)
+        if rows * columns > MAX_PIXELS:
+            raise model.error(
+                f"it takes pictures of {rows}x{columns}, which need gigabytes inside the network; at most {MAX_PIXELS / 1e6:.1f} "
+                "million pixels are taken, such as 2048x4096: export it for a smaller size"
             )
-        self._input = ImageInput(self.model)
-        size = self._input.size(*EXAMPLE_SIZE)
-        feeds = self._input.feed(np.zeros((*EXAMPLE_SIZE, 3), np.uint8))
-        self._output = ClassOutput(self.model, (feeds, size), labels.OF_IMAGES, labels.NUMBERS_OF_IMAGES, CONVENTIONS)
+        self._swap, self._as_it_is = model.sidecar.channels != "bgr", np.issubdtype(found.tensor.dtype, np.integer)
+        usual = Normalisation(1.0) if self._as_it_is else IMAGENET if found.channels == 3 else GREY_IMAGENET
+        self._normalised = Normalisation.of(model, usual, found.channels)
+        example = self.feed(np.zeros((*EXAMPLE_SIZE, 3), np.uint8)), self.size(*EXAMPLE_SIZE)
+        self._output = ClassOutput(model, example, labels.OF_IMAGES, labels.NUMBERS_OF_IMAGES, CONVENTIONS)
 
     def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> PixelClasses:
         deadline.check()
@@ -110,47 +73,23 @@ class ImageNetwork(SegmentationModel):
 
     def _values(self, image: NDArray[np.uint8], deadline: Deadline) -> Array:
         """Scores or class numbers of an image, of one run or put together from several."""
-        size = self._input.size(*image.shape[:2])
-        tiling = self._input.tiling(*image.shape[:2])
-        if tiling is None:
-            return self._output.values(self._input.feed(image), deadline, size)
+        shape, (rows, columns) = (image.shape[0], image.shape[1]), self._size
+        size = self.size(*shape)
+        tiling = None if rows is None or columns is None else Tiling.of(shape, (rows, columns), MAX_SIDE)
+        if tiling is None:  # in one run, stretched
+            return self._output.values(self.feed(image), deadline, size)
         picture = fitted(image, tiling.size)
-        parts = [self._output.values(self._input.feed(tile), deadline, size) for tile in tiling.cut(picture)]
+        parts = [self._output.values(self.feed(tile), deadline, size) for tile in tiling.cut(picture)]
         return tiling.numbers(parts) if self._output.count is None else tiling.scores(parts)
 
     def describe(self) -> str:
         family = "PIDNet with auxiliary heads" if self._output.is_pidnet else "segmentation network"
         family = FAMILIES.get(self.model.sidecar.family.lower(), family)
-        return f"{family}: {self._input.text} -> {self._output.text}, on {self.model.provider}"
-
-
-class ImageInput:
-    """The image input of a network: size, channels, normalisation, layout. ModelError if unusable or its YAML contradicts it."""
-
-    def __init__(self, model: OnnxModel) -> None:
-        found = [(t, layout) for t in model.inputs if (layout := _layout(t.shape)) is not None]
-        if len(found) != 1 or len(model.inputs) != 1:
-            raise model.error("a network for classes of pixels takes one picture as 1x3xHxW or 1xHxWx3")
-        self.tensor, (self._axis, self.channels) = found[0]
-        self._size = model.size_of(self.tensor, self._axis)
-        rows, columns = (n or 1 for n in self._size)
-        if rows * columns > MAX_PIXELS:
-            raise model.error(
-                f"it takes pictures of {rows}x{columns}, which need gigabytes inside the network; at most {MAX_PIXELS / 1e6:.1f} "
-                "million pixels are taken, such as 2048x4096: export it for a smaller size"
-            )
-        self._swap = model.sidecar.channels != "bgr"
-        as_it_is = np.issubdtype(self.tensor.dtype, np.integer)
-        usual = Normalisation(1.0) if as_it_is else IMAGENET if self.channels == 3 else GREY_IMAGENET
-        self._normalised = Normalisation.of(model, usual, self.channels)
-
-    @property
-    def text(self) -> str:
-        """As text, such as "1024x512 RGB" (width x height)."""
-        width, height = ("?" if n is None else n for n in self._size[::-1])
-        order = "grey" if self.channels == 1 else "RGB" if self._swap else "BGR"
+        height, width = ("?" if n is None else n for n in self._size)
+        order = "grey" if self._input.channels == 1 else "RGB" if self._swap else "BGR"
         free = f" (at most {MAX_SIDE} wide)" if None in self._size else " (pictures of another shape in tiles)"
-        return f"{width}x{height} {order}{free}, fed as {self._normalised.text}"
+        given = f"{width}x{height} {order}{free}, fed as {self._normalised.text}"
+        return f"{family}: {given} -> {self._output.text}, on {self.model.provider}"
 
     def size(self, height: int, width: int) -> tuple[int, int]:
         """Height and width of the input for an image of this size."""
@@ -163,46 +102,16 @@ class ImageInput:
         rows, columns = (max(round(n * scale / SIZE_MULTIPLE), 1) * SIZE_MULTIPLE for n in (height, width))
         return own_height or rows, own_width or columns
 
-    def tiling(self, height: int, width: int) -> Tiling | None:
-        """How an image of this size goes into an input of fixed size; None = in one run, stretched."""
-        rows, columns = self._size
-        return None if rows is None or columns is None else Tiling.of((height, width), (rows, columns), MAX_SIDE)
-
     def feed(self, image: NDArray[np.uint8]) -> dict[str, Array]:
         """The input by its name for an image (H, W) or (H, W, 3) BGR."""
-        if self.channels == 1 and image.ndim == 3:
+        channels, dtype = self._input.channels, self._input.tensor.dtype
+        if channels == 1 and image.ndim == 3:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-        elif self.channels == 3 and image.ndim == 2:
+        elif channels == 3 and image.ndim == 2:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-        height, width = self.size(*image.shape[:2])
-        picture = fitted(image, (height, width)).reshape(height, width, self.channels)
+        size = self.size(*image.shape[:2])
+        picture = fitted(image, size).reshape(*size, channels)
         values: Array = self._normalised((picture[..., ::-1] if self._swap else picture).astype(np.float32))
-        if np.issubdtype(self.tensor.dtype, np.integer):
-            limits = np.iinfo(self.tensor.dtype)
-            values = np.clip(np.rint(values), limits.min, limits.max)
-        batch = values if len(self.tensor.shape) == 3 else values[None]
-        return {self.tensor.name: np.ascontiguousarray(np.moveaxis(batch, -1, self._axis), self.tensor.dtype)}
-
-
-def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """An image (H, W) or (H, W, 3) at another size (height, width)."""
-    if image.shape[:2] == size:
-        return image
-    # Averaging all pixels when shrinking keeps thin objects.
-    shrinks = size[0] <= image.shape[0] and size[1] <= image.shape[1]
-    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, size[::-1], interpolation=how), np.uint8)
-
-
-def _layout(shape: Sequence[int | None]) -> tuple[int, int] | None:
-    """Axis and number of the channels of an input of this shape; None if it is not an image."""
-    if not shape:
-        return 1, 3  # unknown rank: the usual layout
-    if len(shape) not in (3, 4) or (len(shape) == 4 and shape[0] not in (None, 1)):
-        return None
-    first = len(shape) - 3
-    if shape[first] in (1, 3):
-        return first, int(shape[first] or 3)
-    if shape[-1] in (1, 3):
-        return len(shape) - 1, int(shape[-1] or 3)
-    return (first, 3) if shape[first] is None else None
+        if self._as_it_is:
+            values = np.clip(np.rint(values), np.iinfo(dtype).min, np.iinfo(dtype).max)
+        return {self._input.tensor.name: self._input.arranged(values)}

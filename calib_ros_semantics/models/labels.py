@@ -90,51 +90,46 @@ _NAMES: dict[SemanticClass, str] = {
     C.SKY: "sky",
 }
 _CLASS_OF = {name: cls for cls, names in _NAMES.items() for name in names.split("|")}
+
+
+def _by_count(*lists: Sequence[str]) -> dict[int, Sequence[str]]:
+    return {len(names): names for names in lists}
+
+
 # Names by the number of classes, for networks that do not name them.
-OF_IMAGES: dict[int, Sequence[str]] = {
-    len(CITYSCAPES): CITYSCAPES,
-    len(CITYSCAPES) + 1: [*CITYSCAPES, "background"],
-    len(CITYSCAPES_RAW): CITYSCAPES_RAW,
-    len(CITYSCAPES_RAW) + 1: [*CITYSCAPES_RAW, "license plate"],
-    len(CAMVID): CAMVID,
-    len(CAMVID) - 1: CAMVID[:-1],
-    len(VOC): VOC,
-    len(MAPILLARY): MAPILLARY,
-    len(MAPILLARY) - 1: MAPILLARY[:-1],
-    len(ADE20K): ADE20K,
-}
-OF_CLOUDS: dict[int, Sequence[str]] = {
-    len(SEMANTIC_KITTI): SEMANTIC_KITTI,
-    len(SEMANTIC_KITTI) - 1: SEMANTIC_KITTI[1:],
-    len(SQUEEZESEG): SQUEEZESEG,
-}
+OF_IMAGES = _by_count(
+    CITYSCAPES, [*CITYSCAPES, "background"], CITYSCAPES_RAW, [*CITYSCAPES_RAW, "license plate"], CAMVID, CAMVID[:-1], VOC,
+    MAPILLARY, MAPILLARY[:-1], ADE20K,
+)  # fmt: skip
+OF_CLOUDS = _by_count(SEMANTIC_KITTI, SEMANTIC_KITTI[1:], SQUEEZESEG)
 # Candidates for networks that give class numbers without names; the first that has all numbers met so far is assumed. The 34 raw
 # numbers of Cityscapes are never all below 20: that would be a scene without vegetation, sky, person and car.
 NUMBERS_OF_IMAGES: dict[str, Names] = {"cityscapes": OF_IMAGES[20], "cityscapes_raw": OF_IMAGES[35]}
 NUMBERS_OF_CLOUDS: dict[str, Names] = {"semantic_kitti": SEMANTIC_KITTI, "semantic_kitti_raw": SEMANTIC_KITTI_RAW}
 # Datasets by the name that a YAML beside a model may give.
 DATASETS: dict[str, Names] = {
-    "cityscapes": CITYSCAPES,
-    "cityscapes_raw": CITYSCAPES_RAW,
-    "camvid": CAMVID,
-    "voc": VOC,
-    "mapillary": MAPILLARY,
-    "ade20k": ADE20K,
-    "semantic_kitti": SEMANTIC_KITTI,
-    "semantic_kitti_raw": SEMANTIC_KITTI_RAW,
-    "squeezeseg": SQUEEZESEG,
+    **{"cityscapes": CITYSCAPES, "cityscapes_raw": CITYSCAPES_RAW, "camvid": CAMVID, "voc": VOC, "mapillary": MAPILLARY},
+    **{"ade20k": ADE20K, **NUMBERS_OF_CLOUDS, "squeezeseg": SQUEEZESEG},
 }
 METADATA_KEYS = ("names", "labels", "classes", "class_names", "id2label", "CLASSES")  # under which exporters write class names
 IGNORED = (-1, 255)  # numbers of pixels without a class
 
 
 class LabelTable:
-    """Class numbers -> SemanticClass, by class names. Numbers without a name are UNLABELLED. ModelError for unknown names."""
+    """Class numbers -> SemanticClass, by the class names of a dataset; numbers without a name are UNLABELLED. Of several datasets
+    it is the first that has all numbers met so far, in whatever frame. ModelError for unknown class names."""
 
-    guess = ""  # the assumed dataset, where the meaning of the numbers is not declared
+    def __init__(self, datasets: Mapping[str, Names]) -> None:
+        self._datasets, self._seen = dict(datasets), np.empty(0, np.int64)
+        self._assume(next(iter(datasets)))
 
-    def __init__(self, names: Names) -> None:
-        self._table = lookup(names)
+    def _assume(self, name: str) -> None:
+        self.dataset, self._table = name, lookup(self._datasets[name])
+
+    @property
+    def guess(self) -> str:
+        """The assumed dataset, where the meaning of the numbers is not declared."""
+        return self.dataset if len(self._datasets) > 1 else ""
 
     @property
     def known(self) -> frozenset[int]:
@@ -142,7 +137,9 @@ class LabelTable:
         return frozenset(np.unique(self._table).tolist()) - {UNLABELLED}
 
     def classes(self, numbers: NDArray[Any]) -> Classes:
-        """SemanticClass of integers of any shape; UNLABELLED for -1. ModelError for numbers outside 0..65535."""
+        """SemanticClass of integers of any shape; UNLABELLED for -1. ModelError for numbers that are no classes."""
+        if self.guess:
+            self._choose(numbers)
         low, high = int(numbers.min(initial=0)), int(numbers.max(initial=0))
         if low < -1 or high >= MAX_NUMBERS:
             raise ModelError(f"it holds numbers from {low} to {high}, which are no classes")
@@ -150,32 +147,17 @@ class LabelTable:
         found[numbers < 0] = UNLABELLED
         return found
 
-
-class GuessedTable(LabelTable):
-    """The table of the first of several datasets that has all numbers met so far, in whatever frame."""
-
-    def __init__(self, datasets: Mapping[str, Names]) -> None:
-        self._datasets = dict(datasets)
-        self._seen: NDArray[Any] = np.empty(0, np.int64)
-        self._assume(next(iter(datasets)))
-
-    def classes(self, numbers: NDArray[Any]) -> Classes:
-        """As LabelTable.classes; ModelError if no dataset has all numbers met so far."""
+    def _choose(self, numbers: NDArray[Any]) -> None:
         self._seen = np.union1d(self._seen, np.setdiff1d(numbers, IGNORED))
-        fitting = (name for name, names in self._datasets.items() if np.isin(self._seen, list(_by_number(names))).all())
+        fitting = (name for name, names in self._datasets.items() if np.isin(self._seen, list(_numbered(names))).all())
         name = next(fitting, None)
         if name is None:
             raise ModelError(
                 f"its class numbers, {self._seen.min()} to {self._seen.max()} so far, are those of no known dataset; say in a "
                 "YAML beside it what 'labels:' mean"
             )
-        if name != self.guess:
+        if name != self.dataset:
             self._assume(name)
-        return super().classes(numbers)
-
-    def _assume(self, name: str) -> None:
-        self.guess = name
-        super().__init__(self._datasets[name])
 
 
 def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names], by_number: Mapping[str, Names]) -> LabelTable:
@@ -184,39 +166,45 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
     count: scores per pixel; None = the network gives class numbers. by_count: names for known counts. by_number: candidates for
     class numbers, by dataset.
     """
-    yaml = model.yaml
-    names = declared_names(model.sidecar, yaml)
+    path, names = model.yaml, _declared_names(model.sidecar, model.yaml)
     if names is not None:
         if count is not None and (max(names) >= count if isinstance(names, Mapping) else len(names) != count):
-            raise model.error(f"{yaml.name} names {len(names)} classes by 'labels:', but the network gives scores of {count}")
-        return _table(yaml, names)
+            raise model.error(f"{path.name} names {len(names)} classes by 'labels:', but the network gives scores of {count}")
+        return _declared_table(path, names)
     own = _metadata_names(model.metadata)
-    if own is not None and (count is None or len(own) == count) and _names_street_classes(own):
-        return LabelTable(own)
+    if own is not None and count in (None, len(own)):
+        return LabelTable({"": own})
     if count is None:
-        return GuessedTable(by_number)
+        return LabelTable(by_number)
     if count not in by_count:
         none = f"which are of no known dataset (these have {', '.join(map(str, sorted(by_count)))})"
-        raise model.error(f"it gives scores of {count} classes, {none}; name them by 'labels:' in {yaml}")
-    return LabelTable(by_count[count])
+        raise model.error(
+            f"it gives scores of {count} classes, {none}; name them by 'labels:' in {path}. If it is Segment Anything, it goes "
+            "to semantics.segment_anything; detectors of boxes and classifiers of whole pictures are of no use"
+        )
+    return LabelTable({"": by_count[count]})
 
 
-def table_of_folder(folder: Path, default: Names) -> LabelTable:
-    """The class table of a folder of label files: of its labels.yaml, else the default. ModelError for a wrong labels.yaml."""
+def table_of_folder(folder: Path, usual: Names) -> LabelTable:
+    """The class table of a folder of label files: of its labels.yaml, else the usual one. ModelError for a wrong labels.yaml."""
     beside = folder / "labels.yaml"
-    names = declared_names(Sidecar.beside(beside), beside)
-    return LabelTable(default) if names is None else _table(beside, names)
+    return _declared_table(beside, _declared_names(Sidecar.beside(beside), beside) or usual)
 
 
-def declared_names(sidecar: Sidecar, path: Path) -> Names | None:
+def _declared_names(sidecar: Sidecar, path: Path) -> Names | None:
     """The class names declared in the YAML at this path; None if there are none. ModelError for an unknown dataset."""
-    if not sidecar.labels:
-        return None
     if not isinstance(sidecar.labels, str):
-        return sidecar.labels
-    if sidecar.labels not in DATASETS:
+        return sidecar.labels or None
+    if sidecar.labels and sidecar.labels not in DATASETS:
         raise ModelError(f"{path}: labels = '{sidecar.labels}' is none of {', '.join(DATASETS)}; use one, or a list of names")
-    return DATASETS[sidecar.labels]
+    return DATASETS.get(sidecar.labels)
+
+
+def _declared_table(path: Path, names: Names) -> LabelTable:
+    try:
+        return LabelTable({"": names})
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from None
 
 
 def class_of(name: str) -> int:
@@ -234,12 +222,12 @@ def class_of(name: str) -> int:
 def lookup(names: Names) -> Classes:
     """Table (65536,) uint8 from class number to SemanticClass; UNLABELLED for numbers without a name."""
     table = np.full(MAX_NUMBERS, UNLABELLED, np.uint8)
-    for number, name in _by_number(names).items():
+    for number, name in _numbered(names).items():
         table[number] = class_of(name)
     return table
 
 
-def _by_number(names: Names) -> Mapping[int, str]:
+def _numbered(names: Names) -> Mapping[int, str]:
     return names if isinstance(names, Mapping) else dict(enumerate(names))
 
 
@@ -250,24 +238,19 @@ def resized(classes: Classes, size: tuple[int, int]) -> Classes:
     return np.asarray(cv2.resize(classes, (size[1], size[0]), interpolation=cv2.INTER_NEAREST_EXACT), np.uint8)
 
 
-def _table(path: Path, names: Names) -> LabelTable:
-    try:
-        return LabelTable(names)
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}") from None
-
-
 def _metadata_names(metadata: Mapping[str, str]) -> dict[int, str] | None:
-    """Names by number in the metadata, as a list or mapping in the syntax of Python or JSON; None if there are none."""
+    """Names by number in the metadata, as a list or mapping in the syntax of Python or JSON; None if there are none, or none of a
+    class of streets: a list like c0, c1, ... is no better than none."""
     for key in METADATA_KEYS:
         try:
             found = io.load(metadata.get(key, ""))
-            pairs = found.items() if isinstance(found, dict) else enumerate(found if isinstance(found, list) else ())
+            pairs = _numbered(found).items() if isinstance(found, list | dict) else ()
             names = {int(number): _plain(str(name)) for number, name in pairs}
         except (yaml.YAMLError, ValueError, TypeError, RecursionError):  # anything else is no list of classes
             continue
         if names and min(names) >= 0 and max(names) < MAX_NUMBERS:
-            return names
+            useful = any(class_of(name) not in (UNLABELLED, SemanticClass.OTHER) for name in names.values())
+            return names if useful else None
     return None
 
 
@@ -279,8 +262,3 @@ def _plain(name: str) -> str:
     except ModelError:
         return "object"
     return first
-
-
-def _names_street_classes(names: Mapping[int, str]) -> bool:
-    """Whether any name is of a known class other than OTHER: a list like c0, c1, ... is no better than none."""
-    return any(class_of(name) not in (UNLABELLED, SemanticClass.OTHER) for name in names.values())

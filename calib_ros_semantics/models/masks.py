@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
-from calib_ros.messages.pictures import decode_picture
 from calib_ros_semantics.models.class_borders import clear_border
-from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel
 
 Pixels = NDArray[np.bool_]
 Floats = NDArray[np.float32]
@@ -85,8 +84,7 @@ class Mask:
         return common / (self.area + other.area - common)
 
 
-@dataclass(frozen=True, eq=False)
-class Proposals:
+class Proposals(NamedTuple):
     """Masks proposed by a network. logits: (m, h, w) float32, inside above 0. score: (m,) predicted IoU, 0..1.
 
     size: (H, W) of the image. content: (h, w) of the logits, from the upper left corner, that covers the image. soft: False if
@@ -182,48 +180,15 @@ def without_duplicates(masks: Sequence[Mask], max_iou: float) -> list[Mask]:
     return [ordered[k] for k in kept]
 
 
-class MaskFolder:
-    """Masks made beforehand: `folder/NAME/*.png` of frame NAME, grey at the size of its image, bright inside."""
+class MaskModel(SegmentationModel):
+    """Frame -> semantic edges (2, H, W) as of `mask_edges`, from masks of whatever is in its image."""
 
-    fallback, needed = "", "a file in the folder"
+    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Floats:
+        return mask_edges(self.masks(frame, deadline), (frame.image.shape[0], frame.image.shape[1]))
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
-
-    def describe(self) -> str:
-        """Where the masks are read from, as text."""
-        return f"ready masks {self.folder}/NAME/*.png"
-
-    def __call__(self, frame: Frame, deadline: Deadline) -> list[Mask]:
-        """Masks of a frame in the order of the file names, without specks and dark pictures. Raises ModelError, BudgetError."""
-        if not frame.name:
-            raise ModelError(f"masks {self.folder}: this frame has no name to find its folder by; use a model instead")
-        own = self.folder / frame.name
-        paths = sorted(own.glob("*.png"))
-        if not paths:
-            found_by = "as calib-ros replay prints it (the number of a KITTI frame, 000042)"
-            raise ModelError(f"masks: there is no {own}/*.png; a frame's folder has its name, {found_by}")
-        masks = []
-        for path in paths:
-            deadline.check()
-            masks += _read(path, (frame.image.shape[0], frame.image.shape[1]))
-        return masks
-
-
-def _read(path: Path, size: Size) -> list[Mask]:
-    try:
-        picture = decode_picture(np.fromfile(path, np.uint8))
-    except OSError as error:
-        raise ModelError(f"mask {path} cannot be read: {error.strerror}") from None
-    if picture is None:
-        raise ModelError(f"mask {path} is not a complete PNG; write it again")
-    if picture.ndim == 3:
-        picture = picture[:, :, :3].max(axis=2)
-    if picture.shape != size:
-        sizes = f"{picture.shape[1]}x{picture.shape[0]}, but the image is {size[1]}x{size[0]}"
-        raise ModelError(f"mask {path} is {sizes}; make the masks of the image as recorded")
-    mask = Mask.of(picture > picture.max() // 2)  # masks may be of 0 and 1 or of 0 and 255
-    return [] if mask is None else found_mask(mask.inside, size, (mask.left, mask.top))
+    @abstractmethod
+    def masks(self, frame: Frame, deadline: Deadline) -> list[Mask]:
+        """Masks of a frame's image. Raises ModelError, BudgetError."""
 
 
 def mask_edges(masks: Sequence[Mask], size: Size) -> Floats:

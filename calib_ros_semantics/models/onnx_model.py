@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,11 +24,8 @@ from calib_ros_semantics.models.sidecar import Sidecar
 Array = NDArray[Any]
 GREY_LEVELS = 2.0  # mean or std above this refer to 0..255, not to 0..1
 POLL_S = 0.05  # how often the deadline of a running network is checked
-PROVIDERS = {
-    "cpu": ["CPUExecutionProvider"],
-    "cuda": ["CUDAExecutionProvider", "CPUExecutionProvider"],
-    "tensorrt": ["TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"],
-}
+CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+PROVIDERS = {"cpu": [CPU], "cuda": [CUDA, CPU], "tensorrt": ["TensorrtExecutionProvider", CUDA, CPU]}
 TYPES: dict[str, type[np.generic]] = {
     **{"float": np.float32, "float16": np.float16, "double": np.float64, "bool": np.bool_},
     **{t.__name__: t for t in (np.uint8, np.int8, np.uint16, np.int16, np.int32, np.int64)},
@@ -59,24 +57,12 @@ class OnnxModel:
 
     def __init__(self, path: str | Path, config: SemanticsConfig) -> None:
         self.path, self.sidecar = Path(path), Sidecar.beside(path)
+        self.yaml = self.path.with_suffix(".yaml")  # where its description is, or would be
         self._session, self.fallback = _session(self.path, config)
+        self.provider = provider_name(self._session)
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)  # that the exporter wrote
         self.inputs = [_tensor(self.path, t) for t in self._session.get_inputs()]
         self.outputs = [_tensor(self.path, t) for t in self._session.get_outputs()]
-
-    @property
-    def yaml(self) -> Path:
-        """Where its description is, or would be."""
-        return self.path.with_suffix(".yaml")
-
-    @property
-    def provider(self) -> str:
-        """Execution provider: cpu, cuda or tensorrt."""
-        return str(self._session.get_providers()[0]).removesuffix("ExecutionProvider").lower()
-
-    @property
-    def metadata(self) -> dict[str, str]:
-        """Metadata that the exporter wrote."""
-        return dict(self._session.get_modelmeta().custom_metadata_map)
 
     @property
     def tensors(self) -> str:
@@ -172,6 +158,16 @@ class Normalisation:
         return f"{whole} of grey levels v in 0..255 ({source})"
 
 
+def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """An image (H, W) or (H, W, 3) at another size (height, width)."""
+    if image.shape[:2] == size:
+        return image
+    # Averaging all pixels when shrinking keeps thin objects.
+    shrinks = size[0] <= image.shape[0] and size[1] <= image.shape[1]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=how), np.uint8)
+
+
 class Deadline:
     """A time limit of `seconds` from now, which also ends when `cancelled` returns True (a node that shuts down)."""
 
@@ -211,7 +207,7 @@ class Deadline:
             watcher.join()
 
 
-def error_text(error: BaseException) -> str:
+def error_text(error: BaseException | None) -> str:
     """The message of an onnxruntime exception in one line of at most 300 characters, without its codes; its end matters."""
     text = re.sub(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ", "", " ".join(str(error).split()) or type(error).__name__)
     return text if len(text) <= 300 else f"{text[:98]} ... {text[-197:]}"
@@ -232,33 +228,27 @@ def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
     # Idle threads that spin take the core that the sensor callbacks need; an arena never shrinks.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.enable_cpu_mem_arena = False
-    available = onnxruntime.get_available_providers()
-    if config.provider == "auto":
-        provider = next(p for p in ("tensorrt", "cuda", "cpu") if PROVIDERS[p][0] in available)
+    available, asked = onnxruntime.get_available_providers(), config.provider
+    if asked == "auto":
+        asked = next(p for p in ("tensorrt", "cuda", "cpu") if PROVIDERS[p][0] in available)
+    usable, failed = [p for p in PROVIDERS[asked] if p in available], None
+    for providers in dict.fromkeys((tuple(usable), (CPU,))):
+        try:
+            # The built-in fallback prints to stdout, and loads a broken file twice.
+            session = onnxruntime.InferenceSession(str(path), options, providers=list(providers), enable_fallback=0)
+            break
+        except Exception as error:
+            failed = error
     else:
-        provider = config.provider
-    usable = [p for p in PROVIDERS[provider] if p in available]
-    fallback = ""
-    if PROVIDERS[provider][0] not in usable:
-        fallback = f"onnxruntime has no {provider} here: {path.name} runs on {_provider_name(usable)}"
-    try:
-        # The built-in fallback prints to stdout, and loads a broken file twice.
-        session = onnxruntime.InferenceSession(str(path), options, providers=usable, enable_fallback=0)
-    except Exception as error:
-        if provider != "cpu":
-            try:
-                session = onnxruntime.InferenceSession(str(path), options, providers=PROVIDERS["cpu"])
-                return session, f"{path.name} cannot run on {provider}, but on cpu: {error_text(error)}"
-            except Exception as on_cpu:
-                error = on_cpu
-        raise ModelError(f"model {path} cannot be loaded: {_load_error(error, path, onnxruntime.__version__)}") from None
-    if usable[0] not in session.get_providers():  # onnxruntime continues without a provider whose libraries are missing
-        instead = _provider_name(session.get_providers())
-        fallback = f"{path.name} cannot run on {provider}, but on {instead}; check the driver and its libraries"
-    return session, fallback
+        raise ModelError(f"model {path} cannot be loaded: {_load_error(failed, path, onnxruntime.__version__)}") from None
+    instead = provider_name(session)
+    if PROVIDERS[asked][0] not in available:
+        return session, f"onnxruntime has no {asked} here: {path.name} runs on {instead}"
+    why = "; check the driver and its libraries" if failed is None else f": {error_text(failed)}"
+    return session, f"{path.name} cannot run on {asked}, but on {instead}{why}" * (instead != asked)
 
 
-def _load_error(error: BaseException, path: Path, version: str) -> str:
+def _load_error(error: BaseException | None, path: Path, version: str) -> str:
     """Why a file cannot be loaded, and what to do."""
     text, whole = error_text(error), " ".join(str(error).split()).replace(str(path), "")
     missing = MISSING_DATA.search(whole)
@@ -269,8 +259,9 @@ def _load_error(error: BaseException, path: Path, version: str) -> str:
     return f"{text}; download or export it again"
 
 
-def _provider_name(providers: Sequence[str]) -> str:
-    return providers[0].removesuffix("ExecutionProvider").lower()
+def provider_name(session: Any) -> str:
+    """Execution provider of a session: cpu, cuda or tensorrt."""
+    return str(session.get_providers()[0]).removesuffix("ExecutionProvider").lower()
 
 
 def _tensor(path: Path, node: Any) -> Tensor:

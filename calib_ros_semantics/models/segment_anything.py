@@ -1,33 +1,33 @@
-"""Semantic edges from Segment Anything: the configured model or folder, prompted on a grid over the image."""
+"""Masks by Segment Anything: an encoder from an image to an embedding, a decoder from points to masks, and a grid of points."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import SemanticsConfig
+from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
-from calib_ros_semantics.models.fast_sam import FastSam, is_fast_sam
 from calib_ros_semantics.models.masks import (
     MIN_IOU,
     MIN_STABILITY,
     NMS_IOU,
     Mask,
-    MaskFolder,
+    MaskModel,
     Proposals,
     accepted_masks,
-    mask_edges,
     without_duplicates,
 )
-from calib_ros_semantics.models.network_kinds import NetworkKind, kind_of
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
-from calib_ros_semantics.models.sam_models import Decoder, Encoder, roles_of
+from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, Tensor, fitted
 
 Points = NDArray[np.float64]
-Proposer = Callable[[Points], Proposals]
+DEFAULT_SIDE = 1024  # px; size the models were trained at, and the default of graphs of dynamic size
+CELL_PX = 16  # px of the frame of prompts per cell of the embedding, in all families
+LOGIT_PX = 4  # px of the frame of prompts per logit
+NO_POINT = -1.0  # label of a padding point
 # A prompt is redundant in a mask so small that the grid has hardly another point in it, and among neighbours that are in the same
 # mask and in none within it. On 94 real masks of a street this saves a fifth of the prompts, of finer grids a quarter, on
 # synthetic streets, where less is nested, up to a third, and it loses no mask larger than a cell of the grid. Skipping all
@@ -35,77 +35,222 @@ Proposer = Callable[[Points], Proposals]
 PROMPT_BATCH = 16  # prompts per run, if the export accepts several: more gain hardly any time, and take memory
 SMALL_CELLS = 2.0  # area of a small mask, cells of the grid
 NEIGHBOUR_SPACINGS, SAME_MASK_NEIGHBOURS = 1.1, 2  # reach of neighbours in spacings of the grid; how many of them
+KNOWN = (
+    "known are the exports of SAM, MobileSAM, EdgeSAM and NanoSAM (image_embeddings, point_coords, point_labels and some of "
+    "mask_input, has_mask_input, orig_im_size; masks or low_res_masks, iou_predictions or scores), SAM2 (with high_res_feats_0, "
+    "high_res_feats_1, image_embed), EfficientSAM (batched_point_coords, batched_point_labels, orig_im_size; output_masks), "
+    "Hugging Face (input_points, input_labels; pred_masks, iou_scores) and, alone, FastSAM (output0, output1)"
+)
 
 
-class MaskEdges(SegmentationModel):
-    """Frame -> semantic edges (2, H, W) as of `mask_edges`, from the masks of `segmenter_of`."""
+class Family(NamedTuple):
+    """How a family prepares an image. padded: the aspect ratio is kept and the rest of the input is zero; else the image is
+    stretched. own_pixels: prompts are in pixels of the original image."""
 
-    def __init__(self, config: SemanticsConfig) -> None:
-        self._segmenter = segmenter_of(config)
-        self.fallback, self.needed = self._segmenter.fallback, self._segmenter.needed
-
-    def __call__(self, frame: Frame, deadline: Deadline, borders: bool = True) -> NDArray[np.float32]:
-        return mask_edges(self._segmenter(frame, deadline), (frame.image.shape[0], frame.image.shape[1]))
-
-    def describe(self) -> str:
-        return self._segmenter.describe()
+    normalised: Normalisation
+    padded: bool = True
+    own_pixels: bool = False
 
 
-def segmenter_of(config: SemanticsConfig) -> MaskFolder | FastSam | Prompted:
-    """What gives the masks of everything in a frame's image: an encoder with its decoder, FastSAM, or a folder of masks.
+IMAGENET = Normalisation(1.0, (123.675, 116.28, 103.53), (58.395, 57.12, 57.375))  # of RGB, in nearly all families
+FAMILIES = {
+    **dict.fromkeys(("sam", "mobilesam", "edgesam", "nanosam"), Family(IMAGENET)),
+    "sam2": Family(IMAGENET, padded=False),
+    "efficientsam": Family(Normalisation(1 / 255), padded=False, own_pixels=True),
+    "samexporter": Family(Normalisation(1.0)),  # the graph does it all
+}
 
-    Raises ModelError, MissingDependencyError.
+
+class Embedded(NamedTuple):
+    """An encoded image. features: arrays by the name of the encoder's output. size: (H, W) of the image. frame: (h, w) of the
+    coordinate frame of prompts. content: (h, w) of the image within it, from the upper left corner. own_pixels: see Family."""
+
+    features: dict[str, Array]
+    size: tuple[int, int]
+    frame: tuple[float, float]
+    content: tuple[float, float]
+    own_pixels: bool
+
+
+class Encoder:
+    """An ONNX graph from an image to an embedding. Raises ModelError if its tensors are not those of an encoder."""
+
+    def __init__(self, model: OnnxModel, efficient: bool) -> None:
+        """efficient: whether the decoder is that of EfficientSAM."""
+        self.model = model
+        features = sum(len(t.shape) == 4 for t in model.outputs)
+        if len(model.inputs) != 1 or not _is_picture(model.inputs[0]) or not features:
+            raise model.error("this is no encoder, which takes a picture and gives an embedding")
+        self.input = model.inputs[0]
+        self._channels_last = self.input.shape[-1] == 3 and self.input.shape[-3] != 3
+        self.family = declared_family(model)
+        if self.family and self.family not in FAMILIES:
+            raise model.error(f"family '{self.family}' in its YAML is unknown; known are {', '.join(FAMILIES)}, fastsam")
+        if not self.family:
+            self.family = "samexporter" if self._channels_last or np.issubdtype(self.input.dtype, np.integer) else "sam"
+            if efficient or self.input.name.startswith("batched"):
+                self.family = "efficientsam"
+            elif features >= 3:
+                self.family = "sam2"
+        usual, self._padded, self._own_pixels = FAMILIES[self.family]
+        self.normalised = Normalisation.of(model, usual)
+
+    def __call__(self, image: NDArray[np.uint8], deadline: Deadline) -> Embedded:
+        """Embedding of an image (H, W) or (H, W, 3) BGR uint8 of any size. Raises ModelError, BudgetError."""
+        height, width = image.shape[:2]
+        size = self._input_size(height, width)
+        inner = _scaled((height, width), min(size[0] / height, size[1] / width)) if self._padded else size
+        whole = np.zeros((*size, 3), np.float32)
+        whole[: inner[0], : inner[1]] = self.normalised(to_rgb(image, inner, self.model.sidecar.channels == "bgr"))
+        tensor = whole if self._channels_last else whole.transpose(2, 0, 1)
+        outputs = self.model.run({self.input.name: tensor if len(self.input.shape) == 3 else tensor[None]}, deadline)
+        features = dict(zip((t.name for t in self.model.outputs), outputs, strict=True))
+        coarsest = min((a.shape[-2:] for a in outputs if a.ndim == 4), key=lambda s: s[0] * s[1])
+        frame = float(CELL_PX * coarsest[0]), float(CELL_PX * coarsest[1])
+        factor = max(frame) / max(size)
+        content = (inner[0] * factor, inner[1] * factor) if self._padded else frame
+        return Embedded(features, (height, width), frame, content, self._own_pixels)
+
+    def _input_size(self, height: int, width: int) -> tuple[int, int]:
+        """Height and width of the input for an image of this size."""
+        if self.model.sidecar.size:
+            return self.model.sidecar.size
+        rows, columns = self.input.shape[-3:-1] if self._channels_last else self.input.shape[-2:]
+        if rows and columns:
+            return rows, columns
+        if self._own_pixels:
+            return height, width
+        if self._channels_last:  # the graph pads by itself
+            return _scaled((height, width), DEFAULT_SIDE / max(height, width))
+        return rows or DEFAULT_SIDE, columns or DEFAULT_SIDE
+
+
+class Decoder:
+    """An ONNX graph from embedding and points to masks. Raises ModelError if it fits no known export, or not the encoder.
+
+    What its tensors are is told by their names, then by their shapes. features: pairs of an input and the name of the encoder's
+    output that feeds it. batch: prompts per run.
     """
-    if Path(config.segment_anything).is_dir():
-        return MaskFolder(config.segment_anything)
-    first = OnnxModel(config.segment_anything, config)
-    if is_fast_sam(first, alone=not config.segment_anything_decoder):
-        return FastSam(first)
-    return Prompted(first, _decoder_of(first, config), config.prompt_grid)
+
+    def __init__(self, model: OnnxModel, encoder: OnnxModel) -> None:
+        self.model = model
+        left = list(model.inputs)
+        points = _take(left, ("coords", "points"), lambda t: len(t.shape) in (3, 4) and t.shape[-1] == 2)
+        if points is None or len(points.shape) not in (3, 4) or points.shape[-1] not in (2, None):
+            raise _mismatch(model, encoder, "no input takes points")
+        labels = _take(left, ("label",), lambda t: len(t.shape) == len(points.shape) - 1)
+        if labels is None or len(labels.shape) != len(points.shape) - 1:
+            raise _mismatch(model, encoder, "no input takes the labels of the points")
+        self._points, self._labels = points, labels
+        self._has_mask = _take(left, ("has_mask",), lambda t: t.shape in ((), (1,)))
+        self._mask_input = _take(left, ("mask",), lambda t: len(t.shape) == 4 and t.shape[1] == 1)
+        self._image_size = _take(left, ("size",), lambda t: t.shape == (2,))
+        self._features = _features(left, model, encoder)
+        outputs = list(model.outputs)
+        largest = max(len(t.shape) for t in outputs)
+        declared = model.sidecar.output
+        if declared and declared not in [t.name for t in outputs]:
+            raise model.error(f"there is no output '{declared}', which 'output:' of the YAML beside it names")
+        names = (declared,) if declared else ("low_res", "mask")
+        exactly = [t for t in outputs if t.name == declared]
+        masks = exactly[0] if exactly else _take(outputs, names, lambda t: len(t.shape) == largest >= 3)
+        if masks is None:
+            raise _mismatch(model, encoder, "no output gives masks")
+        self.masks = masks
+        others = [t for t in outputs if t is not masks]
+        self._score = _take(others, ("iou", "score"), lambda t: 1 <= len(t.shape) < len(masks.shape) - 1)
+        self._nested = len(points.shape) == 4  # (1, prompts, points, 2)
+        self._fixed = points.shape[1 if self._nested else 0]
+        self.batch = self._fixed or PROMPT_BATCH
+        # Exports with nested points pad them themselves; the others expect a padding point where there is no box.
+        self._slots = points.shape[-2] or (1 if self._nested else 2)
+
+    @property
+    def is_efficient(self) -> bool:
+        """Whether points are in pixels of the original image: EfficientSAM, whose decoder scales them itself."""
+        return self._nested and self._image_size is not None
+
+    def __call__(self, embedded: Embedded, points: Points, deadline: Deadline) -> Proposals:
+        """Masks for prompts (n, 2), n <= batch, points in pixels of the image. Raises ModelError, BudgetError."""
+        try:
+            return self._run(embedded, points, deadline)
+        except ModelError:
+            if len(points) == 1 or self._fixed:
+                raise
+        self.batch = 1  # sizes declared as dynamic need not be
+        parts = [self._run(embedded, point[None], deadline) for point in points]
+        logits, score = np.concatenate([p.logits for p in parts]), np.concatenate([p.score for p in parts])
+        return parts[0]._replace(logits=logits, score=score)
+
+    def _run(self, embedded: Embedded, points: Points, deadline: Deadline) -> Proposals:
+        outputs = [t.name for t in (self.masks, self._score) if t is not None]
+        n = self._fixed or len(points)
+        filled = points[np.minimum(np.arange(n), len(points) - 1)]
+        masks, *scores = self.model.run(self._feeds(embedded, filled), deadline, outputs)
+        if masks.ndim < 2 or masks.size == 0 or masks.size % (n * masks.shape[-2] * masks.shape[-1]):
+            raise self.model.error(f"it gave masks {masks.shape} for {n} prompts")
+        masks = masks.reshape(n, -1, *masks.shape[-2:])
+        score = scores[0].astype(np.float32) if scores else np.ones(masks.shape[:2], np.float32)
+        if score.size % n or (masks.shape[1] > 1 and score.size != n * masks.shape[1]):
+            raise self.model.error(f"it gave masks {masks.shape} and scores {scores[0].shape} for {n} prompts")
+        masks, score = masks[: len(points)], score.reshape(n, -1)[: len(points)]
+        if masks.shape[1] == 1:  # the graph chose the best one
+            score = score.max(axis=1, keepdims=True)
+        logits, soft = _as_logits(masks)
+        flat = logits.reshape(-1, *logits.shape[-2:])
+        return Proposals(flat, score.ravel(), embedded.size, _content(embedded, flat.shape[-2:]), soft)
+
+    def _feeds(self, embedded: Embedded, points: Points) -> dict[str, Array]:
+        n, (height, width) = len(points), embedded.size
+        own_pixels = embedded.own_pixels and self._image_size is not None
+        factor = np.ones(2) if own_pixels else np.array([embedded.content[1] / width, embedded.content[0] / height])
+        coords, labels = np.zeros((n, self._slots, 2)), np.full((n, self._slots), NO_POINT)
+        coords[:, 0], labels[:, 0] = points * factor, 1
+        feeds: dict[str, Array] = {t.name: embedded.features[source] for t, source in self._features}
+        feeds[self._points.name] = coords[None] if self._nested else coords
+        feeds[self._labels.name] = labels[None] if self._nested else labels
+        if self._mask_input is not None:
+            feeds[self._mask_input.name] = np.zeros(_filled(self._mask_input, n, [n, 1, *_coarse(embedded.frame)]))
+        if self._has_mask is not None:
+            feeds[self._has_mask.name] = np.zeros(_filled(self._has_mask, n, [n]))
+        if self._image_size is not None:
+            # With logits as another output, masks at full size would be computed in vain.
+            small = not own_pixels and "low_res" in self.masks.name
+            feeds[self._image_size.name] = np.array(_coarse(embedded.content) if small else embedded.size)
+        return feeds
 
 
-class Prompted:
+class SegmentAnything(MaskModel):
     """Encoder and decoder, prompted on a grid over the image. ModelError if the two do not fit each other."""
 
     needed = f"a predicted IoU of {MIN_IOU:g} and a stability of {MIN_STABILITY:g}"
 
     def __init__(self, encoder: OnnxModel, decoder: OnnxModel, along: int) -> None:
         """along: prompts along the longer side of the image."""
-        roles = roles_of(decoder, encoder)
         self.along = along
         self.fallback = "; ".join(model.fallback for model in (encoder, decoder) if model.fallback)
-        self.encoder = Encoder(encoder, roles.in_own_pixels)
-        self.decoder = Decoder(decoder, roles, self.encoder, PROMPT_BATCH)
+        self.decoder = Decoder(decoder, encoder)
+        self.encoder = Encoder(encoder, self.decoder.is_efficient)
 
     def describe(self) -> str:
-        """Family, grid, and tensors of both files, as text."""
         encoder, decoder = self.encoder.model, self.decoder.model
         return (
             f"Segment Anything ({self.encoder.family}), {self.along} prompts along the longer side, {self.decoder.batch} in a "
-            f"run, fed as {self.encoder.preprocessing.normalised.text}, on {decoder.provider}; encoder: {encoder.tensors}; "
-            f"decoder: {decoder.tensors}"
+            f"run, fed as {self.encoder.normalised.text}, on {decoder.provider}; encoder: {encoder.tensors}; decoder: "
+            f"{decoder.tensors}"
         )
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> list[Mask]:
-        """Masks of the frame's image. Raises ModelError, BudgetError."""
+    def masks(self, frame: Frame, deadline: Deadline) -> list[Mask]:
+        """Of everything in the frame's image."""
         embedded, decoder = self.encoder(frame.image, deadline), self.decoder
         return everything(
             lambda points: decoder(embedded, points, deadline), embedded.size, lambda: decoder.batch, self.along, deadline
         )
 
 
-def _decoder_of(encoder: OnnxModel, config: SemanticsConfig) -> OnnxModel:
-    if config.segment_anything_decoder:
-        return OnnxModel(config.segment_anything_decoder, config)
-    kind = kind_of(encoder)
-    if kind not in (NetworkKind.ENCODER, NetworkKind.OTHER):
-        raise encoder.error(
-            f"this looks like {kind.value}; semantics.segment_anything takes the encoder of Segment Anything or FastSAM"
-        )
-    raise encoder.error("it needs its decoder: set semantics.segment_anything_decoder to its ONNX file. FastSAM has none")
-
-
-def everything(propose: Proposer, size: tuple[int, int], batch: Callable[[], int], along: int, deadline: Deadline) -> list[Mask]:
+def everything(
+    propose: Callable[[Points], Proposals], size: tuple[int, int], batch: Callable[[], int], along: int, deadline: Deadline
+) -> list[Mask]:
     """Masks of everything in an image of this size (H, W), from a grid of prompts without redundant ones.
 
     propose: masks for prompts (n, 2), pixels. batch: prompts per call, which may shrink. along: see prompt_points. Raises
@@ -123,8 +268,7 @@ def everything(propose: Proposer, size: tuple[int, int], batch: Callable[[], int
             if not _is_redundant(point, prompted, found, spacing):
                 prompts.append(point)
         if prompts:
-            proposals = propose(np.array(prompts))
-            found = without_duplicates(found + accepted_masks(proposals), NMS_IOU)
+            found = without_duplicates(found + accepted_masks(propose(np.array(prompts))), NMS_IOU)
             prompted += prompts
     return found
 
@@ -159,3 +303,97 @@ def _is_redundant(point: Points, prompted: Sequence[Points], found: Sequence[Mas
 def _innermost(point: Points, masks: Iterable[Mask]) -> Mask | None:
     """The smallest mask that covers the point (2,)."""
     return min((mask for mask in masks if mask.covers(*(point + 0.5))), key=lambda mask: mask.area, default=None)
+
+
+def _take(left: list[Tensor], names: Sequence[str], fits: Callable[[Tensor], bool]) -> Tensor | None:
+    """Remove from the list and return the tensor with one of the names, else the first that fits."""
+    named = (t for name in names for t in left if name in t.name.lower())
+    found = next(named, None) or next(filter(fits, left), None)
+    if found is not None:
+        left.remove(found)
+    return found
+
+
+def _features(inputs: Iterable[Tensor], decoder: OnnxModel, encoder: OnnxModel) -> tuple[tuple[Tensor, str], ...]:
+    """The output of the encoder for each of these inputs: that of the same name, else the first of a compatible shape."""
+    given = {t.name: t for t in encoder.outputs}
+    found = []
+    for tensor in sorted(inputs, key=lambda t: t.name not in given):
+        fitting = [tensor.name] if tensor.name in given else list(given)
+        source = next((name for name in fitting if _compatible(given[name], tensor)), None)
+        if source is None and tensor.name in given:
+            raise _mismatch(decoder, encoder, f"the encoder gives {given[tensor.name]}, but the decoder takes {tensor}")
+        if source is None:
+            raise _mismatch(decoder, encoder, f"no output of the encoder fits the input {tensor}")
+        del given[source]
+        found.append((tensor, source))
+    if not found:
+        raise _mismatch(decoder, encoder, "no input takes the embedding")
+    return tuple(found)
+
+
+def _compatible(given: Tensor, taken: Tensor) -> bool:
+    sizes = zip(given.shape, taken.shape, strict=False)
+    return len(given.shape) == len(taken.shape) and all(None in (a, b) or a == b for a, b in sizes)
+
+
+def _mismatch(decoder: OnnxModel, encoder: OnnxModel, problem: str) -> ModelError:
+    return ModelError(
+        f"{encoder.path} and {decoder.path} are no pair of Segment Anything: {problem}; the encoder has {encoder.tensors}; "
+        f"the decoder has {decoder.tensors}; {KNOWN}"
+    )
+
+
+def to_rgb(image: NDArray[np.uint8], size: tuple[int, int], bgr: bool = False) -> NDArray[np.float32]:
+    """Image (H, W) or (H, W, 3) BGR -> (h, w, 3) float32 RGB or BGR, 0..255, at another size."""
+    colour = fitted(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8) if image.ndim == 2 else image, size)
+    return np.asarray(colour if bgr else colour[:, :, ::-1], np.float32)
+
+
+def declared_family(model: OnnxModel) -> str:
+    """The family in the YAML beside a model, lower case, without underscores and hyphens; empty if it is not given."""
+    return model.sidecar.family.lower().replace("_", "").replace("-", "")
+
+
+def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    height, width = (max(int(n * factor + 0.5), 1) for n in size)
+    return height, width
+
+
+def _is_picture(tensor: Tensor) -> bool:
+    shape = tensor.shape
+    channels = shape[-3::2] if len(shape) in (3, 4) else ()  # first or last after the batch
+    return 3 in channels or (len(shape) == 4 and shape[1] is None)
+
+
+def _coarse(size: tuple[float, float]) -> tuple[int, int]:
+    return max(round(size[0] / LOGIT_PX), 1), max(round(size[1] / LOGIT_PX), 1)
+
+
+def _filled(tensor: Tensor, n: int, usual: Sequence[int]) -> list[int]:
+    """A shape with its dynamic sizes set."""
+    if len(tensor.shape) != len(usual):
+        return [size or n for size in tensor.shape]
+    return [size or other for size, other in zip(tensor.shape, usual, strict=True)]
+
+
+def _as_logits(masks: Array) -> tuple[NDArray[np.float32], bool]:
+    """Masks as float32 logits with the threshold 0, and whether they are soft rather than binary."""
+    if masks.dtype.kind not in "f":
+        return np.where(masks > 0, np.float32(1), np.float32(-1)), False
+    masks = masks.astype(np.float32, copy=False)
+    if masks.min() < 0 or masks.max() > 1:
+        return masks, True
+    soft = bool(((masks > 0) & (masks < 1)).any())
+    p = np.clip(masks, 1e-6, 1 - 1e-6)  # probabilities
+    return np.log(p / (1 - p)), soft
+
+
+def _content(embedded: Embedded, shape: tuple[int, ...]) -> tuple[float, float]:
+    """Part (h, w) of masks of this shape that covers the image: all of it, unless they have the shape of the padded frame."""
+    height, width = shape
+    aspect = np.log(height / width)
+    padded, own = (abs(aspect - np.log(s[0] / s[1])) for s in (embedded.frame, embedded.size))
+    if own <= padded or (height, width) == embedded.size:
+        return float(height), float(width)
+    return height * embedded.content[0] / embedded.frame[0], width * embedded.content[1] / embedded.frame[1]

@@ -6,6 +6,8 @@ import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,15 @@ from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC, SOURCE
 from calib_ros.errors import BudgetError, CalibrationError, MissingDependencyError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.registration.classes import ALL, CLOUD, IMAGE, MASKS, OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros_semantics.models.cloud_classes import CloudNetwork
+from calib_ros_semantics.models.fast_sam import FastSam, is_fast_sam
+from calib_ros_semantics.models.geometric_classes import ClusterClasses
+from calib_ros_semantics.models.image_classes import ImageNetwork
 from calib_ros_semantics.models.labels import Classes
-from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel, error_text
+from calib_ros_semantics.models.masks import MaskModel
+from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel, error_text
+from calib_ros_semantics.models.ready import MaskFolder, ReadyClasses
+from calib_ros_semantics.models.segment_anything import SegmentAnything
 from calib_ros_semantics.models.weight_sets import WeightSet, file_of, weights_of
 
 MAX_FAILURES = 3  # in a row, after which a model is switched off
@@ -197,22 +206,36 @@ class SegmentationModels:
 
 
 def load_model(kind: str, path: str, config: SemanticsConfig) -> SegmentationModel:
-    """Load a model. ModelError if that fails. Modules are imported on demand: most configurations need one of them."""
-    if kind == MASKS:
-        from calib_ros_semantics.models.segment_anything import MaskEdges
-
-        return MaskEdges(config)
-    if kind == IMAGE:
-        from calib_ros_semantics.models.image_classes import pixel_model
-
-        return pixel_model(path, config)
+    """The model that the value `path` of the parameter `kind` names. ModelError, MissingDependencyError if that fails."""
     if path == GEOMETRIC:
-        from calib_ros_semantics.models.geometric_classes import ClusterClasses
-
         return ClusterClasses()
-    from calib_ros_semantics.models.cloud_classes import point_model
+    if path == SOURCE or Path(path).is_dir():
+        return READY[kind](path)
+    return NETWORKS[kind](OnnxModel(file_of(path), config), config)
 
-    return point_model(path, config)
+
+def _mask_network(model: OnnxModel, config: SemanticsConfig) -> MaskModel:
+    if is_fast_sam(model, alone=not config.segment_anything_decoder):
+        return FastSam(model)
+    if config.segment_anything_decoder:
+        return SegmentAnything(model, OnnxModel(config.segment_anything_decoder, config), config.prompt_grid)
+    raise model.error(
+        "it needs its decoder: set semantics.segment_anything_decoder to its ONNX file. FastSAM has none; networks for classes "
+        "go to semantics.image_classes"
+    )
+
+
+# One adapter per kind of graph, and of what is ready without one.
+NETWORKS: dict[str, Callable[[OnnxModel, SemanticsConfig], SegmentationModel]] = {
+    MASKS: _mask_network,
+    IMAGE: ImageNetwork,
+    CLOUD: CloudNetwork,
+}
+READY: dict[str, Callable[[str], SegmentationModel]] = {
+    MASKS: MaskFolder,
+    IMAGE: partial(ReadyClasses, IMAGE),
+    CLOUD: partial(ReadyClasses, CLOUD),
+}
 
 
 def judge(model: SegmentationModel, answer: Any) -> tuple[str, str]:

@@ -18,17 +18,10 @@ MAX_NUMBERS = 65536  # class numbers are below
 
 @dataclass(frozen=True)
 class Sidecar:
-    """What the YAML says. Empty or None entries are inferred.
+    """What the YAML says, see ENTRIES; empty or None entries are inferred.
 
-    Attributes
-    ----------
-    family : overrides the family inferred from the tensors. output : name of the output to use.
-    scale : factor on grey levels 0..255, such as 1/255. mean, std : per channel, after scale.
-    channels : rgb or bgr; of range images the channel names in order.
-    size : (height, width) to run at.
-    labels : class names by number, or the name of a dataset.
-    fov_deg : highest and lowest elevation of a range image. azimuth_deg : angle its columns cover, straight ahead in the middle.
-    depth_scale : of completion networks, units of their depths per metre.
+    family, output: instead of those told by the tensors. scale: factor on grey levels 0..255. mean, std: per channel, after it.
+    channels: of range images their names in order. azimuth_deg: angle that its columns cover, straight ahead in the middle.
     """
 
     family: str = ""
@@ -41,7 +34,6 @@ class Sidecar:
     fov_deg: tuple[float, float] | None = None
     azimuth_deg: float = 360.0
     output: str = ""
-    depth_scale: float | None = None
 
     @staticmethod
     def beside(path: str | Path) -> Sidecar:
@@ -59,18 +51,16 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e12
 
 
-def _is_list(value: Any, of: Callable[[Any], bool], length: int | None = None) -> bool:
-    return isinstance(value, list) and bool(value) and len(value) == (length or len(value)) and all(map(of, value))
-
-
 def _is_side(value: Any) -> bool:
     return isinstance(value, int) and SIZES[0] <= value <= SIZES[1]
 
 
+def _is_list(value: Any, of: Callable[[Any], bool], length: int | None = None) -> bool:
+    return isinstance(value, list) and bool(value) and len(value) == (length or len(value)) and all(map(of, value))
+
+
 def _names_numbers(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        isinstance(k, int) and not isinstance(k, bool) and 0 <= k < MAX_NUMBERS and _is_text(v) for k, v in value.items()
-    )
+    return isinstance(value, dict) and all(type(k) is int and 0 <= k < MAX_NUMBERS and _is_text(v) for k, v in value.items())
 
 
 # What the value of each entry must be, and whether it is.
@@ -88,7 +78,6 @@ ENTRIES: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "fov_deg": ("[highest, lowest]", lambda v: _is_list(v, _is_number, 2) and -90 <= v[1] < v[0] <= 90),
     "azimuth_deg": ("an angle above 0, up to 360", lambda v: _is_number(v) and 0 < v <= 360),
     "output": ("a name", _is_text),
-    "depth_scale": ("a number above 0", lambda v: _is_number(v) and v > 0),
 }
 
 
@@ -102,13 +91,11 @@ def _read(path: Path) -> Sidecar:
         raise ModelError(f"{path} is not valid YAML{io.what_is_wrong(error)}; it may hold {known}") from None
     if not isinstance(data, dict | None):
         raise ModelError(f"{path} must hold names and values; known are {known}")
-    given: dict[str, Any] = {}
-    for name, value in (data or {}).items():
+    given: dict[str, Any] = {name: value for name, value in (data or {}).items() if value is not None or name not in ENTRIES}
+    for name, value in given.items():
         if name not in ENTRIES:
             raise ModelError(f"{path}: unknown entry '{name}'; known are {known}")
         expected, fits = ENTRIES[name]
-        if value is None:
-            continue
         if not fits(value):
             raise ModelError(f"{path}: {name} = {value!r} must be {expected}")
         given[name] = tuple(value) if isinstance(value, list) else value

@@ -50,14 +50,7 @@ def weights_of(path: Path) -> WeightSet | None:
 @lru_cache(maxsize=16)
 def _read(path: Path, state: tuple[int, ...]) -> WeightSet:
     """weights_of, once as long as the file does not change. Raises OSError."""
-    digest = hashlib.sha256(np.memmap(path, np.uint8, "r").data)  # encoders have hundreds of megabytes
-    own = metadata_of(path)
-    name, licence = (path.stem, None) if own is None else (own.get("name") or path.stem, own.get("license", ""))
-    return WeightSet(name, licence, digest.hexdigest())
-
-
-def metadata_of(path: Path) -> dict[str, str] | None:
-    """Metadata of an ONNX file by their keys; None for what cannot be loaded on a CPU, of which the model itself says why."""
+    digest = hashlib.sha256(np.memmap(path, np.uint8, "r").data).hexdigest()  # encoders have hundreds of megabytes
     try:
         import onnxruntime
 
@@ -65,6 +58,7 @@ def metadata_of(path: Path) -> dict[str, str] | None:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL  # it is not going to run
         options.log_severity_level = 4
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        return dict(session.get_modelmeta().custom_metadata_map)
-    except Exception:  # onnxruntime's exceptions have no common base below Exception
-        return None
+        own = session.get_modelmeta().custom_metadata_map
+    except Exception:  # what cannot be loaded on a CPU; of it the model itself says why
+        return WeightSet(path.stem, None, digest)
+    return WeightSet(own.get("name") or path.stem, own.get("license", ""), digest)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes import NEAR, Scene
+from thesis_constants import with_constants
 
 from calib_ros import se3
 from calib_ros.config import Config, preset
@@ -14,7 +15,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.own import LINEARISATION, Own, _Count
@@ -25,7 +26,7 @@ from calib_ros_thesis.score import ThesisScore
 # The features of these scenes were made without semantics: what is compared with them has none either.
 NONE = {"semantics": {"segmentation": "none"}}
 PLAIN = Config.from_dict(NONE)
-THESIS = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"evaluations": 60}, **NONE})
+THESIS = with_constants(Config.from_dict({"refine": {"objective": "thesis"}, **NONE}), evaluations=60)
 CLASSES = {"semantics": {"cloud_classes": "geometric"}}
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from html_pages import Page
+from thesis_constants import with_constants
 
 from calib_ros import Config, Frame, PointCloud, open_dataset, se3
 from calib_ros.cli import main
@@ -68,7 +69,7 @@ def test_the_page_shows_exactly_the_pictures_that_exist(made: Path) -> None:
     text = (made / "index.html").read_text()
     for number, (heading, _) in SECTIONS.items():
         assert f"<span>{number}</span>{heading}" in text
-    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "min_depth: 2.0", "prefers-color-scheme"):
+    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "normalize: true", "prefers-color-scheme"):
         assert fact in text
 
 
@@ -141,7 +142,7 @@ def test_a_source_without_colour_and_intensity(drive: SyntheticDrive, tmp_path: 
 
 def test_the_filters_shown_are_those_of_the_method_without_intensity_too(drive: SyntheticDrive) -> None:
     """A threshold on reflectivity says nothing where the source tells none."""
-    frame, config = drive[0], Config.from_dict({"thesis": {"min_reflectivity": 0.5}})
+    frame, config = drive[0], with_constants(Config(), min_reflectivity=0.5)
     bare = dataclasses.replace(frame, cloud=PointCloud(frame.cloud.xyz, ring=frame.cloud.ring))
     scene = RegisteredFrame.of(bare, drive.reference, config)
     cloud = Cloud.of(scene)

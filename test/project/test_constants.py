@@ -10,9 +10,15 @@ from paths import ROOT
 
 JUDGES = (
     *("calib_ros/registration/acceptance/*.py", "calib_ros/registration/nuisance/*.py", "calib_ros/registration/covariance.py"),
-    *("calib_ros/registration/estimate.py", "calib_ros_check/*.py", "benchmarks/compare.py"),
+    *(
+        "calib_ros/registration/score/chance.py",
+        "calib_ros/registration/estimate.py",
+        "calib_ros_check/*.py",
+        "benchmarks/compare.py",
+    ),
     *(f"calib_ros/online/{name}.py" for name in ("evidence", "monitor", "glance", "tracker", "clocks")),
 )
+SYSTEMATIC_ERROR = ("calib_ros/registration/objective.py", "SYSTEMATIC_ERROR")  # whose other constants judge nothing
 OF_PAGES = {"report", "page", "cli", "commands"}
 TABLE = ROOT / "docs" / "figures" / "constants.csv"
 
@@ -39,6 +45,7 @@ def numbers(path: Path) -> dict[str, str]:
 def test_every_constant_of_judgement_is_listed_as_it_is() -> None:
     paths = {path for pattern in JUDGES for path in ROOT.glob(pattern) if path.stem not in OF_PAGES}
     there = {(str(path.relative_to(ROOT)), *item) for path in paths for item in numbers(path).items()}
+    there.add((*SYSTEMATIC_ERROR, numbers(ROOT / SYSTEMATIC_ERROR[0])[SYSTEMATIC_ERROR[1]]))
     with TABLE.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {(row["module"], row["constant"], row["value"]) for row in rows} == there

@@ -5,7 +5,7 @@ from __future__ import annotations
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import Frame
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, JobDone, Notice, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import INITIAL, Extrinsic, Result
 from calib_ros_synthetic.drive import SyntheticDrive
@@ -31,7 +31,6 @@ class Driven:
         self.notices: list[str] = []
         self.states: list[Extrinsic] = []
         self.kept: list[int] = []
-        self.outcomes: list[object] = []  # of deferred jobs
         start = Result(se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
         inputs = Inputs(lambda image, cloud, camera: image, lambda image, cloud: ("camera", "lidar"), lambda *_: start)
         self.pipeline = Pipeline(settings, inputs, self.on_event)
@@ -41,11 +40,7 @@ class Driven:
         if isinstance(event, ExtrinsicUpdated):
             self.states.append(event.extrinsic)
         elif isinstance(event, Problem):
-            self.errors.append(event.message)
-        elif isinstance(event, Notice):
-            self.notices.append(event.message)
-        elif isinstance(event, JobDone):
-            self.outcomes.append(event.outcome)
+            (self.notices if event.solved else self.errors).append(event.message)
         elif isinstance(event, FrameIngested) and event.is_keyframe:
             self.kept.append(event.image.stamp)
 

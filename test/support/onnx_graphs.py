@@ -205,32 +205,3 @@ def range_network(
         g.op("Softmax" if name == "softmax" else "Neg" if name.startswith("aux") else "Identity", scores, out=out, **how)
         made.append((out, [1, len(at), height, width]))
     return g.save(path, given, made)
-
-
-def completion(
-    path: Path,
-    yaml: str | None = "{depth_scale: 1, scale: 1}",
-    *,
-    inputs: str = "depth 1 1 height width; image 1 1 height width",
-    outputs: str = "dense 1 1 height width",
-    channels: Sequence[float] = (0.01,),
-    shrunk: int = 1,
-) -> Path:
-    """A completion network: the largest depth within 2 px, and the image's channels (k,) weighted. yaml: beside it; None = none.
-
-    inputs: depth and image, in any order, the image with k channels. shrunk: cells of the output per pixel, each way.
-    """
-    g, given = Graph(), tensors(inputs)
-    image = next(name for name, shape in given if "im" in name or (shape and shape[1] == 3))
-    depth = next(name for name, _ in given if name != image)
-    grey = g.op("Conv", image, g.const(np.reshape(channels, (1, -1, 1, 1))))
-    grown = g.op("MaxPool", depth, kernel_shape=[5, 5], pads=[2] * 4)
-    made = tensors(outputs)
-    total = g.op("Add", grown, grey, out="" if shrunk > 1 else made[0][0])
-    if shrunk > 1:
-        g.op("MaxPool", total, kernel_shape=[shrunk] * 2, strides=[shrunk] * 2, out=made[0][0])
-    for name, _ in made[1:]:
-        g.op("Neg", total, out=name)
-    if yaml is not None:
-        path.with_suffix(".yaml").write_text(yaml)
-    return g.save(path, given, made)

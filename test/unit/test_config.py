@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 from paths import FORMER_OPTIONS, FORMER_VERSION, ROOT
 
-from calib_ros.config import Config, ImageConfig, OnlineConfig, SearchConfig, former_names, stages, update
+from calib_ros.config import Config, ImageConfig, OnlineConfig, SearchConfig, stages, update
 from calib_ros.config.removed import REMOVED
 from calib_ros.errors import BadInputError, ConfigError
 
@@ -55,8 +55,6 @@ def test_values_that_contradict_each_other_are_refused():
     for values, text in (
         ({"online": {"min_keyframes": 21}}, "min_keyframes = 21 is more than online.buffer_size = 20"),
         ({"online": {"min_keyframes": 2, "buffer_size": 1}}, "no estimate"),
-        ({"thesis": {"min_depth": 8, "max_depth": 7}}, "thesis.min_depth = 8 must be less than thesis.max_depth = 7"),
-        ({"thesis": {"smoothing": []}}, "thesis.smoothing has 0 levels; give 1 to 8"),
         ({"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}}, "levenberg_marquardt needs a gradient"),
         ({"semantics": {"segment_anything_decoder": "decoder.onnx"}}, "segment_anything_decoder is set without"),
     ):
@@ -66,8 +64,6 @@ def test_values_that_contradict_each_other_are_refused():
 
 def test_unusual_but_consistent_values_are_accepted():
     for values in (
-        {"thesis": {"smoothing": [0]}},
-        {"thesis": {"smoothing": [1.5, 4.0, 0.0]}},
         {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}},
         {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "once_per_level"}},
         {"refine": {"optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "every_evaluation"}},
@@ -120,8 +116,7 @@ def test_wrong_values_are_refused_by_name(read):
         ("search: {seed: -1}", r"search.seed = -1 is out of range \[0, "),
         ("monitor: {enabled: 'true'}", "monitor.enabled = 'true' must be of type bool"),
         ("refine: {optimizer: bfgs}", "optimizer = 'bfgs' must be one of auto, levenberg_marquardt, nelder_mead"),
-        ("thesis: {smoothing: 4}", "thesis.smoothing = 4 must be a list of float"),
-        ("thesis: {smoothing: [4, -1]}", r"thesis.smoothing = -1 is out of range \[0, 64\]"),
+        ("lidar: {ego_box: 4}", "lidar.ego_box = 4 must be a list of float"),
         ("constraints: {limit_m: [0, 0]}", r"constraints.limit_m = \[0, 0\] must have 3 elements"),
         ("constraints: {sigma_deg: [1, 1, -0.1]}", r"constraints.sigma_deg = -0.1 is out of range \[0, 180\]"),
         ("constraints: {sigma_m: [1, 1, a]}", "constraints.sigma_m = 'a' must be of type float"),
@@ -166,18 +161,6 @@ def test_update_changes_what_is_named_and_nothing_else_and_dictionaries_keep_eve
 FORMS = ["{stage}: {{{name}: {value}}}", "/**:\n  ros__parameters:\n    {stage}.{name}: {value}"]
 
 
-@pytest.mark.parametrize("former", former_names())
-def test_former_names_are_read_with_one_warning_but_not_beside_the_current_ones(read, former):
-    (stage, old), (_, new) = former.split("."), former_names()[former].split(".")
-    for form in FORMS:
-        with pytest.warns(FutureWarning, match=f"^{former} is now called {stage}.{new}$") as caught:
-            config = read(form.format(stage=stage, name=old, value=0.2))
-        assert len(caught) == 1
-        assert config == Config.from_dict({stage: {new: 0.2}})
-    with pytest.raises(ConfigError, match=f"{former} is the former name of {stage}.{new}; give only {stage}.{new}"):
-        Config.from_dict({stage: {old: 0.2, new: 0.2}})
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_removed_options_are_ignored_with_one_warning(read, form):
     with pytest.warns(FutureWarning, match=r"^lidar\.jump_min has no effect any more; remove it$") as caught:
@@ -185,10 +168,17 @@ def test_removed_options_are_ignored_with_one_warning(read, form):
     assert len(caught) == 1
     with pytest.warns(FutureWarning, match=r"; in place of semantics\.first_guess there is initial\.method: semantic$"):
         Config.from_dict({"semantics": {"first_guess": True, "witness": False}})
+    for form in FORMS:  # of a stage that there is no more
+        with pytest.warns(FutureWarning, match=r"^guess\.tilt_deg has .*; in place of guess\.tilt_deg there is --initial FILE"):
+            assert read(form.format(stage="guess", name="tilt_deg", value=30.0)) == Config()
+    with pytest.raises(ConfigError, match=r"unknown parameter 'guess\.tilt'"):
+        Config.from_dict({"guess": {"tilt": 30.0}})
+    with pytest.warns(FutureWarning, match=r"; in place of thesis\.completion there is morphology, eq\. 3\.11$"):
+        assert Config.from_dict({"thesis": {"completion": "own.onnx"}}) == Config()
 
 
 def test_all_removed_options_at_once_make_one_warning_a_stage():
-    assert not REMOVED & {*former_names(), *(f"{stage}.{f.name}" for stage, f in FIELDS)}
+    assert not REMOVED & {f"{stage}.{f.name}" for stage, f in FIELDS}
     values: dict[str, dict[str, object]] = {}
     for option in REMOVED:
         stage, _, name = option.partition(".")
@@ -201,18 +191,17 @@ def test_all_removed_options_at_once_make_one_warning_a_stage():
 
 def test_configurations_of_former_versions_still_load():
     """As ~/capture of calib_node wrote it beside a bag; and the shipped one of 187 options, one of whose defaults has changed."""
-    former = Config.from_yaml(FORMER_OPTIONS / "config.yaml")
+    with pytest.warns(FutureWarning, match="no effect any more"):
+        former = Config.from_yaml(FORMER_OPTIONS / "config.yaml")
     assert former == update(Config(), {"camera": {"focal_sigma": 0.003}})
     with pytest.warns(FutureWarning) as caught:
         config = Config.from_yaml(FORMER_VERSION / "config.yaml")
     told = [str(w.message) for w in caught]
-    assert sum("is now called" in text for text in told) == len(former_names())
-    for name in ("semantics.witness", "search.distinct", "search.climbed", "search.refined", "search.finalists"):
+    for name in ("tracker.drift_deg", "semantics.witness", "search.distinct", "search.climbed", "search.refined"):
         assert sum(name in text and "no effect any more" in text for text in told) == 1
     assert config == Config.from_dict(
         {
             "online": {"pair_tolerance_s": 0.05, "max_load": 1.0},
-            "tracker": {"process_noise_deg": 0.15, "process_noise_m": 0.015},
             "search": {"seed": 7, "rounds": 8, "starts": 2048},
         }
     )

@@ -26,28 +26,15 @@ class ClockDifference:
         self._newest_is_image: bool | None = None
         self._leads: deque[int] = deque(maxlen=SEEN_LATER)
 
-    def add_image(self, stamp: int, paired: bool = False) -> bool:
-        """An image's stamp, ns; True if it changes what is taken out. paired: whether there were pairs so far."""
-        self._image = stamp
-        return self._look(True, paired)
+    def add(self, is_image: bool, stamp: int, paired: bool = False) -> bool:
+        """The stamp of an image or a cloud, ns, as its driver has stamped it; True if it changes what is taken out.
 
-    def add_cloud(self, stamp: int, paired: bool = False) -> bool:
-        """The same of a cloud, as its driver has stamped it."""
-        self._cloud = stamp
-        return self._look(False, paired)
-
-    def describe(self) -> str:
-        """For people; "" if there is no difference."""
-        if not self.ahead:
-            return ""
-        seconds = abs(self.ahead) / NANOSECONDS
-        side = "after" if self.ahead > 0 else "before"
-        return (
-            f"clouds are stamped {seconds:.0f} s {side} images received at the same time: {cause_of_difference(seconds)}; "
-            "paired as received; synchronise the clocks (PTP, chrony)"
-        )
-
-    def _look(self, is_image: bool, paired: bool) -> bool:
+        paired: whether there were pairs so far.
+        """
+        if is_image:
+            self._image = stamp
+        else:
+            self._cloud = stamp
         goes_on_alone, self._newest_is_image = is_image == self._newest_is_image, is_image
         if goes_on_alone or self._image is None or self._cloud is None:
             return False
@@ -68,3 +55,14 @@ class ClockDifference:
             return False
         self.ahead = found
         return True
+
+    def describe(self) -> str:
+        """For people; "" if there is no difference."""
+        if not self.ahead:
+            return ""
+        seconds = abs(self.ahead) / NANOSECONDS
+        side = "after" if self.ahead > 0 else "before"
+        return (
+            f"clouds are stamped {seconds:.0f} s {side} images received at the same time: {cause_of_difference(seconds)}; "
+            "paired as received; synchronise the clocks (PTP, chrony)"
+        )

@@ -76,10 +76,7 @@ class PairingHealth:
         if lost:
             return f"{' and '.join(lost)} are missing between those that came; see that the drivers send them and none get lost"
         if synchronizer.outruns_queue():
-            return (
-                "one stream comes later than the queue of the other one holds; raise online.pair_queue, or lower the rate of the "
-                "faster one"
-            )
+            return "one stream comes later than the queue of the other one holds; lower the rate of the faster one"
         every = " and ".join(f"{period / NANOSECONDS:.3g} s" if period else "an unknown time" for period in periods)
         if gap is None or gap <= tolerance:
             return f"images and clouds come every {every}, at irregular times; check both drivers' rates and stamps"

@@ -17,6 +17,7 @@ from calib_ros.online.pairing.synchronizer import Synchronizer
 # Cloud messages kept: the one before a keyframe's is needed for the vehicle's motion, and the keyframe's own may wait for its
 # image and in the queue meanwhile.
 CLOUDS_KEPT = 6
+QUEUE = 8  # images and clouds that wait for their counterpart: twice what a stream of twice the rate brings in a late scan's time
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +39,7 @@ class Pairing:
     """
 
     def __init__(self, config: Config, clouds_are_decoded: bool) -> None:
-        online = config.online
-        self.synchronizer = Synchronizer(online.pair_tolerance_s, online.pair_queue, None if clouds_are_decoded else 0)
+        self.synchronizer = Synchronizer(config.online.pair_tolerance_s, QUEUE, None if clouds_are_decoded else 0)
         self.sweep, self.clocks = SweepOffset(config.motion), ClockDifference()
         self._newest_image: Any = None  # messages to find out from when scans sweep the view, while that is not known
         self._newest_cloud: Any = None
@@ -47,20 +47,20 @@ class Pairing:
 
     def configure(self, config: Config) -> list[Intake]:
         """Use other constants from now on."""
-        self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
+        self.synchronizer.limit_s = config.online.pair_tolerance_s
         self.sweep.config = config.motion
         return self.use_sweep()
 
     def add_image(self, stamp: int, message: Any) -> list[Intake]:
         """An image message, stamp in ns."""
-        if self.clocks.add_image(stamp, self.synchronizer.counts.pairs > 0):
+        if self.clocks.add(True, stamp, self.synchronizer.counts.pairs > 0):
             self._begin_anew()
         self._newest_image = message
         return self._to_take_in(self.synchronizer.add_image(stamp, message))
 
     def add_cloud(self, stamp: int, message: Any) -> list[Intake]:
         """A cloud message, stamp in ns, from which the difference of the clocks is taken out."""
-        if self.clocks.add_cloud(stamp, self.synchronizer.counts.pairs > 0):
+        if self.clocks.add(False, stamp, self.synchronizer.counts.pairs > 0):
             self._begin_anew()
         stamp -= self.clocks.ahead
         self._clouds.append((stamp, message))

@@ -56,9 +56,9 @@ class Synchronizer:
     """Keeps messages that wait for a partner, and returns each pair once, as soon as no nearer partner can come.
 
     tolerance_s: messages farther apart are never paired; 0 = as the periods of both streams allow, which also bound any other
-    value (`stamps.pair_tolerance`). capacity: images and clouds kept. cloud_offset: ns, from a cloud's stamp to the moment by
-    which it belongs to an image; while it is None, nothing is paired. Messages are passed through untouched. counts: see
-    SynchronizerCounts. Not thread-safe.
+    value (`stamps.pair_tolerance`); as limit_s it may be replaced. capacity: images and clouds kept. cloud_offset: ns, from a
+    cloud's stamp to the moment by which it belongs to an image; while it is None, nothing is paired. Messages are passed through
+    untouched. counts: see SynchronizerCounts. Not thread-safe.
     """
 
     def __init__(self, tolerance_s: float, capacity: int, cloud_offset: int | None = 0) -> None:
@@ -68,11 +68,6 @@ class Synchronizer:
         self._images, self._clouds = _Stream(capacity), _Stream(capacity)
         self._newest: _Stream | None = None
         self._lead: int | None = None  # ns, see lead_s
-
-    def configure(self, tolerance_s: float, capacity: int) -> None:
-        """Use other limits from now on."""
-        self.limit_s = tolerance_s
-        self._images.capacity = self._clouds.capacity = capacity
 
     def set_cloud_offset(self, cloud_offset: int) -> list[tuple[Any, Any]]:
         """Use another offset, ns, from now on; returns the pairs that are now final."""

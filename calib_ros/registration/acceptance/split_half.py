@@ -7,13 +7,15 @@ what their own curvatures let expect.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR, noise_covariance, noise_level, share_of_weight
+from calib_ros.registration.covariance import noise_covariance, noise_level, share_of_weight
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.registration.search.optimizers import levenberg_marquardt
@@ -44,7 +46,9 @@ def disagreement(score: PointScore, T: Transform, limits: Limits) -> float:
     factors = []
     for half in _halvings(part, T):
         both = [part.select(np.flatnonzero(half == k)) for k in (False, True)]
-        ends = [_refined(own, T, limits) for own in both]
+        ends = [T, T]
+        for own_level, (k, own) in product(LEVELS, enumerate(both)):
+            ends[k] = levenberg_marquardt(own.at(own_level), ends[k], limits=limits, tolerance_deg=0.005, near=True)[0]
         expected = sum((noise_covariance(own, T, level, axes, noise) for own in both), systematic)
         gap = se3.log(ends[0] @ se3.inverse(ends[1]))[axes]
         factors.append(float(gap @ np.linalg.solve(expected, gap)) / len(axes))
@@ -70,10 +74,3 @@ def _halvings(score: PointScore, T: Transform) -> Iterator[NDArray[np.bool_]]:
     ):
         if MIN_POINTS <= np.count_nonzero(mask) <= len(mask) - MIN_POINTS:
             yield mask
-
-
-def _refined(score: PointScore, T: Transform, limits: Limits) -> Transform:
-    """The optimum of a half near T (4, 4)."""
-    for level in LEVELS:
-        T = levenberg_marquardt(score.at(level), T, limits=limits, tolerance_deg=0.005, near=True)[0]
-    return T

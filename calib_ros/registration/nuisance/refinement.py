@@ -21,15 +21,15 @@ from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig
 from calib_ros.intrinsics import CENTRE, COEFFICIENTS, FOCAL, RADIAL, IntrinsicEstimate, RefinedCamera, change_between, changed
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.nuisance.lens import CENTRE as CENTRE_VALUES
 from calib_ros.registration.nuisance.lens import FOCAL as FOCAL_VALUES
 from calib_ros.registration.nuisance.lens import Intrinsic
 from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, noise_of
 from calib_ros.registration.nuisance.time_offset import FINE_POINTS
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior
-from calib_ros.registration.search.optimizers import ascend_jointly
+from calib_ros.registration.search.optimizers import JointView, ascend_jointly
 
 # Standard deviations of the radial distortion, as a displacement of the corner, a share of its radius: 1 to 3 px are usual.
 RADIAL_USUAL, RADIAL_GROSS = 0.004, 0.03
@@ -102,29 +102,6 @@ def _grid(shift: Matrix) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """The points as a changed lens shows them; a JointView.
-
-    part: of points in the camera's axes. shifts: (n, 2, points) m, by which each parameter moves them in the plane of the image.
-    """
-
-    part: PointScore
-    shifts: Matrix
-
-    def value(self, level: int) -> float:
-        return self.part.at(level).value(np.eye(4))
-
-    def linearise(self, level: int) -> tuple[Matrix, Matrix]:
-        """Gradient (6 + n,) by a left twist of the extrinsic and by the parameters, and the Gauss-Newton scale."""
-        n = len(self.shifts)
-        J = np.empty((6 + n, self.part.points.shape[1]))
-        J[:6] = self.part.jacobian(np.eye(4), level)
-        J[6:] = J[3] * self.shifts[:, 0] + J[4] * self.shifts[:, 1]  # slopes by a shift of the point across and down
-        weighted = J * self.part.weights
-        return weighted.sum(axis=1), weighted @ J.T
-
-
-@dataclass(frozen=True, eq=False)
 class _Doubted:
     """What is known in advance of changes (n,) about `centre` (n,): each usual, or, with probability DOUBT, plainly wrong."""
 
@@ -159,8 +136,8 @@ class _Joint:
     advance: _Doubted
     noise: float
 
-    def seen(self, T: Transform, change: Matrix) -> _Seen:
-        """The points from T (4, 4) with a change (n,) of the lens."""
+    def seen(self, T: Transform, change: Matrix) -> JointView:
+        """The points from T (4, 4) with a change (n,) of the lens, in the camera's axes."""
         P = T[:3, :3] @ self.score.points.astype(np.float64) + T[:3, 3:]
         z, K, camera = np.maximum(P[2], 1e-3), self.score.camera.K, self.score.camera
         scale = (NODES[0] - 1) / (camera.width - 1), (NODES[1] - 1) / (camera.height - 1)
@@ -173,7 +150,8 @@ class _Joint:
             shifts[:, own] = cv2.remap(fields, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].T
         shifts = shifts.reshape(len(self.parameters), 2, -1) * z
         P[:2] += np.einsum("k,kin->in", change, shifts)
-        return _Seen(self.score.with_points(P.astype(np.float32)), shifts)
+        # Slopes by a shift of the point across and down, of which each parameter makes so many m.
+        return self.score.with_points(P.astype(np.float32)), np.eye(4), lambda J: J[3] * shifts[:, 0] + J[4] * shifts[:, 1]
 
     def ascend(
         self, T: Transform, change: Matrix, levels: Sequence[int], free: NDArray[np.bool_] | None = None
@@ -224,7 +202,7 @@ def joint_optimum(
             ends = [joint.ascend(*start, LEVELS[:-1]) for start in _starts(T, part.camera, parameters)]
             ends = sorted(ends, key=lambda end: -end[2])[:FOLLOWED]
         begin = max((joint.ascend(*end[:2], NEAR_LEVELS) for end in ends), key=lambda end: end[2])[:2]
-    part = joint.seen(*begin).part
+    part = joint.seen(*begin)[0]
     # The halves' disagreement at T may be that of the wrong intrinsics.
     if begin is not as_it_is:
         inflated = min(inflated, inflation(disagreement(part, np.eye(4), free)))

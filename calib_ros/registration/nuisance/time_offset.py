@@ -34,7 +34,7 @@ from calib_ros.registration.nuisance.parameters import (
 )
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior
-from calib_ros.registration.search.optimizers import ascend_jointly
+from calib_ros.registration.search.optimizers import JointView, ascend_jointly, joint_jacobian
 
 # In scan periods: a driver that stamps scans at the other end is one off. Where the best is so many steps away, it is looked for
 # everywhere: it may be only the best that is near.
@@ -181,7 +181,7 @@ def scatter_gain(score: PointScore, T: Transform, twists: Matrix, limits: Limits
     Where frames hardly differ in speed, one stamp that is a millisecond late looks like an offset of many. Linear in the frames'
     own optima, which it moves.
     """
-    J, axes = _jacobian(score, T, twists, score.n_levels - 1), np.append(np.flatnonzero(limits.open_axes), 6)
+    J, axes = joint_jacobian(view_at(score, T, twists), 1, score.n_levels - 1), np.append(np.flatnonzero(limits.open_axes), 6)
     whole, squares = np.zeros((7, 7)), np.zeros((7, 7))
     for k in np.unique(score.frame):
         own = J[:, score.frame == k]
@@ -214,44 +214,19 @@ def _coarse(
     return best, seconds
 
 
-@dataclass(frozen=True, eq=False)
-class _Moved:
-    """The points `part` as they are at an offset, seen from T; a JointView."""
-
-    part: PointScore
-    T: Transform
-    twists: Matrix
-
-    def value(self, level: int) -> float:
-        return self.part.at(level).value(self.T)
-
-    def linearise(self, level: int) -> tuple[Matrix, Matrix]:
-        return linearise(self.part, self.T, self.twists, level)
-
-
 def _ascend(
     score: PointScore, T: Transform, seconds: float, twists: Matrix, limits: Limits, prior: Prior | None
 ) -> tuple[Matrix, float, float]:
     """The optimum in seven unknowns near T (4, 4) and an offset. -> T (4, 4), seconds, score."""
 
-    def see(T: Transform, offset: Matrix) -> _Moved:
-        return _Moved(score.moved(twists, offset[0]), T, twists)
+    def see(T: Transform, offset: Matrix) -> JointView:
+        return view_at(score.moved(twists, offset[0]), T, twists)
 
     T, offset, value, _ = ascend_jointly(see, T, np.array([seconds]), NEAR_LEVELS, limits, prior)
     return T, float(offset[0]), value
 
 
-def linearise(score: PointScore, T: Transform, twists: Matrix, level: int) -> tuple[Matrix, Matrix]:
-    """Gradient (7,) of the score by a left twist at T (4, 4) and by the offset, and a positive matrix that scales the step."""
-    J = _jacobian(score, T, twists, level)
-    weighted = J * score.weights
-    return weighted.sum(axis=1), weighted @ J.T
-
-
-def _jacobian(score: PointScore, T: Transform, twists: Matrix, level: int) -> Matrix:
-    """(7, n) of the points' values, by a left twist at T (4, 4) and by the offset."""
-    J = np.empty((7, score.points.shape[1]))
-    J[:6] = score.jacobian(T, level)
+def view_at(score: PointScore, T: Transform, twists: Matrix) -> JointView:
+    """The points of a score at an offset, seen from T (4, 4)."""
     flow = np.asarray(twists @ se3.adjoint(T).T)  # (n_frames, 6), of every frame in the camera's axes
-    J[6] = np.einsum("kn,nk->n", J[:6], flow[score.frame])
-    return J
+    return score, T, lambda J: np.einsum("kn,nk->n", J, flow[score.frame])

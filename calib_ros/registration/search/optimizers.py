@@ -1,9 +1,8 @@
-"""Optimisers of a score over the extrinsic, and the points to start from. All maximise, start at T and return (T, score)."""
+"""Optimisers of a score over the extrinsic. All maximise, start at T and return (T, score)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from scipy.optimize import minimize
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
-from calib_ros.registration.score.point_score import Score, SmoothScore
+from calib_ros.registration.score.point_score import PointScore, Score, SmoothScore
 from calib_ros.registration.search.constraints import Limits, Prior, unlimited
 
 JOINT_ITERATIONS, GAIN = 15, 1e-7  # per level; a step that gains less of the score is rounding
@@ -80,14 +79,25 @@ def learned_curvature(H: Matrix, moved: Matrix, fell: Matrix) -> Matrix:
     return H - np.outer(along, along) / expected + np.outer(fell, fell) / product
 
 
-class JointView(Protocol):
-    """The points at an extrinsic and n values of further unknowns."""
+# A score at values of n further unknowns, the extrinsic (4, 4) it is seen from, and the slopes (n, points) by the unknowns from
+# those (6, points) by a left twist.
+JointView = tuple[PointScore, Transform, Callable[[Matrix], Matrix]]
 
-    def value(self, level: int) -> float:
-        """The score."""
 
-    def linearise(self, level: int) -> tuple[Matrix, Matrix]:
-        """Gradient (6 + n,) of the score by a left twist and by the values, and a positive matrix that scales the step."""
+def linearised(view: JointView, n: int, level: int) -> tuple[Matrix, Matrix]:
+    """Gradient (6 + n,) of the score by a left twist and by the unknowns, and a positive matrix that scales the step."""
+    J = joint_jacobian(view, n, level)
+    weighted = J * view[0].weights
+    return weighted.sum(axis=1), weighted @ J.T
+
+
+def joint_jacobian(view: JointView, n: int, level: int) -> Matrix:
+    """Slopes (6 + n, points) of the points' values, by a left twist and by the unknowns."""
+    score, T, slopes = view
+    J = np.empty((6 + n, score.points.shape[1]))
+    J[:6] = score.jacobian(T, level)
+    J[6:] = slopes(J[:6])
+    return J
 
 
 def ascend_jointly(
@@ -113,11 +123,11 @@ def ascend_jointly(
 
     for level in levels:
         here = see(T, x)
-        best = here.value(level)
+        best = here[0].at(level).value(here[1])
         objective = penalised(best, T, x)
         damping, H, last, step = 1e-2, np.zeros((6 + n, 6 + n)), np.zeros(6 + n), np.zeros(6 + n)
         for k in range(JOINT_ITERATIONS):
-            ascent, scale = here.linearise(level)
+            ascent, scale = linearised(here, n, level)
             H = learned_curvature(H, step, last - ascent) if k else scale
             gradient, B = ascent.copy(), H.copy()
             if known:
@@ -134,7 +144,7 @@ def ascend_jointly(
                 step[axes] = np.linalg.solve(damped, gradient[axes])
                 candidate, later = limits.clip(se3.exp(step[:6]) @ T), x + step[6:]
                 moved = see(candidate, later)
-                value = moved.value(level)
+                value = moved[0].at(level).value(moved[1])
                 higher = penalised(value, candidate, later)
                 if higher > objective + GAIN:
                     break
@@ -232,16 +242,3 @@ def barzilai_borwein(
         if value > best_value:
             best, best_value = here, value
     return best, best_value
-
-
-class Sobol:
-    """A scrambled Sobol sequence over [-1, 1]^dimensions."""
-
-    def __init__(self, dimensions: int, seed: int) -> None:
-        from scipy.stats import qmc  # half a second, which a process that searches nothing is spared
-
-        self._sequence = qmc.Sobol(dimensions, seed=seed)
-
-    def next(self, count: int) -> NDArray[np.float64]:
-        """The next points (count, dimensions)."""
-        return np.asarray(self._sequence.random(count) * 2 - 1)

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import SearchConfig
-from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.registration.score.chance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior, SearchBox
-from calib_ros.registration.search.optimizers import Sobol, levenberg_marquardt, nelder_mead
+from calib_ros.registration.search.optimizers import levenberg_marquardt, nelder_mead
 from calib_ros.registration.search.parallel import SERIAL, Workers
+from calib_ros.registration.starts import Sobol
 
 # What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
 # Seeding. Levels where starts are ranked and optimised first: the two coarsest find 49 of 80 KITTI frames, all three 66; in wide
@@ -151,22 +151,11 @@ class SeedingStrategy:
     level: int
 
 
-def seeding_strategies(first: PointScore, guide: PointScore | None, box: SearchBox, seed: int) -> list[SeedingStrategy]:
-    """By the edges, which `first` scores, on every seed level, and by the guide if there is one."""
-
-    def on_fewer(score: PointScore, points: int) -> PointScore:
-        return score.subset(points, np.random.default_rng(seed))
-
-    ranking = on_fewer(first, RANKING_POINTS)
-    by_edges = [SeedingStrategy(ranking, first, level) for level in (WIDE_SEED_LEVELS if is_wide(box) else SEED_LEVELS)]
-    if guide is None:
-        return by_edges
-    guide = on_fewer(guide, GUIDE_POINTS)
-    return [*by_edges, SeedingStrategy(on_fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL)]
-
-
 class SearchSpace:
-    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from."""
+    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from.
+
+    strategies: by the edges on every seed level, and by the guide if there is one.
+    """
 
     def __init__(
         self,
@@ -183,12 +172,20 @@ class SearchSpace:
         self.score, self.config, self.limits, self.T_prior, self.workers = score, config, limits, T_prior, workers
         self.first = score.subset(FIRST_POINTS, rng)
         self.coarse, self.middle = score.subset(COARSE_POINTS, rng), score.subset(MIDDLE_POINTS, rng)
-        self.strategies = seeding_strategies(self.first, guide, box, config.seed)
+        ranking = self._fewer(self.first, RANKING_POINTS)
+        levels = WIDE_SEED_LEVELS if is_wide(box) else SEED_LEVELS
+        self.strategies = [SeedingStrategy(ranking, self.first, level) for level in levels]
+        if guide is not None:
+            guide = self._fewer(guide, GUIDE_POINTS)
+            self.strategies.append(SeedingStrategy(self._fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL))
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
         self.user_prior, self._inverse_prior = user_prior, se3.inverse(T_prior)
         self._sobol = Sobol(6, seed=config.seed)
+
+    def _fewer(self, score: PointScore, points: int) -> PointScore:
+        return score.subset(points, np.random.default_rng(self.config.seed))
 
     def draw(self) -> Matrix:
         """The next starts (n, 6) in units of the box, -1..1; n a power of two, at which Sobol's sequence is balanced."""
@@ -206,22 +203,13 @@ class SearchSpace:
 @dataclass(eq=False)
 class Optimum:
     """An optimum of the coarse levels, polished once it is among the best. count: starts that ended here. coarse_T: where it was
-    before it was polished; None until it is. final: with all points; None until it is a finalist."""
+    before it was polished; None until it is. final: with all points, and its penalised score; None until it is a finalist."""
 
     value: float
     T: Transform
     count: int = 1
     coarse_T: Transform | None = None
-    final: Finalist | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Finalist:
-    """An optimum on the fine levels with all points, its penalised score, and how many starts ended there."""
-
-    T: Transform
-    value: float
-    count: int
+    final: tuple[Matrix, float] | None = None
 
 
 class Optima:
@@ -242,19 +230,33 @@ class Optima:
             own = progress.part(0.6 * k / len(strategies), 0.6 * (k + 1) / len(strategies))
             starts = seed_starts(self._space, strategy, self._rounds == 0, own.part(0, 0.25))
             self.optimised += optimise_starts(self._space, starts, strategy.level, self._all, own.part(0.25, 1))
-        self._polished += polish_best(self._space, self._all, progress.part(0.6, 0.9))
+        waiting = sorted((o for o in self._all if o.coarse_T is None), key=lambda o: -o.value)[:POLISHED]
+        for k, _ in enumerate(self._space.workers.map(self._polish, waiting)):
+            progress(0.6 + 0.3 * (k + 1) / len(waiting))
+        self._polished += waiting
         self._polished.sort(key=lambda o: -o.value)
         self._rounds += 1
 
+    def _polish(self, optimum: Optimum) -> None:
+        """On the middle levels, by simplex: it is robust where the slope misleads."""
+        space, optimum.coarse_T = self._space, optimum.T
+        for level, step in SIMPLEX_DEG.items():
+            score = space.middle.at(level)
+            optimum.T, optimum.value = nelder_mead(score, optimum.T, step, SIMPLEX_EVALUATIONS, space.penalty, space.limits)
+
     def best(self) -> tuple[Matrix, int]:
         """The best extrinsic (4, 4) so far, and how many starts ended there."""
-        finalists = finish_best(self._space, self._polished)
-        top = max(finalists, key=lambda f: f.value)
-        if self._near is None or self._near[0] is not top.T:  # often the last round's, whose neighbourhood is known
-            found, ends = search_nearby(self._space, top)
-            self._near, self.nearby = (top.T, found), tuple(f.T for f in [*finalists, *ends])
+        unfinished = [o for o in self._polished[:FINALISTS] if o.final is None]
+        for k, final in enumerate(self._space.workers.map(lambda o: finish(self._space, o.T), unfinished)):
+            unfinished[k].final = final
+        # Starts of later rounds may have ended there, too.
+        finalists = [(*o.final, o.count) for o in self._polished if o.final is not None]
+        top, value, _ = max(finalists, key=lambda f: f[1])
+        if self._near is None or self._near[0] is not top:  # often the last round's, whose neighbourhood is known
+            found, ends = search_nearby(self._space, top, value)
+            self._near, self.nearby = (top, found), (*(T for T, _, _ in finalists), *ends)
         best = self._near[1]
-        return best, sum(f.count for f in finalists if _same(f.T, best) or _same(f.T, top.T))
+        return best, sum(count for T, _, count in finalists if _same(T, best) or _same(T, top))
 
 
 def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
@@ -310,72 +312,42 @@ def optimise_starts(
     ends.sort(key=lambda end: -end[0])
     kept = [T for _, T in ends[:CLIMBED]]
     for k, (value, T) in enumerate(space.workers.map(climbed, kept)):
-        add_optimum(optima, T, value)
+        for other in optima:
+            if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
+                other.count += 1
+                if value > other.value and other.coarse_T is None:
+                    other.value, other.T = value, T
+                break
+        else:
+            optima.append(Optimum(value, T))
         progress(0.5 + 0.5 * (k + 1) / len(kept))
     return len(kept)
 
 
-def add_optimum(optima: list[Optimum], T: Transform, value: float) -> None:
-    """Add an optimum of the coarse levels and its penalised score, or count it where it has been found before."""
-    for other in optima:
-        if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
-            other.count += 1
-            if value > other.value and other.coarse_T is None:
-                other.value, other.T = value, T
-            return
-    optima.append(Optimum(value, T))
-
-
-def polish_best(space: SearchSpace, optima: Sequence[Optimum], progress: Progress = SILENT) -> list[Optimum]:
-    """Polish the best of the optima that are not yet; these."""
-    waiting = sorted((o for o in optima if o.coarse_T is None), key=lambda o: -o.value)[:POLISHED]
-    for k, _ in enumerate(space.workers.map(partial(polish, space), waiting)):
-        progress((k + 1) / len(waiting))
-    return waiting
-
-
-def polish(space: SearchSpace, optimum: Optimum) -> None:
-    """On the middle levels, by simplex: it is robust where the slope misleads."""
-    optimum.coarse_T = optimum.T
-    for level, step in SIMPLEX_DEG.items():
-        optimum.T, optimum.value = nelder_mead(
-            space.middle.at(level), optimum.T, step, SIMPLEX_EVALUATIONS, space.penalty, space.limits
-        )
-
-
-def finish_best(space: SearchSpace, polished: Sequence[Optimum]) -> list[Finalist]:
-    """All finalists so far, the best of the polished optima among them. polished: best first."""
-    unfinished = [o for o in polished[:FINALISTS] if o.final is None]
-    for optimum, final in zip(unfinished, space.workers.map(lambda o: finish(space, o.T, o.count), unfinished), strict=True):
-        optimum.final = final
-    # Starts of later rounds may have ended there, too.
-    return [Finalist(o.final.T, o.final.value, o.count) for o in polished if o.final is not None]
-
-
-def finish(space: SearchSpace, T: Transform, count: int = 1) -> Finalist:
-    """On the fine levels with all points."""
+def finish(space: SearchSpace, T: Transform) -> tuple[Matrix, float]:
+    """On the fine levels with all points: the extrinsic, and its penalised score."""
     value = 0.0
     for level in FINE_LEVELS:
         T, value = levenberg_marquardt(space.score.at(level), T, 20, space.user_prior, space.limits, tolerance_deg=0.01)
-    return Finalist(T, value - space.penalty(T), count)
+    return T, value - space.penalty(T)
 
 
-def search_nearby(space: SearchSpace, top: Finalist) -> tuple[Matrix, list[Finalist]]:
-    """Something better near the best finalist, beyond a ridge, else itself; and all optima that were met."""
+def search_nearby(space: SearchSpace, top: Transform, value: float) -> tuple[Matrix, list[Matrix]]:
+    """Something better near the best finalist (4, 4), beyond a ridge, else itself; and all optima that were met."""
     best, ends = top, [top]
     half = np.where(space.half > 0, NEARBY, 0.0)
-    candidates = se3.exp_many(Sobol(6, seed=space.config.seed).next(NEARBY_STARTS) * half) @ top.T
+    candidates = se3.exp_many(Sobol(6, seed=space.config.seed).next(NEARBY_STARTS) * half) @ top
     order = np.argsort(-space.coarse.values(candidates, 2), kind="stable")
 
-    def optimum_from(k: int) -> Finalist:
+    def optimum_from(k: int) -> tuple[Matrix, float]:
         start = space.limits.clip(candidates[k])
         return finish(space, _coarse_optimum(space, space.coarse, 2, start, tolerance_deg=0.02))
 
-    for end in space.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
+    for end, reached in space.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
         ends.append(end)
-        if end.value > best.value + MIN_IMPROVEMENT * abs(best.value):
-            best = end
-    return best.T, ends
+        if reached > value + MIN_IMPROVEMENT * abs(value):
+            best, value = end, reached
+    return best, ends
 
 
 def _coarse_optimum(space: SearchSpace, score: PointScore, level: int, T: Transform, tolerance_deg: float) -> Transform:

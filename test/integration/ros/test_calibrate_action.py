@@ -46,7 +46,8 @@ def one_run(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.E
 
 
 def await_requests(peer: Peer, count: int) -> None:
-    peer.until(lambda: len(peer.pipeline._requests._answered) == count, "that all have joined")
+    requests = peer.pipeline._requests
+    peer.until(lambda: requests._running is not None and len(requests._running.asked) == count, "that all have joined")
 
 
 def assert_answers(peer: Peer, reference: np.ndarray) -> None:

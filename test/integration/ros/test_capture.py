@@ -24,9 +24,9 @@ from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.capture import read_events
 from calib_ros.errors import BadInputError
-from calib_ros.online.black_box import Occasion
 from calib_ros.result import INITIAL, SUSPECT, Result, load
-from calib_ros.ros.capture import MEGABYTE, RawKeyframe, _write_bag
+from calib_ros.ros import capture as capture_module
+from calib_ros.ros.capture import RawKeyframe, _write_bag
 from calib_ros.ros.conversions import Serialized, image_message
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -162,7 +162,7 @@ def size_of(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def test_the_black_box_keeps_to_number_and_size_and_captures_on_request_stay(street, drive, tmp_path):
+def test_the_black_box_keeps_to_number_and_size_and_captures_on_request_stay(street, drive, tmp_path, monkeypatch):
     with Peer(**start(drive.reference, tmp_path, 5)) as peer:
         peer.drive(street[:5])
         assert peer.trigger("capture").success
@@ -170,10 +170,10 @@ def test_the_black_box_keeps_to_number_and_size_and_captures_on_request_stay(str
 
         def record() -> tuple[int, Path]:
             """How many keyframes were written where."""
-            words = capture.write_occasion(Occasion(SUSPECT, result, "{}\n")).split()
+            words = capture.write_occasion(SUSPECT, result, "{}\n").split()
             return int(words[0]), Path(words[-1])
 
-        peer.change(capture__keep=2)
+        monkeypatch.setattr(capture_module, "KEPT", 2)
         for _ in range(4):
             count, newest = record()
         on_request, *events = folders(tmp_path)
@@ -182,12 +182,12 @@ def test_the_black_box_keeps_to_number_and_size_and_captures_on_request_stay(str
         assert newest in events
         assert size_of(newest) > sum(len(f.image.data) + len(f.cloud.data) for f in capture._frames)
 
-        for megabytes, keyframes in ((2 * size_of(newest) // MEGABYTE - 1, 5), (size_of(newest) // MEGABYTE // 2, 2)):
-            peer.change(capture__max_mb=megabytes)
+        for most, keyframes in ((2 * size_of(newest) - 1_000_000, 5), (size_of(newest) // 2, 2)):
+            monkeypatch.setattr(capture_module, "MOST_BYTES", most)
             count, newest = record()
             assert (count, [on_request, newest]) == (keyframes, folders(tmp_path))
-            assert size_of(newest) <= megabytes * MEGABYTE
-        peer.change(capture__max_mb=1)
-        with pytest.raises(BadInputError, match=r"capture\.max_mb = 1 is less than a keyframe takes"):
+            assert size_of(newest) <= most
+        monkeypatch.setattr(capture_module, "MOST_BYTES", 100_000)
+        with pytest.raises(BadInputError, match="nothing captured of suspect: there is no keyframe, or one takes all"):
             record()
         assert folders(tmp_path) == [on_request, newest]

@@ -187,7 +187,7 @@ def test_a_node_that_stops_answers_and_ends(checked):
     """Last of all: the node is gone afterwards."""
     peer = checked.peer
     under_way = checked.ask(se3.inverse(checked.reference))
-    peer.until(lambda: peer.pipeline._deferred._running, "the check to begin")
+    peer.until(lambda: peer.pipeline._requests._running, "the check to begin")
     peer.pipeline.stop()
     peer.until(under_way.done, "an answer")
     assert not under_way.result().success

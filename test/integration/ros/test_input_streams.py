@@ -151,7 +151,7 @@ def test_no_keyframe_in_a_sharp_turn(street, drive, source, kind):
             else:
                 message.angular_velocity.y = np.deg2rad(turn_deg)
             publisher.publish(message)
-            peer.until(lambda stamp=stamp: gate.newest is not None and gate.newest.stamp == stamp)
+            peer.until(lambda stamp=stamp: gate.newest is not None and gate.newest[0] == stamp)
             peer.publish(frame)
             assert peer.recalibrator.keyframes_seen == keyframes
         peer.until(lambda: peer.values.get("frames too fast for a keyframe") == "2")

@@ -13,7 +13,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from ros_peer import Peer, start_parameters
 from vehicle import QUICK, Vehicle, is_right, off
 
-from calib_ros.ros.lifecycle_node import CalibLifecycleNode
+from calib_ros.ros.node import CalibLifecycleNode
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 UNCONFIGURED, INACTIVE = State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_INACTIVE

@@ -23,7 +23,7 @@ import rclpy.executors, rclpy.lifecycle
 sys.modules["rclpy.qos_event"] = sys.modules["rclpy.event_handler"]  # of Humble, with the same classes
 for name in ("event_handler", "endpoint_info", "topic_endpoint_info", "parameter_client", "parameter_event_handler", "type_hash"):
     sys.modules[f"rclpy.{name}"] = None
-import calib_ros.ros.bags, calib_ros.ros.client, calib_ros.ros.lifecycle_node, calib_ros_view.node.watch
+import calib_ros.ros.bags, calib_ros.ros.client, calib_ros.ros.node, calib_ros_view.node.watch
 from calib_ros.ros.distributions import SubscriptionEventCallbacks
 from calib_ros.ros.node import CalibNode
 rclpy.init()

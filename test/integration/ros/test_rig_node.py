@@ -44,8 +44,7 @@ from calib_ros.registration import features
 from calib_ros.rig.report import load
 from calib_ros.ros import conversions
 from calib_ros.ros.conversions import matrix_from_transform
-from calib_ros.ros.lifecycle_node import CalibLifecycleNode
-from calib_ros.ros.node import interface
+from calib_ros.ros.node import CalibLifecycleNode, interface
 from calib_ros.ros.rig_lidars import LidarsOfRig
 from calib_ros.ros.rig_pairs import UNSEEN_SCANS, PairOfRig
 from calib_ros.ros.tf import LATCHED

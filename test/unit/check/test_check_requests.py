@@ -71,7 +71,6 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
     assert (recalibrator.current, list(recalibrator.buffer), len(driven.states)) == (before, kept, states)
     assert driven.errors == []
     assert pipeline.wait_idle(SOON)
-    assert [outcome.result for outcome in driven.outcomes] == [own.result, given.result]
     counts = pipeline.load.counts()
     assert counts.seconds[Work.CHECKS] > 0
     assert counts.seconds[Work.ESTIMATES] == of_estimates

@@ -11,7 +11,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
-from onnx_graphs import completion, endless, failing, range_network, segmentation
+from onnx_graphs import endless, failing, range_network, segmentation
 from sam_graphs import official_decoder, raw_encoder
 
 from calib_ros.cli import main
@@ -207,24 +207,3 @@ def test_rare_classes_lie_on_top_from_above(drive) -> None:
     assert (u, v) == pytest.approx((450 - 450 / 4, 450 - 450 / 2), abs=2)
     assert not (picture[:900] == COLORS[C.GROUND]).all(axis=2).any()
     assert not (picture == COLORS[C.VEHICLE]).all(axis=2).any()
-
-
-def test_a_completion_network_is_tried_too(capsys, tmp_path: Path) -> None:
-    """Beside the others, at the source's extrinsic; one that fits no convention is named, with exit 2."""
-    config, good = tmp_path / "config.yaml", completion(tmp_path / "own.onnx", channels=(0.0,))
-    config.write_text(f"{{semantics: {{segmentation: none}}, thesis: {{completion: {good}}}}}")
-    code, out, err = run(capsys, SMALL, "--config", config, "--out", tmp_path)
-    assert (code, err) == (0, "")
-    lines = parts(out)["completion"]
-    assert lines[0] == f"completion: {good}"
-    assert "completion network: ?x?, depth in 1/1 m, image grey" in lines[2]
-    kept = float(re.search(r"; (\d+) % of the measured depths kept to 10 %", " ".join(lines))[1])
-    assert 60 < kept < 100  # the largest depth within 2 px is far off at outlines only
-    assert cv2.imread(str(tmp_path / "completion.png")).shape == (120, 320, 3)
-    completion(good, None)
-    good.with_suffix(".yaml").unlink()
-    code, out, err = run(capsys, SMALL, "--config", config)
-    assert code == 2
-    assert err.startswith("calib-ros: thesis.completion: ")
-    assert "must say 'depth_scale:'" in err
-    assert err.count("\n") == 1

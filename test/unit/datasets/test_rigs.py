@@ -282,5 +282,4 @@ def test_the_page_of_the_rigs_lists_them_all() -> None:
     page = (Path(__file__).parents[3] / "docs" / "synthetic.md").read_text(encoding="utf-8")
     for names, title in ((RIGS, "Rigs"), (SCENES, "Scenes"), (CONDITIONS, "Conditions")):
         _, _, section = page.partition(f"## {title}\n")
-        rows = re.findall(r"^\| `(\w+)` \|", section.partition("\n## ")[0], re.MULTILINE)
-        assert rows == list(names), title
+        assert re.findall(r"`(\w+)`", section.partition("\n## ")[0]) == list(names), title

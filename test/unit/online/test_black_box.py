@@ -27,10 +27,10 @@ class Box(BlackBox):
     """One that notes what is to be recorded, by a clock that a test turns."""
 
     def __init__(self, *kinds: str) -> None:
-        self.now, self.kinds, self.recorded = 0.0, list(kinds), list[Occasion]()
+        self.now, self.kinds, self.recorded = 0.0, list(kinds), list[tuple[Occasion, str]]()
         inputs = Inputs(lambda *_: FRAME, lambda *_: ("camera", "lidar"), lambda *_: None)
         self.pipeline = Pipeline(Config(), inputs, lambda event: None)
-        super().__init__(self.pipeline, lambda: self.kinds, self.recorded.append, lambda: self.now)
+        super().__init__(self.pipeline, lambda: self.kinds, lambda *own: self.recorded.append(own), lambda: self.now)
 
     def says(self, status: str, usable: bool = False, T: np.ndarray | None = None, **values: Any) -> None:
         own = {name: values.pop(name) for name in ("p_value", "disputed_since", "accepted") if name in values}
@@ -43,7 +43,7 @@ class Box(BlackBox):
 
     @property
     def kinds_recorded(self) -> list[str]:
-        return [occasion.kind for occasion in self.recorded]
+        return [occasion.kind for occasion, _ in self.recorded]
 
 
 @pytest.fixture
@@ -72,8 +72,8 @@ def test_where_none_come_it_waits_for_some_seconds_or_the_end(box: Box) -> None:
     box.check()
     assert box.kinds_recorded == [MOVED]
     box.says(BLINDED)
-    box.flush()
-    box.flush()
+    box.check(flush=True)
+    box.check(flush=True)
     assert box.kinds_recorded == [MOVED, BLINDED]
 
 
@@ -83,7 +83,7 @@ def test_a_status_that_flaps_is_recorded_once_a_minute(box: Box) -> None:
         box.says(CONVERGED, True)
         box.now += SPACING_S / 3
     box.says(MOVED)  # of another kind
-    box.flush()
+    box.check(flush=True)
     assert box.kinds_recorded == [SUSPECT, SUSPECT, MOVED]
 
 
@@ -93,10 +93,10 @@ def test_only_what_is_wanted_at_present_is_recorded(box: Box) -> None:
     box.kinds = [MOVED]
     box.says(MOVED, reason="still")  # no change
     box.says(BLINDED)
-    box.flush()
+    box.check(flush=True)
     assert box.recorded == []
     box.says(MOVED)
-    box.flush()
+    box.check(flush=True)
     assert box.kinds_recorded == [MOVED]
 
 
@@ -104,7 +104,7 @@ def test_every_refused_estimate_is_an_occasion_also_while_the_mount_has_moved(bo
     refusal = {"refusal": RefusalCode.LOW_SCORE, "optimum": np.eye(4)}
     box.kinds = [REFUSED]
     box.says(MOVED)
-    box.flush()
+    box.check(flush=True)
     assert box.recorded == []
     box.says(MOVED, **refusal)
     box.now += SPACING_S
@@ -112,9 +112,9 @@ def test_every_refused_estimate_is_an_occasion_also_while_the_mount_has_moved(bo
     box.says(REFUSED)
     box.now += SPACING_S
     box.says(REFUSED)  # one more
-    box.flush()
+    box.check(flush=True)
     assert box.kinds_recorded == [REFUSED] * 3
-    assert [json.loads(o.events.splitlines()[-1])["status"] for o in box.recorded] == [MOVED, REFUSED, REFUSED]
+    assert [json.loads(events.splitlines()[-1])["status"] for _, events in box.recorded] == [MOVED, REFUSED, REFUSED]
 
 
 def test_what_is_recorded_is_the_extrinsic_that_was_used(box: Box) -> None:
@@ -122,8 +122,8 @@ def test_what_is_recorded_is_the_extrinsic_that_was_used(box: Box) -> None:
     T = nominal(3.0)
     box.says(CONVERGED, True, T, covariance=np.eye(6), score=0.7)
     box.says(MOVED, False, nominal(9.0), score=0.1)
-    box.flush()
-    result = box.recorded[0].result
+    box.check(flush=True)
+    result = box.recorded[0][0].result
     assert np.array_equal(result.T_camera_lidar, T)
     assert (result.status, result.reason, result.score) == (MOVED, "it is moved", 0.7)
 
@@ -138,9 +138,9 @@ def test_events_tell_what_led_to_it(box: Box) -> None:
     box.add(Problem("the cloud has no intensity", "intensity"))
     box.add(Problem("the cloud has no intensity", "intensity"))
     box.note("no messages on points", "health")
-    box.flush()
+    box.check(flush=True)
     assert {*box.kinds_recorded} == {SUSPECT, MOVED, REFUSED}
-    told = {occasion.kind: [json.loads(line) for line in occasion.events.splitlines()] for occasion in box.recorded}
+    told = {occasion.kind: [json.loads(line) for line in events.splitlines()] for occasion, events in box.recorded}
     suspect, moved = told[SUSPECT], told[MOVED]
     assert [event["event"] for event in moved] == [
         *("status", "keyframe", "estimate", "status", "alarm", "status", "problem", "health", "capture")

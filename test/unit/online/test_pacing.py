@@ -159,9 +159,9 @@ def test_another_share_takes_effect_at_once() -> None:
 
 def test_a_meter_books_cpu_time_under_one_work_after_the_other() -> None:
     budget = LoadBudget(OnlineConfig())
-    with budget.counting(Work.INTAKE) as meter:
+    with budget.counting(Work.INTAKE) as switch:
         threading.Event().wait(0.3)  # takes no CPU time
-        meter.switch(Work.KEYFRAMES)
+        switch(Work.KEYFRAMES)
         sum(range(3_000_000))
     with pytest.raises(ZeroDivisionError), budget.counting(Work.CLASSES):  # work that fails counts as well
         sum(range(300_000)) / 0

@@ -379,7 +379,7 @@ def test_configure_keeps_keyframes_whose_features_stay_the_same(drive, start):
 
 
 @pytest.mark.parametrize(
-    "change", [{"image": {"max_width": 320}}, {"lidar": {"max_range": 30.0}}, {"score": {"weight_reflectivity": 0.2}}]
+    "change", [{"image": {"max_width": 320}}, {"lidar": {"min_range": 3.0}}, {"score": {"weight_reflectivity": 0.2}}]
 )
 def test_configure_drops_keyframes_whose_features_change(drive, start, change):
     recalibrator = taken_in([drive[0], drive[-1]], start)

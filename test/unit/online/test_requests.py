@@ -1,4 +1,4 @@
-"""Requests for an estimate: shared, cancelled, refused. The pipeline under them runs real estimates."""
+"""Requests for estimates and other jobs: shared, cancelled, refused. The pipeline under them runs real estimates."""
 
 from __future__ import annotations
 
@@ -12,88 +12,176 @@ from waiting import LIMIT_S, until
 from calib_ros.config import update
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.online.requests import Requests
+from calib_ros.online.requests import ESTIMATE, MAX_WAITING, Pending, Requests
 from calib_ros.online.worker import Cancelled
-from calib_ros.result import INITIAL, Extrinsic, Result
+from calib_ros.result import Extrinsic
 from calib_ros_synthetic.drive import SyntheticDrive
 
 SOON = LIMIT_S
 LONG_SEARCH = {"search": {"rotation_deg": 3.0, "translation_m": 0.3, "starts": 1 << 20}}
+OUTCOME = "outcome"
 
 
-@pytest.fixture
-def extrinsic(drive: SyntheticDrive) -> Extrinsic:
-    return Extrinsic(Result(drive.reference, INITIAL))
+def go_on() -> None:
+    """A thread that is not to end."""
 
 
-def test_requests_over_the_same_keyframes_share_a_run(extrinsic: Extrinsic) -> None:
-    requests = Requests()
-    first, first_needs = requests.add(3)
-    second, second_needs = requests.add(3)  # nothing runs yet: both are answered by the run that begins next
-    assert requests.begin(3)
-    third, third_needs = requests.add(3)
-    later, later_needs = requests.add(4)
-    assert (first_needs, second_needs, third_needs, later_needs) == (True, True, False, True)
-    requests.answer(extrinsic)
-    assert first.result(0) is second.result(0) is third.result(0) is extrinsic
-    assert not later.done()
-    assert requests.begin(4)
-    requests.fail(CalibrationError("no"))
-    with pytest.raises(CalibrationError, match="no"):
-        later.result(0)
-    assert not requests.begin(4)
+class Queue(Requests):
+    """Estimates and checks, which return OUTCOME after what a test does meanwhile."""
+
+    def ask(self, keyframes: int, progress=None) -> Future[str]:
+        return self.add(Pending(ESTIMATE), keyframes, progress)
+
+    def check(self, key: object, obstacle: str = "") -> Future[str]:
+        return self.add(Pending("check", key), obstacle=obstacle)
+
+    def do(
+        self, keyframes: int | None = None, meanwhile=lambda progress: None, check_cancelled=go_on, is_due: bool = False
+    ) -> bool:
+        """An estimate over so many keyframes, None = a check; False if there is none to be done, Cancelled or not."""
+        job = self.begin(keyframes is not None, keyframes, is_due)
+        if job is not None:
+            assert self.run(job, lambda progress: [meanwhile(progress), OUTCOME][1], check_cancelled) is OUTCOME
+        return job is not None
 
 
-def test_progress_goes_to_those_who_still_wait(extrinsic: Extrinsic) -> None:
-    requests = Requests()
-    heard: dict[str, list[tuple[str, float]]] = {"first": [], "second": []}
-    first, _ = requests.add(1, lambda *said: heard["first"].append(said))
-    requests.begin(1)
-    requests.report("search", 0.25)
-    requests.add(1, lambda *said: heard["second"].append(said))
-    requests.report("search", 0.5)
-    assert first.cancel()
-    requests.report("search", 0.75)
-    assert heard == {"first": [("search", 0.25), ("search", 0.5)], "second": [("search", 0.5), ("search", 0.75)]}
-    requests.answer(extrinsic)
+def test_requests_for_an_estimate_share_the_next_and_those_over_the_same_keyframes_the_one_under_way() -> None:
+    queue, asked = Queue(), []
+    first, second = queue.ask(2), queue.ask(3)  # nothing runs yet: both are answered by the run that begins next
+    assert queue.do(3, lambda _: asked.extend([queue.ask(3), queue.ask(4), queue.close(), queue.ask(3)]))
+    joins, *later = (future for future in asked if future)
+    assert [future.result(0) for future in (first, second, joins)] == [OUTCOME] * 3
+    assert not any(future.done() for future in later)
+    assert queue.do(4)
+    assert [future.result(0) for future in later] == [OUTCOME] * 2
+    assert not queue.do(4)
+
+
+def test_checks_with_the_same_key_share_one_that_has_not_begun() -> None:
+    queue, asked = Queue(), []
+    first, again, other = queue.check(1), queue.check(1), queue.check(2)
+    queue.add(Pending("count", 1))
+    assert queue.do(None, lambda _: asked.append(queue.check(1)))
+    assert [first.result(0), again.result(0)] == [OUTCOME] * 2
+    assert [other.done(), asked[0].done()] == [False, False]
+    assert queue.do()
+    assert other.result(0) is OUTCOME
+    assert [queue.do(), queue.do()] == [True, True]  # the count, and what was asked for meanwhile
+    assert asked[0].result(0) is OUTCOME
+    assert not queue.waiting
+
+
+def test_more_than_a_few_waiting_are_turned_away() -> None:
+    queue = Queue()
+    waiting = [queue.check(k) for k in range(MAX_WAITING)]
+    with pytest.raises(CalibrationError, match="8 checks wait already; ask again"):
+        queue.check(80).result(0)
+    same, estimate = queue.check(0), queue.ask(1)
+    queue.do()
+    assert same.result(0) is waiting[0].result(0) is OUTCOME  # the same as one that waits costs nothing
+    assert [queue.check(80).done(), estimate.done()] == [False, False]
+
+
+def test_what_goes_wrong_is_said_to_who_asked_and_the_next_is_done() -> None:
+    def fails(progress):
+        raise ZeroDivisionError("a defect")
+
+    queue = Queue()
+    first, cancelled, second = queue.check(1), queue.check(2), queue.check(3)
+    assert cancelled.cancel()
+    with pytest.raises(ZeroDivisionError):
+        queue.do(None, fails)
+    assert isinstance(first.exception(0), ZeroDivisionError)
+    assert queue.do()
+    assert second.result(0) is OUTCOME
     with pytest.raises(CancelledError):
-        first.result(0)
+        cancelled.result(0)
+    assert not queue.do()
+
+
+def test_progress_goes_to_those_who_still_wait() -> None:
+    heard: dict[str, list[float]] = {"first": [], "second": []}
+    queue = Queue()
+    first = queue.ask(1, lambda stage, share: heard["first"].append(share))
+
+    def meanwhile(progress) -> None:
+        progress("search", 0.25)
+        queue.ask(1, lambda stage, share: heard["second"].append(share))
+        progress("search", 0.5)
+        assert first.cancel()
+        progress("search", 0.75)
+
+    assert queue.do(1, meanwhile)
+    assert heard == {"first": [0.25, 0.5], "second": [0.5, 0.75]}
+    assert first.cancelled()
 
 
 def test_a_run_ends_when_the_last_request_is_cancelled_and_nobody_joins_it_then() -> None:
-    requests = Requests()
-    first, _ = requests.add(1)
-    requests.begin(1)
-    second, _ = requests.add(1)
-    first.cancel()
-    requests.report("search", 0.1)
-    second.cancel()
+    queue = Queue()
+    first = queue.ask(1)
+
+    def meanwhile(progress) -> None:
+        second = queue.ask(1)
+        first.cancel()
+        progress("search", 0.1)
+        second.cancel()
+        try:
+            progress("search", 0.2)
+        finally:
+            queue.ask(1)
+
     with pytest.raises(Cancelled):
-        requests.report("search", 0.2)
-    assert requests.add(1)[1]
+        queue.do(1, meanwhile)
+    assert queue.do(1)
 
 
-def test_a_run_that_nobody_waits_for_goes_on() -> None:
-    requests = Requests()
-    requests.add(1)[0].cancel()  # before its run: it is not answered
-    assert not requests.begin(1)
-    requests.report("search", 0.1)
-    assert requests.add(1)[1]  # it does not search the whole box
+def test_a_run_that_nobody_waits_for_goes_on_and_is_not_joined() -> None:
+    """It does not search the whole box."""
+    queue = Queue()
+    queue.ask(1).cancel()
+    assert not queue.do(1)
+    assert queue.do(1, lambda progress: [progress("search", 0.1), queue.ask(1)], is_due=True)
+    assert queue.waiting
 
 
-def test_refused_requests_fail_at_once_with_the_reason() -> None:
-    requests = Requests()
-    answered, _ = requests.add(1)
-    requests.begin(1)
-    waiting, _ = requests.add(2)
-    requests.refuse("not now")
-    late, needs_run = requests.add(1)
-    assert not needs_run
-    assert [str(future.exception(0)) for future in (answered, waiting, late)] == ["not now"] * 3
+@pytest.mark.parametrize("keyframes", [1, None], ids=["an estimate", "a check"])
+def test_refused_requests_fail_at_once_and_the_one_under_way_ends(keyframes: int | None) -> None:
+    queue, late = Queue(), []
+
+    def ask() -> Future[str]:
+        return queue.check(object()) if keyframes is None else queue.ask(keyframes)
+
+    def meanwhile(progress) -> None:
+        waiting = queue.check(2)
+        queue.refuse("not now")
+        late.extend([ask(), waiting, queue.check(1, "an obstacle")])
+        assert str(answered.exception(0)) == "not now"
+        queue.accept()  # who asks again at once does not keep it alive
+        late.append(queue.check(1, "an obstacle"))
+        progress("search", 0.5)
+
+    answered = ask()
     with pytest.raises(Cancelled):
-        requests.report("search", 0.1)
-    requests.accept()
-    assert requests.add(1)[1]
+        queue.do(keyframes, meanwhile)
+    assert [str(future.exception(0)) for future in late] == ["not now"] * 3 + ["an obstacle"]
+    assert not queue.waiting
+    queue.refuse("not now")
+    assert not queue.do(1, is_due=True)
+
+
+def test_a_thread_that_is_to_end_ends_its_job() -> None:
+    def stopping() -> None:
+        raise Cancelled
+
+    queue = Queue()
+    asked = queue.check(1)
+    with pytest.raises(Cancelled):
+        queue.do(check_cancelled=stopping)
+    queue.refuse()
+    assert [str(future.exception(0)) for future in (asked, queue.check(1), queue.ask(1))] == [
+        *["the check was ended: the node is stopping"] * 2,
+        "the estimate was ended: the node is stopping",
+    ]
 
 
 def searching(driven: Driven) -> Future[Extrinsic]:

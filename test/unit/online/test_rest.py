@@ -13,6 +13,7 @@ from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online import pacing
+from calib_ros.online.monitor import CONFIRM
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.tracker_states import Confirmations
 from calib_ros.result import BLINDED, CONVERGED, MOVED, SUSPECT
@@ -196,7 +197,7 @@ def resting(street: list[Frame], start: np.ndarray) -> Parade:
 
 
 def test_a_keyframe_that_fits_a_little_worse_ends_the_rest(resting: Parade) -> None:
-    """0.14 deg are no movement (monitor.least_deg): the estimates are to follow."""
+    """0.14 deg are no movement (LEAST_DEG): the estimates are to follow."""
     made = len(resting.estimates)
     resting(6, turned_deg=0.14)
     tracker = resting.recalibrator.tracker
@@ -216,8 +217,7 @@ def test_a_refused_estimate_and_a_displaced_mount_end_the_rest(resting: Parade, 
     made, now = len(resting.estimates), resting.n * GAP_S
     resting(12, turned_deg=1.5)
     after = resting.estimates[made:]
-    confirm = recalibrator.config.monitor.confirm
-    assert confirm * GAP_S - GAP_S <= after[0] - now <= (confirm + 3) * GAP_S  # the monitor decides first
+    assert CONFIRM * GAP_S - GAP_S <= after[0] - now <= (CONFIRM + 3) * GAP_S  # the monitor decides first
     assert gaps(after[:5]) == [GAP_S] * 4
     T = recalibrator.current.result.T_camera_lidar
     assert se3.rotation_error_deg(turned_mount(drive.reference, 1.5), T) < 0.2
@@ -236,9 +236,10 @@ def test_a_drift_is_followed(street: list[Frame], start: np.ndarray, drive: Synt
 
 
 @pytest.fixture
-def standing(street: list[Frame], start: np.ndarray) -> Parade:
+def standing(street: list[Frame], start: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> Parade:
     """At rest, in front of a picture that stays the same, so that there is no keyframe; looks at the frames go on."""
-    parade = Parade(street, start, monitor={"frozen_images": 0})
+    monkeypatch.setattr("calib_ros.online.sensor_health.FROZEN_IMAGES", 1000)
+    parade = Parade(street, start)
     parade(8)
     parade.settle()
     return parade

@@ -19,7 +19,7 @@ SLOW = np.zeros(6)
 
 @pytest.fixture
 def gate() -> SpeedGate:
-    return SpeedGate(OnlineConfig(max_speed=10.0, max_turn_deg_s=20.0))
+    return SpeedGate(OnlineConfig(max_turn_deg_s=20.0))
 
 
 def moving(frame: Frame, speed: float, turn_deg: float) -> Frame:
@@ -35,9 +35,9 @@ def still(street: list[Frame]) -> Frame:
     ("speed", "turn", "figure"),
     [
         (0.0, 0.0, ""),
-        (10.0, 20.0, ""),
-        (10.1, 0.0, "10.1 m/s"),
-        (-15.0, 0.0, "15.0 m/s"),
+        (40.0, 20.0, ""),
+        (40.1, 0.0, "40.1 m/s"),
+        (-45.0, 0.0, "45.0 m/s"),
         (0.0, -21.0, "21.0 deg/s"),
         (None, 30.0, "30.0 deg/s"),
         (50.0, None, "50.0 m/s"),
@@ -55,12 +55,12 @@ def test_measurements(gate: SpeedGate, still: Frame, speed: float | None, turn: 
 
 def test_stale_measurements_do_not_count(gate: SpeedGate, still: Frame) -> None:
     for age, allowed in ((0.0, False), (0.5, False), (-0.5, False), (0.51, True), (-0.51, True), (-3600.0, True)):
-        gate.add_measurement(still.stamp - round(age * NANOSECONDS), 30.0, 0.0)
+        gate.add_measurement(still.stamp - round(age * NANOSECONDS), 50.0, 0.0)
         assert gate.allows(still) is allowed, age
 
 
 def test_a_frames_twist_counts_where_nothing_is_measured(gate: SpeedGate, still: Frame) -> None:
-    fast, turning = moving(still, 30.0, 0.0), moving(still, 0.0, 45.0)
+    fast, turning = moving(still, 50.0, 0.0), moving(still, 0.0, 45.0)
 
     def allowed() -> tuple[bool, bool]:
         return gate.allows(fast), gate.allows(turning)
@@ -70,15 +70,16 @@ def test_a_frames_twist_counts_where_nothing_is_measured(gate: SpeedGate, still:
     assert allowed() == (True, True)
     gate.add_measurement(still.stamp, None, 1.0)  # an IMU knows the turn rate only
     assert allowed() == (False, True)
-    gate.config = OnlineConfig(max_speed=40.0)  # limits change at run time
-    assert allowed() == (True, True)
+    gate.config = OnlineConfig(max_turn_deg_s=0.5)  # limits change at run time
+    assert allowed() == (False, False)
 
 
-def test_the_estimated_twist_counts_too() -> None:
+def test_the_estimated_twist_counts_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no odometry tells, the motion estimated from scans does: the limit is below the drive's 3 m/s."""
     pytest.importorskip("small_gicp")
     drive = SyntheticDrive(seed=1, frames=4, rings=32, width=320, height=96, speed=3.0, stride=1)
-    options = {"online": {"max_speed": 2.0, "keyframe_spacing_s": 0.0, "similarity_threshold": 1.0}}
+    monkeypatch.setattr("calib_ros.online.keyframes.MAX_SPEED", 2.0)
+    options = {"online": {"keyframe_spacing_s": 0.0, "similarity_threshold": 1.0}}
     recalibrator = Recalibrator(drive.camera, drive.reference, Config.from_dict(options))
     taken = [recalibrator.ingest(dataclasses.replace(frame, twist=None)) for frame in (drive[i] for i in range(4))]
     assert isinstance(recalibrator.motion.last, Motion)

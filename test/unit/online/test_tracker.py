@@ -31,7 +31,7 @@ from calib_ros.online.monitor import Verdict
 from calib_ros.online.pose_filter import SYSTEMATIC_COVARIANCE, PoseFilter, without_systematic_error
 from calib_ros.online.tracker import SETTLED_DEG, SETTLED_M, UNSETTLING_REJECTIONS, Tracker
 from calib_ros.online.tracker_states import TRANSITIONS, TrackerState
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, Result
 
 
@@ -118,9 +118,11 @@ def test_consecutive_refusals_reopen_the_search_at_the_last_good_extrinsic():
 # --- fusion ---------------------------------------------------------------------------------------------------------------
 
 
-def test_repeated_frames_do_not_shrink_the_covariance():
+def test_repeated_frames_do_not_shrink_the_covariance(monkeypatch):
     """30 estimates over the same 20 frames, one of which is new each time, tell as much as 30 frames."""
-    tracker = settled(Config(tracker=TrackerConfig(process_noise_deg=0.0, process_noise_m=0.0)))
+    for noise in ("PROCESS_NOISE_DEG", "PROCESS_NOISE_M"):
+        monkeypatch.setattr(f"calib_ros.online.pose_filter.{noise}", 0.0)
+    tracker = settled()
     start = tracker.spread
     for count, share, rtol in ((30, 1 / 20, 1e-3), (5, 0.0, 0.01)):
         for _ in range(count):

@@ -64,7 +64,7 @@ def test_items_are_worked_on_in_another_thread(make):
     recorder = make()
     recorder.put(0, None, 2)
     assert recorder.items == [0, None, 2]
-    assert recorder.threads == {"recorder"}
+    assert recorder.threads == {"recorder_0"}
 
 
 def test_the_newest_item_replaces_those_that_wait(make):
@@ -148,9 +148,10 @@ def test_busy_time_counts_the_work_under_way(make):
 
 def test_what_an_idle_thread_was_woken_for_is_not_replaced(make):
     """However late it wakes: one item is at work and one waits."""
-    recorder = make()
-    with recorder.worker._changed:  # it cannot begin meanwhile
-        assert [recorder.worker.put(k) for k in range(4)] == [[], [], [1], [2]]
+    recorder, wake = make(), threading.Event()
+    recorder.worker._thread.submit(wake.wait)
+    assert [recorder.worker.put(k) for k in range(4)] == [[], [], [1], [2]]
+    wake.set()
     assert recorder.worker.wait_idle(SOON)
     assert recorder.items == [0, 3]
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from bowl import CURVATURE, OPTIMUM, Bowl
 from scenes import NEAR, QUICK, Scene
+from thesis_constants import with_constants
 
 from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig, update
@@ -204,10 +205,10 @@ def test_strong_priors_hold_and_weak_priors_yield(scene, box, optimizer):
 def test_thesis_objective_respects_constraints(scene, dense_edges):
     values = {
         "refine": {"objective": "thesis"},
-        "thesis": {"dense_edges": dense_edges, "evaluations": 30},
+        "thesis": {"dense_edges": dense_edges},
         "constraints": {"limit_deg": [180, 0.2, 180], "limit_m": [0, 0, 0]},
     }
-    thesis = Calibrator(scene.camera, Config.from_dict(values))
+    thesis = Calibrator(scene.camera, with_constants(Config.from_dict(values), evaluations=30))
     start = scene.off(([0, 0.6, 0], [0, 0, 0]))
     start[:3, 3] = -start[:3, :3] @ camera_centre(scene.truth)
     features = [thesis.extract(f) for f in scene.frames[:2]]

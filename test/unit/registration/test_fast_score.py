@@ -17,7 +17,6 @@ from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import UPWARD, EdgePoints
 from calib_ros.registration.covariance import (
     FEW_POINTS,
-    SYSTEMATIC_ERROR,
     USUAL_NOISE,
     covariance,
     effective_frames,
@@ -28,9 +27,9 @@ from calib_ros.registration.covariance import (
 )
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import (
-    MARGIN,
+from calib_ros.registration.score.fast_score import (
     RING_SPACING_DEG,
     WEIGHT_FLOOR,
     WEIGHT_SIDE,
@@ -39,6 +38,7 @@ from calib_ros.registration.score.point_score import (
     WEIGHT_TOP,
     FastScore,
 )
+from calib_ros.registration.score.point_score import MARGIN
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, pose_constraints
 
@@ -267,7 +267,7 @@ def test_too_few_points_are_refused_with_their_number(monkeypatch):
         FastScore(few, nominal(), CONFIG)
     with pytest.raises(TooFewFeaturesError, match="no edge points"):
         FastScore([frame(0)], se3.from_parts(np.diag([-1.0, 1, -1]) @ nominal()[:3, :3], [0, 0, -500]), CONFIG)
-    monkeypatch.setattr("calib_ros.registration.score.point_score.MIN_POINTS", 100)
+    monkeypatch.setattr("calib_ros.registration.score.fast_score.MIN_POINTS", 100)
     FastScore(few, nominal(), CONFIG)
 
 

@@ -18,7 +18,7 @@ from calib_ros.registration.camera_rounds import refined_with_camera
 from calib_ros.registration.nuisance.lens import Intrinsic
 from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate, wrong_parameter
 from calib_ros.registration.nuisance.refinement import joint_optimum, lens_parameters
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, SearchBox, unlimited
 from calib_ros.result import CONVERGED, RefusalCode, Result
 
@@ -91,7 +91,7 @@ def test_right_intrinsics_are_estimated_as_given(scene):
 @pytest.mark.parametrize("focal", [-0.01, 0.01])
 def test_a_focal_length_one_per_cent_off_is_an_unknown_and_no_reason_to_refuse(scene, focal):
     result = calibrated(scene, wrong(scene.camera, focal))
-    exact = calibrated(scene, wrong(scene.camera, focal), camera={"focal_sigma": 0.0, "centre_sigma": 0.0})
+    exact = calibrated(scene, wrong(scene.camera, focal), camera={"focal_sigma": 0.0})
     assert result.converged
     assert result.intrinsics[FOCAL].value == pytest.approx(-focal, abs=0.006)
     assert exact.intrinsics == {}
@@ -183,7 +183,7 @@ def test_a_right_camera_stays_so(scene):
 
 
 def test_exact_intrinsics_are_left_alone(scene):
-    names = [own.name for own in lens_parameters(CameraConfig(focal_sigma=0.0, centre_sigma=0.0), scene.camera, scene.camera)]
+    names = [own.name for own in lens_parameters(CameraConfig(focal_sigma=0.0), scene.camera, scene.camera)]
     assert names == [RADIAL]
 
 
@@ -193,7 +193,7 @@ def test_exact_intrinsics_are_left_alone(scene):
 def test_of_models_without_a_radial_coefficient_focal_length_and_centre_are_refined(model, D):
     camera = Camera(K, 1280, 720, model, np.array(D))
     assert [own.name for own in lens_parameters(CameraConfig(), camera, camera.rectified())] == [FOCAL, *CENTRE]
-    assert lens_parameters(CameraConfig(focal_sigma=0.0, centre_sigma=0.0), camera, camera.rectified()) == ()
+    assert lens_parameters(CameraConfig(focal_sigma=0.0), camera, camera.rectified()) == ()
 
 
 def test_unrolled_pictures_show_no_intrinsics(scene):

@@ -12,7 +12,6 @@ from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.classes import Hypothesis
@@ -89,13 +88,12 @@ def test_invalid_views_are_refused(problem: str) -> None:
 
 
 def test_tilted_and_distant_poses_are_not_allowed() -> None:
-    config = GuessConfig(tilt_deg=20, distance_m=1.0)
     zero = np.zeros(6)
-    tilts = np.deg2rad([0, 19, 21, 0, 0, 0])
-    rolls = np.deg2rad([0, 0, 0, -21, 19, 0])
-    centres = np.c_[zero, zero, [0, 0.9, 0, 0, 0, 1.1]]
+    tilts = np.deg2rad([0, 24, 26, 0, 0, 0])
+    rolls = np.deg2rad([0, 0, 0, -26, 24, 0])
+    centres = np.c_[zero, zero, [0, 1.9, 0, 0, 0, 2.1]]
     T = poses(np.deg2rad(np.arange(6) * 60.0), tilts, rolls, centres)
-    assert allowed(T, config).tolist() == [True, True, False, False, True, False]
+    assert allowed(T).tolist() == [True, True, False, False, True, False]
 
 
 @pytest.mark.parametrize(("yaw", "wrong", "seen"), [(180.0, 0, 0.5), (-97.0, 30, 1.0), (60.0, 20, 0.7)])
@@ -105,8 +103,8 @@ def test_centroids_alone_find_the_pose(yaw: float, wrong: int, seen: float) -> N
     views = [balls(T, seed, wrong, 60) for seed in range(3)]
     kept = [np.linalg.norm(v.xyz, axis=1) < 8 + 17 * seen for v in views]  # the far ones are missing
     views = [replace(v, xyz=v.xyz[own], label=v.label[own]) for v, own in zip(views, kept, strict=True)]
-    pairs = find_pairs(views, GuessConfig())
-    found = agreed_poses(pairs, GuessConfig(), 0)
+    pairs = find_pairs(views)
+    found = agreed_poses(pairs, 0)
     assert_near(T, found[0], 1.0, 0.3)
     assert pairs.inliers(found[0]) > 2 * max(pairs.inliers(turned_away(found[0], by)) for by in (40, 130, 220))
 
@@ -119,14 +117,14 @@ def test_more_frames_bring_centroids_nearer() -> None:
     T = mounted(70.0, 3)
     errors = []
     for count in (1, 4):
-        found = agreed_poses(find_pairs([balls(T, seed, 15, 60) for seed in range(count)], GuessConfig()), GuessConfig(), 0)
+        found = agreed_poses(find_pairs([balls(T, seed, 15, 60) for seed in range(count)]), 0)
         errors.append(se3.translation_error_m(T, found[0]))
     assert errors[1] < min(0.7 * errors[0], 0.2)
 
 
 def test_evidence_of_centroids_has_the_slope_that_it_says() -> None:
     T = mounted(20.0)
-    pairs = replace(find_pairs([balls(T, 0, 15, 60)], GuessConfig()), parallax=1.0)
+    pairs = replace(find_pairs([balls(T, 0, 15, 60)]), parallax=1.0)
     off = se3.perturb(T, [0.6, -0.4, 0.5], [0.1, 0.05, -0.1])
     gradient, scale = pairs.linearise(off)
     step = 1e-6
@@ -144,8 +142,8 @@ def test_centroids_need_no_sweep_and_say_what_they_miss(street_views) -> None:
     assert {h.kind for h in found} == {CENTROIDS}
     nothing = [replace(v, label=np.where(v.label < C.GROUND, UNLABELLED, v.label)) for v in views]
     with pytest.raises(TooFewFeaturesError, match=r"3 objects .* of \d+ in the images 0 may be in the clouds"):
-        agreed_poses(find_pairs(nothing, GuessConfig()), GuessConfig(), 0)
-    assert not find_pairs(nothing, GuessConfig()).per_object(T[None]).any()
+        agreed_poses(find_pairs(nothing), 0)
+    assert not find_pairs(nothing).per_object(T[None]).any()
 
 
 @pytest.mark.parametrize(("yaw", "columns", "kind"), [(75.0, (0, 200), RIGHT), (-75.0, (440, 640), LEFT), (75.0, (0, 640), None)])
@@ -157,7 +155,7 @@ def test_of_a_row_that_the_border_cuts_the_end_in_view_counts(yaw: float, column
     )
     classes = np.full((CAMERA.height, CAMERA.width), C.SKY, np.uint8)
     classes[90:150, columns[0] : columns[1]] = C.VEHICLE
-    pairs = find_pairs([class_view(cloud, classes, CAMERA)], GuessConfig())
+    pairs = find_pairs([class_view(cloud, classes, CAMERA)])
     assert pairs.cls.tolist() == ([] if kind is None else [C.VEHICLE + kind])
     if kind is not None:
         end = poses(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros((1, 3)))[0, :3, :3] @ pairs.point[0]
@@ -166,13 +164,13 @@ def test_of_a_row_that_the_border_cuts_the_end_in_view_counts(yaw: float, column
 
 def test_optimisations_reach_every_allowed_place() -> None:
     T = poses(np.full(6, 0.3), np.zeros(6), np.zeros(6), 1.9 * np.r_[np.eye(3), -np.eye(3)])
-    assert allowed(T, GuessConfig()).all()
-    assert np.array([near_lidar(own, GuessConfig()).clip(own) for own in T]) == pytest.approx(T)
+    assert allowed(T).all()
+    assert np.array([near_lidar(own).clip(own) for own in T]) == pytest.approx(T)
 
 
 def test_rotations_that_fewer_pairs_agree_on_follow_for_the_maps_to_judge(street_views) -> None:
-    pairs = find_pairs(street_views[0], GuessConfig())
-    found = agreed_poses(pairs, GuessConfig(), 0)
+    pairs = find_pairs(street_views[0])
+    found = agreed_poses(pairs, 0)
     assert len(found) > 5 * STARTS
     assert pairs.per_object(found[:1]) > 2 * pairs.per_object(found[STARTS:]).max()
     assert rotation_distance_deg(found[STARTS:-1], found[-1]).min() > SAME_DEG[0]
@@ -205,7 +203,7 @@ def test_hypotheses_are_distinct_best_first_and_repeatable(street_views) -> None
     )
     other_way = [h for h in found[1:] if se3.rotation_error_deg(h.T, found[0].T) > OTHER_WAY_DEG]
     assert found[0].margin == pytest.approx(found[0].score - other_way[0].score)
-    assert all(allowed(h.T[None], GuessConfig()).all() for h in found)
+    assert all(allowed(h.T[None]).all() for h in found)
     assert all(h.kind in ("centroids", "sweep") for h in found)
     again = first_guess(views[:1])
     assert [(h.T.tobytes(), h.score, h.margin, h.inliers) for h in again] == [
@@ -253,7 +251,7 @@ def test_guess_finds_a_remounted_camera(street_views) -> None:
     score = label_score(views)
     back = T.copy()
     back[2, 3] += 1.2
-    found, values, source = refine_positions(score, back[None], GuessConfig(), 0)
+    found, values, source = refine_positions(score, back[None], 0)
     assert_near(T, found[0], 2.0, 0.5)
     assert (np.diff(values) <= 0).all()
     assert (source == 0).all()

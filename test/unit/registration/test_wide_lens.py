@@ -18,7 +18,7 @@ from calib_ros.image.edges import EdgeLevel, edge_levels, oriented_edges
 from calib_ros.lidar.edges import UPWARD, EdgePoints
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, rectified_camera
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.fast_score import FastScore
 
 WIDTH, HEIGHT = 340, 160
 CAMERA = Camera(np.array([[100.0, 0, 168.2], [0, 105, 81.3], [0, 0, 1]]), WIDTH, HEIGHT, SPHERE)  # 194 deg wide

@@ -11,6 +11,7 @@ import pytest
 from masks_of_pictures import assert_lies_on_edges, frame_of, later
 from onnx_graphs import segmentation
 from scenes import RenderedDrive
+from thesis_constants import with_constants
 
 from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.errors import BudgetError
@@ -19,12 +20,11 @@ from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.image.enhance import prepare
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import EDGE_SHARE, OF_CLASSES, OF_MASKS
+from calib_ros.registration.classes import EDGE_SHARE, IMAGE, OF_CLASSES, OF_MASKS
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros_semantics.models.class_borders import IMAGE_BORDER, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
-from calib_ros_semantics.models.image_classes import pixel_model
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
-from calib_ros_semantics.models.segmentation import SegmentationModels
+from calib_ros_semantics.models.segmentation import SegmentationModels, load_model
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import CLASS_EDGE_SHARE, semantic_share
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
@@ -189,7 +189,7 @@ CENTRES = np.array([-4.5, 5.5])
 def network(folder: Path, config: SemanticsConfig | None = None, outputs: str = "scores 1 2 64 128", **more) -> SegmentationModel:
     path = segmentation(folder / "net.onnx", 2, outputs, inputs="1 3 64 128", at=CENTRES, **more)
     path.with_suffix(".yaml").write_text("labels: [building, sky]\n")
-    return pixel_model(str(path), config or SemanticsConfig())
+    return load_model(IMAGE, str(path), config or SemanticsConfig())
 
 
 def grey(left: int, right: int) -> Frame:
@@ -284,8 +284,8 @@ def test_a_share_of_masks_is_blended_in_before_the_blur(frame: Frame, edges_of: 
 def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, share: float) -> None:
     assert CLASS_EDGE_SHARE == 0.1
     semantics = {"image_classes": "source", "cloud_classes": "source"}
-    thesis = {"semantic_share": 0.2}
-    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics, "thesis": thesis})
+    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics})
+    config = with_constants(config, semantic_share=0.2)
     calibrator = Calibrator(frame.camera, config)
     seen = replace(calibrator.segmentation(frame), edges_of=edges_of)
     assert semantic_share(thesis_of(config), edges_of) == share
@@ -310,7 +310,7 @@ def test_borders_of_a_real_street_lie_on_edges_of_the_picture(kitti_root: Path) 
     image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
     if image is None:
         pytest.skip("no such KITTI frame")
-    edges = pixel_model("builtin", SemanticsConfig())(frame_of(image, "000000"), later()).borders
+    edges = load_model(IMAGE, "builtin", SemanticsConfig())(frame_of(image, "000000"), later()).borders
     assert edges.shape == (2, *image.shape[:2])
     assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.2
     assert_lies_on_edges(edges, image, sigma=2, shift=12, factor=1.15)

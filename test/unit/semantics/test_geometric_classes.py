@@ -12,8 +12,9 @@ from masks_of_pictures import frame_of, later
 from calib_ros.datasets.kitti import KittiSource
 from calib_ros.datasets.kitti_files import read_scan
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
+from calib_ros.registration.classes import CLOUD
 from calib_ros_semantics.models.geometric_classes import ClusterClasses, cluster_classes, heights
-from calib_ros_semantics.models.label_files import LabelScans
+from calib_ros_semantics.models.ready import ReadyClasses
 from calib_ros_synthetic.drive import SyntheticDrive
 
 C = SemanticClass
@@ -188,7 +189,7 @@ def test_a_labelled_scan(kitti_root: Path) -> None:
     if not (sequence / "labels").is_dir():
         pytest.skip("no labels beside the scans")
     frame = KittiSource(sequence)[0]
-    found, truth = cluster_classes(frame.cloud), LabelScans(sequence / "labels")(frame)
+    found, truth = cluster_classes(frame.cloud), ReadyClasses(CLOUD, str(sequence / "labels"))(frame, later())
     floors = {C.VEHICLE: (0.95, 0.7), C.POLE: (0.8, 0.5), C.BUILDING: (0.75, 0.6), C.VEGETATION: (0.75, 0.65)}
     assert_floors(found, truth, {**floors, C.GROUND: (0.9, 0.98)})
     assert np.count_nonzero(found == C.PERSON) < 100, "there is nobody in this scan"

@@ -13,9 +13,11 @@ from masks_of_pictures import assert_lies_on_edges, box, frame_of, later, pictur
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
-from calib_ros_semantics.models.masks import Mask, MaskFolder, mask_edges
+from calib_ros.registration.classes import MASKS
+from calib_ros_semantics.models.masks import Mask, mask_edges
 from calib_ros_semantics.models.onnx_model import Deadline
-from calib_ros_semantics.models.segment_anything import MaskEdges
+from calib_ros_semantics.models.ready import MaskFolder
+from calib_ros_semantics.models.segmentation import load_model
 
 SIZE = (120, 200)
 FRAME = frame_of(np.zeros((*SIZE, 3), np.uint8), "000007")
@@ -103,9 +105,9 @@ def test_masks_from_a_folder(tmp_path: Path) -> None:
     written(tmp_path / "000007", "a.png", pictures[0].astype(np.uint8))  # 0 and 1
     written(tmp_path / "000007", "c.png", np.zeros(SIZE, np.uint8))
     written(tmp_path / "000008", "a.png", pictures[1].astype(np.uint8) * 255)
-    masks = MaskFolder(tmp_path)(FRAME, later())
+    masks = MaskFolder(tmp_path).masks(FRAME, later())
     assert np.array_equal([picture_of(mask, SIZE) for mask in masks], pictures)
-    edges = MaskEdges(SemanticsConfig(segment_anything=str(tmp_path)))
+    edges = load_model(MASKS, str(tmp_path), SemanticsConfig())
     assert np.array_equal(edges(FRAME, later()), edges_of(*pictures))
     assert "NAME/*.png" in edges.describe()
 
@@ -113,17 +115,17 @@ def test_masks_from_a_folder(tmp_path: Path) -> None:
 def test_folders_of_masks_that_cannot_be_used(tmp_path: Path) -> None:
     model = MaskFolder(tmp_path)
     with pytest.raises(ModelError, match=r"no .*000007/\*\.png; .*\(the number of a KITTI frame, 000042\)"):
-        model(FRAME, later())
+        model.masks(FRAME, later())
     with pytest.raises(ModelError, match=r"no name"):
-        model(replace(FRAME, name=""), later())
+        model.masks(replace(FRAME, name=""), later())
     path = written(tmp_path / "000007", "a.png", np.zeros((60, 100), np.uint8))
     with pytest.raises(ModelError, match=r"a\.png is 100x60, but the image is 200x120"):
-        model(FRAME, later())
+        model.masks(FRAME, later())
     path.write_bytes(path.read_bytes()[:40])
     with pytest.raises(ModelError, match=r"a\.png is not a complete PNG"):
-        model(FRAME, later())
+        model.masks(FRAME, later())
     with pytest.raises(BudgetError):
-        model(FRAME, Deadline(0))
+        model.masks(FRAME, Deadline(0))
 
 
 def test_a_large_mask_of_one_bit(tmp_path: Path) -> None:
@@ -133,7 +135,7 @@ def test_a_large_mask_of_one_bit(tmp_path: Path) -> None:
     assert inside.size > 1100 * len(data)
     (tmp_path / "000007").mkdir()
     (tmp_path / "000007" / "a.png").write_bytes(data)
-    (mask,) = MaskFolder(tmp_path)(frame_of(np.zeros(inside.shape, np.uint8), "000007"), later())
+    (mask,) = MaskFolder(tmp_path).masks(frame_of(np.zeros(inside.shape, np.uint8), "000007"), later())
     assert tuple(mask.box) == (600, 400, 1800, 1000)
     assert mask.inside.all()
 
@@ -143,7 +145,7 @@ def test_boundaries_of_real_masks_lie_on_edges_of_the_picture(kitti_root: Path) 
     image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
     if image is None or not (kitti_root / "sam_masks/000000").is_dir():
         pytest.skip("no masks of Segment Anything among the KITTI frames")
-    masks = MaskFolder(kitti_root / "sam_masks")(frame_of(image, "000000"), later())
+    masks = MaskFolder(kitti_root / "sam_masks").masks(frame_of(image, "000000"), later())
     assert len(masks) == 94
     edges = mask_edges(masks, image.shape[:2])
     assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.1

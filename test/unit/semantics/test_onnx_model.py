@@ -115,7 +115,7 @@ def test_without_an_accelerator_it_runs_on_the_cpu_and_says_so(good: Path, provi
 
 
 EVERY_ENTRY = """{family: cenet, mean: [1, 2.5, -3], std: [0.5, 1, 2], scale: 0.00392, channels: [range, x, y], size: [64, 2048],
-labels: {0: void, 9: road}, fov_deg: [15, -15.5], azimuth_deg: 90, output: logits, depth_scale: 256}"""
+labels: {0: void, 9: road}, fov_deg: [15, -15.5], azimuth_deg: 90, output: logits}"""
 
 
 def test_the_yaml_beside_a_model(tmp_path: Path) -> None:
@@ -126,14 +126,14 @@ def test_the_yaml_beside_a_model(tmp_path: Path) -> None:
     assert Sidecar.beside(tmp_path / "other.onnx") == Sidecar(channels="bgr", labels="cityscapes")
     (tmp_path / "model.yaml").write_text(EVERY_ENTRY)
     expected = Sidecar("cenet", (1, 2.5, -3), (0.5, 1, 2), 0.00392, ("range", "x", "y"), (64, 2048), {0: "void", 9: "road"})
-    expected = dataclasses.replace(expected, fov_deg=(15, -15.5), azimuth_deg=90, output="logits", depth_scale=256)
+    expected = dataclasses.replace(expected, fov_deg=(15, -15.5), azimuth_deg=90, output="logits")
     assert Sidecar.beside(tmp_path / "model.onnx") == expected
 
 
 WRONG = {
     "a name": ("family: 3", "output: [a]"),
     "a list of numbers": ("mean: 0.5", "mean: [a]", "mean: [.nan, 0, 0]", "mean: []"),
-    "above 0": ("std: [1, 0, 1]", "std: [1, -1, 1]", "scale: 0", "depth_scale: -1", "scale: true", "scale: big"),
+    "above 0": ("std: [1, 0, 1]", "std: [1, -1, 1]", "scale: 0", "scale: true", "scale: big"),
     "rgb, bgr or a list of names": ("channels: rbg", "channels: [1, 2]"),
     "[height, width]": ("size: 512", "size: [512]", "size: [512.5, 1024]", "size: [0, 1024]", "size: [512, 100000]"),
     "class names": ("labels: 19", "labels: [road, 3]", "labels: {road: 1}", "labels: {-1: road}", "labels: {true: road}"),

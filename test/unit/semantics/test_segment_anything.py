@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import sam_graphs as graphs
 from masks_of_pictures import compared, frame_of, iou, later, picture_of
+from onnx_graphs import segmentation
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
-from calib_ros_semantics.models.image_classes import ImageInput
-from calib_ros_semantics.models.masks import Mask
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
-from calib_ros_semantics.models.segment_anything import segmenter_of
+from calib_ros.registration.classes import MASKS
+from calib_ros_semantics.models.masks import Mask, MaskModel
+from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_semantics.models.segmentation import load_model
 
 BACKGROUND = (90, 90, 90)
 COLOUR = np.array([40.0, 60, 200])  # BGR
@@ -39,8 +40,12 @@ SCENES = {"wide": painted((360, 640), WIDE), "tall": painted((480, 300), TALL)}
 IMAGE, TRUTH = SCENES["wide"]
 
 
+def segmenter_of(config: SemanticsConfig) -> MaskModel:
+    return load_model(MASKS, config.segment_anything, config)
+
+
 def segment(config: SemanticsConfig, image: np.ndarray) -> list[Mask]:
-    return segmenter_of(config)(frame_of(image), later())
+    return segmenter_of(config).masks(frame_of(image), later())
 
 
 def assert_finds(config: SemanticsConfig, image: np.ndarray, truth: list[np.ndarray], enough: float = 0.8) -> None:
@@ -126,9 +131,6 @@ def test_the_yaml_beside_the_encoder_tells_the_family(tmp_path: Path) -> None:
     (tmp_path / "encoder.yaml").write_text("family: mobile_sam\nmean: [0.485, 0.456, 0.406]\nstd: [0.229, 0.224, 0.225]\n")
     assert segmenter_of(settings(encoder, decoder)).describe().startswith("Segment Anything (mobilesam), 5 prompts")
     assert_finds(settings(encoder, decoder), IMAGE, TRUTH)
-    (tmp_path / "encoder.yaml").write_text("family: segnet\n")
-    with pytest.raises(ModelError, match=r"family 'segnet'.*mobilesam.*efficientsam"):
-        segmenter_of(settings(encoder, decoder))
 
 
 @pytest.mark.parametrize(
@@ -155,22 +157,17 @@ def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text
     embedded = halves.encoder(image, later())
     cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
     assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
-    network = ImageInput(OnnxModel(encoder, SemanticsConfig())).feed(image)["input_image"]
-    assert network[0, :, 500, 500] == pytest.approx(expected, abs=1e-3)
-
-
-def test_a_yaml_that_no_picture_fits(tmp_path: Path) -> None:
-    for model in (official(tmp_path), (in_wide(tmp_path),)):
-        Path(model[0]).with_suffix(".yaml").write_text("std: [1, 2, 3, 4]")
-        with pytest.raises(ModelError, match=rf"{Path(model[0]).name}: 'std:' of the YAML beside it must have 1 or 3 numbers"):
-            segmenter_of(settings(*model))
+    network = segmentation(tmp_path / "net.onnx", 19, "o 1 19 64 64", inputs="1 3 64 64")
+    network.with_suffix(".yaml").write_text(text)
+    fed = load_model("image_classes", str(network), SemanticsConfig()).feed(image)["input"]
+    assert fed[0, :, 50, 50] == pytest.approx(expected, abs=1e-3)
 
 
 def test_the_yaml_beside_the_decoder_names_the_masks(tmp_path: Path) -> None:
     config = settings(*official(tmp_path))
     for name in ("masks", "low_res_masks"):
         (tmp_path / "decoder.yaml").write_text(f"output: {name}")
-        assert segmenter_of(config).decoder.roles.masks.name == name
+        assert segmenter_of(config).decoder.masks.name == name
         assert_finds(config, IMAGE, TRUTH)
     (tmp_path / "decoder.yaml").write_text("output: mask")
     with pytest.raises(ModelError, match=r"decoder\.onnx: there is no output 'mask'.*low_res_masks"):
@@ -187,7 +184,7 @@ def test_fast_sam(tmp_path: Path, transposed: bool) -> None:
             rows.append([*own, confidence, *np.eye(len(palette))[k]])
     rows += [[320, 320, 10, 10, 0.1, *np.zeros(len(palette))]] * 50
     model = segmenter_of(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, np.array(rows), palette, transposed)))
-    masks = model(frame_of(IMAGE), later())
+    masks = model.masks(frame_of(IMAGE), later())
     assert model.describe().startswith("FastSAM, 640x640 RGB, fed as v / 255 of grey levels v in 0..255 (assumed")
     assert compared(masks, TRUTH, 0.95) == (1.0, 0, 0)
     assert [mask.score for mask in masks] == pytest.approx([0.9, 0.8, 0.7, 0.6])
@@ -233,10 +230,6 @@ def test_fast_sam_with_a_yaml(tmp_path: Path) -> None:
     assert len(segment(settings(path), IMAGE)) == 0  # the first table has no detections
     yaml.write_text("output: output0")
     assert_finds_things(path)
-    for name in ("nothing", "many"):
-        yaml.write_text(f"output: {name}")
-        with pytest.raises(ModelError, match=rf"fast\.onnx: '{name}', which 'output:'.*outputs: empty"):
-            segmenter_of(settings(path))
 
 
 @pytest.mark.parametrize(("column", "bad"), [("c0", np.nan), ("c3", np.inf), ("c3", -np.inf), ("c5", np.nan), ("c5", np.inf)])
@@ -246,36 +239,17 @@ def test_fast_sam_drops_nan_detections(tmp_path: Path, column: str, bad: float) 
     assert masks[0].box == pytest.approx(list(TWO_ALIKE)[1], abs=4)
 
 
-def test_fast_sam_with_nms_inside_is_refused(tmp_path: Path) -> None:
-    says = r"fast\.onnx: it was exported with NMS inside; export it with nms=False"
-    for metadata in ({"nms": "True"}, {"end2end": "True"}, {"args": "{'batch': 1, 'half': False, 'nms': True}"}):
-        with pytest.raises(ModelError, match=says):
-            segmenter_of(settings(in_wide(tmp_path, metadata=metadata)))
+def test_fast_sam_with_nms_inside_that_its_file_does_not_tell(tmp_path: Path) -> None:
+    """Corners, confidence, class, coefficients, filled up with nothing; fewer rows than columns, too."""
     without = {"nms": "False", "args": "{'batch': 1, 'nms': False}", "end2end": "False"}
     assert_finds_things(in_wide(tmp_path, metadata=without))
-    # Nothing said: corners, confidence, class, coefficients, filled up with nothing; fewer rows than columns, too.
     rows = np.zeros((300, 9))
     rows[:3] = [[*np.add(box, [0, TOP, 0, TOP]), 0.9, 0, *one] for box, one in zip(WIDE, np.eye(3), strict=True)]
     palette = np.array(list(WIDE.values()))[:, ::-1] / 255
     for count in (300, 5):
         path = graphs.fast_sam(tmp_path / "fast.onnx", 640, rows[:count], palette, transposed=True)
-        with pytest.raises(ModelError, match=says):
+        with pytest.raises(ModelError, match="it was exported with NMS inside"):
             segment(settings(path), IMAGE)
-
-
-def test_files_without_an_encoder_decoder_pair_are_refused(tmp_path: Path) -> None:
-    encoder, decoder = official(tmp_path)
-    small = graphs.encoder(tmp_path / "small.onnx", side=512)
-    for pair, says in (
-        ((encoder, graphs.other(tmp_path / "o.onnx")), r"encoder\.onnx and .*o\.onnx are no pair.*image_embeddings.*FastSAM"),
-        ((decoder, encoder), r"no pair"),
-        ((small, decoder), r"the encoder gives image_embeddings.*32x32.*decoder takes.*64x64"),
-        ((encoder,), r"semantics\.segment_anything_decoder"),
-        ((graphs.other(tmp_path / "o.onnx"),), "this looks like a classifier of whole pictures"),
-        ((encoder, str(tmp_path / "gone.onnx")), r"gone\.onnx.*no such file"),
-    ):
-        with pytest.raises(ModelError, match=says):
-            segmenter_of(settings(*pair))
 
 
 def test_deadline_ends_segmentation(tmp_path: Path) -> None:
@@ -283,4 +257,4 @@ def test_deadline_ends_segmentation(tmp_path: Path) -> None:
     # At once, and somewhere among the prompts.
     for deadline in (Deadline(0), Deadline(60, lambda: next(asked) > 8)):
         with pytest.raises(BudgetError):
-            model(frame_of(IMAGE), deadline)
+            model.masks(frame_of(IMAGE), deadline)

@@ -28,11 +28,11 @@ from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
 from calib_ros.online.keyframes import KeyframeBuffer
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import OF_CLASSES, FrameSemantics
 from calib_ros.registration.initial_guess import nominal, nominal_start
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.chance import UNDOUBTED_Z
+from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
 from calib_ros_semantics.models.segmentation import MAX_FAILURES, SegmentationModels
@@ -334,9 +334,9 @@ def test_a_keyframe_is_replaced_by_its_semantic_features(drive, start):
     assert second.view is not None
     assert recalibrator.segment_keyframe() == ()
     assert list(recalibrator.buffer) == [first, second]
-    assert recalibrator.segmenter.done == 1
+    assert recalibrator.segmented == 1
     took = r"1 keyframes; image_classes \d+\.\d s; cloud_classes \d+\.\d s; image_classes source; cloud_classes source"
-    assert re.fullmatch(took, recalibrator.segmenter.describe(recalibrator.segmentation))
+    assert re.fullmatch(took, recalibrator.describe_semantics())
 
 
 def test_raw_frames_are_not_kept(source, start):

@@ -10,8 +10,9 @@ from masks_of_pictures import frame_of, later
 from onnx_graphs import centres, segmentation
 
 from calib_ros.config import SemanticsConfig
-from calib_ros_semantics.models.image_classes import pixel_model
+from calib_ros.registration.classes import IMAGE
 from calib_ros_semantics.models.labels import CITYSCAPES, lookup
+from calib_ros_semantics.models.segmentation import load_model
 from calib_ros_semantics.models.tiles import Tiling
 
 
@@ -65,6 +66,6 @@ def test_a_square_network_sees_what_is_narrow_in_a_wide_picture(tmp_path: Path, 
     numbers[:, 100::200] = numbers[:, 101::200] = numbers[:, 102::200] = CITYSCAPES.index("pole")
     image = np.repeat(level[numbers][..., None], 3, axis=2)
     path = segmentation(tmp_path / "n.onnx", 19, output, inputs="1 3 128 128")
-    found = pixel_model(str(path), SemanticsConfig())(frame_of(image), later()).classes
+    found = load_model(IMAGE, str(path), SemanticsConfig())(frame_of(image), later()).classes
     assert found.shape == (375, 1242)
     assert (found != lookup(CITYSCAPES)[numbers]).mean() < 0.05

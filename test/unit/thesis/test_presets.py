@@ -42,15 +42,14 @@ def test_the_file_reads_as_a_table_of_contents():
         assert step in text
     for step in ("eq. 3.12", "eq. 3.14", "3.5", "eq. 3.15", "algorithm 6", "eq. 3.16"):
         assert step in text
-    left_out = {"azimuth_deg", "evaluations"}  # where a half width of 180 deg is around, and what ends a simplex anyway
-    assert {f.name for f in dataclasses.fields(ThesisConfig)} - set(values["thesis"]) == left_out
+    assert {f.name for f in dataclasses.fields(ThesisConfig)} == set(values["thesis"])
 
 
 def test_options_hold_before_a_file_and_a_file_before_the_preset(tmp_path):
     path = tmp_path / "own.yaml"
-    path.write_text("thesis: {max_depth: 50.0}\nsearch: {seed: 3}\n")
+    path.write_text("thesis: {operator: canny}\nsearch: {seed: 3}\n")
     config = configuration(str(path), seed=4, preset_name="thesis")
-    assert config == update(preset("thesis"), {"thesis": {"max_depth": 50.0}, "search": {"seed": 4}})
+    assert config == update(preset("thesis"), {"thesis": {"operator": "canny"}, "search": {"seed": 4}})
     with_edges = {"refine": {"objective": "fast", "optimizer": "auto"}}
     path.write_text("refine: {optimizer: auto}\n")
     assert configuration(str(path), objective="fast", preset_name="thesis") == update(preset("thesis"), with_edges)

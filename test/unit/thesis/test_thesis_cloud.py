@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import GROUND, HEIGHT, Box, Plane, Spinner
 from sklearn.cluster import DBSCAN
+from thesis_constants import thesis_with
 
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
@@ -329,8 +330,8 @@ def test_far_points_come_first_and_no_attribute_loses_its_point(scene):
 
 
 def test_only_points_within_the_thresholds_are_left(scene):
-    config = dataclasses.replace(
-        CONFIG, min_depth=5.0, max_depth=18.0, min_height=-1.0, max_height=0.5, azimuth_half_width_deg=30.0, min_reflectivity=0.4
+    config = thesis_with(
+        min_depth=5.0, max_depth=18.0, min_height=-1.0, max_height=0.5, azimuth_half_width_deg=30.0, min_reflectivity=0.4
     )
     found = attributes(scene, config)
     x, y, z = scene.xyz.T.astype(float)
@@ -339,19 +340,19 @@ def test_only_points_within_the_thresholds_are_left(scene):
     assert {tuple(p) for p in found.xyz.tolist()} == {tuple(p) for p in scene.xyz[keep].tolist()}
     assert 100 < len(found) < len(scene) / 2
     # A filter that takes the background away leaves the discontinuity in front of it.
-    near = attributes(scene, dataclasses.replace(CONFIG, max_depth=15.0))
+    near = attributes(scene, thesis_with(max_depth=15.0))
     assert near.discontinuity[~near.ground & (near.xyz[:, 1] > 2.9)].max() > 7
-    dull = attributes(scene, dataclasses.replace(CONFIG, max_reflectivity=0.3))
+    dull = attributes(scene, thesis_with(max_reflectivity=0.3))
     assert 0 < len(dull) < len(attributes(scene, CONFIG))
     assert dull.reflectivity.max() <= 0.3
-    none = attributes(scene, dataclasses.replace(CONFIG, min_height=50.0, max_height=60.0))
+    none = attributes(scene, thesis_with(min_height=50.0, max_height=60.0))
     assert (len(none), none.label.dtype) == (0, np.uint8)
 
 
 @pytest.mark.parametrize("filtered", [{"min_height": -1.0}, {"min_reflectivity": 0.4}])
 def test_nothing_else_becomes_ground_when_the_ground_is_filtered_out(scene, filtered):
     """A level slice through walls and boxes holds more than ground_share of what is left."""
-    found = attributes(scene, dataclasses.replace(CONFIG, **filtered))
+    found = attributes(scene, thesis_with(**filtered))
     upper = found.xyz[:, 2] > -1.4
     assert upper.sum() > 5000
     assert not found.ground[upper].any()
@@ -362,7 +363,7 @@ def test_nothing_else_becomes_ground_when_the_ground_is_filtered_out(scene, filt
 def test_without_intensity_reflectivity_is_zero_and_no_threshold_applies(scene, intensity):
     values = None if intensity is None else np.full(len(scene), 7 if intensity == "constant" else np.nan, np.float32)
     bare = PointCloud(scene.xyz, values, scene.ring)
-    for config in (CONFIG, dataclasses.replace(CONFIG, min_reflectivity=0.5)):
+    for config in (CONFIG, thesis_with(min_reflectivity=0.5)):
         found = attributes(bare, config)
         assert not found.reflectivity.any()
         assert len(found) == len(attributes(scene, CONFIG)) > 1000

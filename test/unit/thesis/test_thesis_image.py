@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from calib_ros.config import Config, ImageConfig
-from calib_ros.errors import BadInputError, ConfigError
+from calib_ros.config import ImageConfig
+from calib_ros.errors import BadInputError
 from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, to_gray
-from calib_ros_thesis.config import ThesisConfig, thesis_of
+from calib_ros_thesis.config import ThesisConfig
 from calib_ros_thesis.image import OPERATORS, blend, edges, gradient_edges, gradients, magnitude, smoothed
 
 
@@ -241,10 +241,3 @@ def test_smoothing_is_a_gaussian(sigma):
     assert smoothed(edges, sigma) == pytest.approx(ndimage.gaussian_filter(edges, sigma, mode="mirror", truncate=4.0), abs=2e-4)
     assert np.array_equal(smoothed(edges, 0.0), edges)
     assert np.array_equal(smoothed(edges, 1e7), smoothed(edges, 70.0))  # no wider than the picture
-
-
-def test_no_smoothing_and_absurdly_many_are_refused():
-    assert len(thesis_of(Config.from_dict({"thesis": {"smoothing": [1.0] * 8}})).smoothing) == 8
-    for count in (0, 9):
-        with pytest.raises(ConfigError, match=rf"thesis\.smoothing has {count} levels; give 1 to 8"):
-            Config.from_dict({"thesis": {"smoothing": [1.0] * count}})

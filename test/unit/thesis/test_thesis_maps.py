@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import ndimage
+from thesis_constants import thesis_with
 
 from calib_ros.camera import Camera
 from calib_ros.registration.score.point_score import nearest_per_pixel, project
@@ -158,8 +159,8 @@ def test_levels_are_centimetres_and_thousandths():
 
 def test_depth_is_inverted_about_the_farthest_that_passes():
     for max_depth, level in ((60.0, 6000), (5.0, 500), (300.0, FAR_LEVEL)):
-        assert far_level(ThesisConfig(max_depth=max_depth)) == level
-    assert low_level(ThesisConfig(low_reflectivity=0.3)) == 300
+        assert far_level(thesis_with(max_depth=max_depth)) == level
+    assert low_level(CONFIG) == 300
     for level in (1, 2, 5999, FAR):  # and inverted back at both ends
         assert set(np.unique(complete_depth(single((61, 61), (30, 30, level)), FAR))) == {0, level}
 
@@ -236,14 +237,14 @@ def test_low_reflectivity_is_removed_from_the_dense_map():
     u, v, points = wall_and_box()
     maps = maps_of(u, v, points)  # 0.1 and 0.8, limit 0.3
     assert set(np.unique(maps.dense_reflectivity)) == {0, 801}
-    assert set(np.unique(maps_of(u, v, points, ThesisConfig(low_reflectivity=0.0)).dense_reflectivity)) >= {101, 801}
-    removed = maps_of(u, v, points, ThesisConfig(low_reflectivity=0.9))
+    assert set(np.unique(maps_of(u, v, points, thesis_with(low_reflectivity=0.0)).dense_reflectivity)) >= {101, 801}
+    removed = maps_of(u, v, points, thesis_with(low_reflectivity=0.9))
     assert not removed.dense_reflectivity.any()
     assert not removed.reflectivity_edges.any()
     # Differences of low reflectivity are no edges; without the limit they are.
     dull = dataclasses.replace(points, reflectivity=np.where(points.label == 2, 0.25, 0.02).astype(np.float32))
     assert not maps_of(u, v, dull).reflectivity_edges.any()
-    assert columns(maps_of(u, v, dull, ThesisConfig(low_reflectivity=0.0)).reflectivity_edges)
+    assert columns(maps_of(u, v, dull, thesis_with(low_reflectivity=0.0)).reflectivity_edges)
 
 
 def test_the_scan_s_edges_are_the_mean_of_three_where_points_are():
@@ -314,7 +315,7 @@ SETTINGS = [
 
 @pytest.mark.parametrize("config", SETTINGS, ids=str)
 def test_the_fast_form_is_exact_for_every_setting(config):
-    fast = FastEdgeMaps(130, 240, ThesisConfig(operator="mix", **config))
+    fast = FastEdgeMaps(130, 240, thesis_with(**config))
     for seed, region in enumerate((ALL, CORNER, (slice(100, 104), slice(3, 90)))):
         same(fast, *scattered(seed, (130, 240), 0.15, region))
 

@@ -9,6 +9,7 @@ import weakref
 import numpy as np
 import pytest
 from scenes import QUICK_SEARCH, RenderedDrive
+from thesis_constants import with_constants
 
 from calib_ros import Calibrator, SearchBox, se3
 from calib_ros.camera import Camera
@@ -31,7 +32,7 @@ IDENTITY = np.eye(4)  # the points are given in the camera's frame
 WIDTH, HEIGHT = 40, 24
 CAMERA = Camera(np.array([[50.0, 0, 19.5], [0, 50.0, 11.5], [0, 0, 1]]), WIDTH, HEIGHT)
 SOBEL = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"operator": "sobel", "normalize": False}})
-HAND = update(SOBEL, {"thesis": {"smoothing": [0.0]}})  # one map, as it is
+HAND = with_constants(SOBEL, smoothing=(0.0,))  # one map, as it is
 THESIS = Config.from_dict({"refine": {"objective": "thesis"}})
 
 
@@ -228,15 +229,16 @@ def test_points_are_found_when_they_are_asked_for_and_once_for_all_features_of_a
 
 ONCE = {"dense_edges": "once_per_level"}
 METHODS: dict[str, dict[str, dict[str, object]]] = {
-    "nelder_mead": {"refine": {"objective": "thesis"}, "thesis": {"evaluations": 120}},
-    "barzilai_borwein": {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}, "thesis": {"evaluations": 80}},
+    "nelder_mead": {"refine": {"objective": "thesis"}},
+    "barzilai_borwein": {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}},
     "attached": {"refine": {"objective": "thesis"}, "thesis": ONCE},
     "attached nelder_mead": {"refine": {"objective": "thesis", "optimizer": "nelder_mead"}, "thesis": ONCE},
 }
 
 
-def calibrator_of(camera: Camera, method: str, **more: dict) -> Calibrator:
-    return Calibrator(camera, update(Config.from_dict(METHODS[method]), more))
+def calibrator_of(camera: Camera, method: str, constants: dict[str, object] | None = None, **more: dict) -> Calibrator:
+    few = {"evaluations": 80 if method == "barzilai_borwein" else 120}  # which is enough here
+    return Calibrator(camera, with_constants(update(Config.from_dict(METHODS[method]), more), **(constants or few)))
 
 
 @pytest.mark.parametrize("method", [m if "attached" in m else pytest.param(m, marks=pytest.mark.slow) for m in METHODS])
@@ -309,7 +311,7 @@ def test_repeated_optimum_is_not_refused(scene):
 def test_filters_leaving_no_points_give_a_result_not_an_exception(drive, method):
     """The azimuths kept lie just beside the picture, where points may still come in."""
     beside = float(np.rad2deg(np.arctan(1.25 * (drive.camera.width / 2) / drive.camera.K[0, 0])))
-    calibrator = calibrator_of(drive.camera, method, thesis={"azimuth_deg": beside, "azimuth_half_width_deg": 2.0})
+    calibrator = calibrator_of(drive.camera, method, {"azimuth_deg": beside, "azimuth_half_width_deg": 2.0})
     result = calibrator.calibrate([drive[0], drive[4]], drive.reference)
     assert result.status == "insufficient"
     assert "no LiDAR edge falls into the image" in result.reason
@@ -356,7 +358,7 @@ def test_refinement_reports_progress_so_that_it_can_be_interrupted(scene):
 def test_optimum_rejected_by_the_fast_objective_is_refused(drive):
     """With 32 rings eq. 3.12 prefers an extrinsic more than a degree off here; its own score does not tell."""
     few_rings, start = scene_of(drive), off(drive.reference, 3)
-    result = calibrator_of(drive.camera, "nelder_mead", thesis={"evaluations": 60}).estimate(few_rings.features, start)
+    result = calibrator_of(drive.camera, "nelder_mead", {"evaluations": 60}).estimate(few_rings.features, start)
     assert result.status == "refused"
     assert result.refusal is RefusalCode.OBJECTIVES_DISAGREE
     assert result.score > result.initial_score

@@ -1,8 +1,5 @@
-"""Is an optimum a calibration, or only the best of many chance alignments? And do all frames agree with it?
-
-Its score is compared with a null distribution, the scores of extrinsics so far off that edges match by chance only, and with the
-best optimum of the same search in a decoy. In doubt, the classes of points and pixels have a say.
-"""
+"""What a score is worth by chance: the scores of extrinsics so far off that edges match by chance only, and the probability that
+the best optimum of chance reaches it."""
 
 from __future__ import annotations
 
@@ -13,14 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.arrays import Covariance, Matrix, Transform
-from calib_ros.registration.acceptance.refusal import Refusal, low_score, not_significant, too_uncertain
-from calib_ros.registration.covariance import unobservable_directions
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.optimizers import Sobol
-from calib_ros.result import RefusalCode, Result
+from calib_ros.registration.starts import Sobol
 
-# The null distribution.
 NEIGHBOURS = 128
 HALF_WIDTH = np.array([np.deg2rad(6.0)] * 3 + [0.5] * 3)  # rad, m; edges move by tens of pixels: nothing matches but by chance
 POINTS = 15000  # edge points used, so that many frames do not cost more
@@ -30,19 +23,10 @@ NO_SPREAD = 1e-6  # a picture without any edge scores 0 everywhere: its z-score 
 UNDOUBTED_Z, HIGHEST_DECOY_Z, LOWEST_DECOY_Z = 10.0, 6.3, 1.0
 GUMBEL_SCALE = 0.65  # of the distribution of the best of many optima of chance: 0.6 to 0.9 within searches, 0.2 to 0.7 across
 
-WITH_90_PERCENT = 1.645  # standard deviations that a normal error exceeds in one of ten cases
-
 # z-score of a frame as a share of the median of all: 0.6 to 2.5 with the right image, -0.12 to 0.2 with another scene's.
 OUTLIER_SHARE = 0.35
 MIN_MEDIAN_Z = 2.5  # median z-score below which no frame matches, and none can judge the others
 MIN_JUDGING_FRAMES = 4  # frames needed to tell which of them is an outlier
-
-# Semantic consistency: share of the null distribution that meets the classes better, and standard deviations above its mean. Of
-# 43 right optima of single KITTI frames 34 are consistent and 3 inconsistent, of 74 wrong ones 11 and 39.
-CONSISTENT_RANK, CONSISTENT_Z = 0.02, 1.5
-INCONSISTENT_RANK = 0.15
-# How much more probable the classes make a right optimum than a wrong one, from these counts.
-RATIO_CONSISTENT, RATIO_INCONSISTENT = 5.0, 1 / 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,51 +86,3 @@ def p_value(z_score: float, decoy_z: float | None, rounds: int = 1) -> float:
     decoy = HIGHEST_DECOY_Z if decoy_z is None else decoy_z
     margin = (z_score - decoy) / GUMBEL_SCALE - np.log(rounds)
     return float(1 / (1 + np.exp(np.clip(margin, -50, 50))))
-
-
-def check_significance(
-    score: float, z_score: float, decoy_z: float | None, p: float, largest: float, ratio: float = 1.0
-) -> Refusal | None:
-    """Is the optimum no better than chance? p: its p value; largest: what is accepted; ratio: see semantic_likelihood_ratio.
-    score: of the optimum; 0 is that of the mean of the maps, less, or NaN, of an image that shows nothing."""
-    if p <= largest * ratio:
-        return None
-    if not score > 0:
-        return low_score(score)
-    return not_significant(z_score, HIGHEST_DECOY_Z if decoy_z is None else decoy_z, p, largest * ratio, ratio < 1)
-
-
-def leaves_doubt(result: Result) -> bool:
-    """Can classes change this result of an estimate without them? They help to find an optimum, and to tell it from chance."""
-    if result.refusal in (RefusalCode.WRONG_INTRINSICS, RefusalCode.WRONG_TIMES):
-        return False
-    return not result.converged or result.evidence is None or result.evidence.z_score < UNDOUBTED_Z
-
-
-def largest_sigmas(tolerance_deg: float, tolerance_m: float) -> tuple[float, float]:
-    """Standard deviations, deg and m, of the axes of a rotation and a shift that are within the tolerance with 90 %, where the
-    axes share it alike."""
-    share = 1 / (WITH_90_PERCENT * np.sqrt(3))
-    return share * tolerance_deg, share * tolerance_m
-
-
-def check_uncertainty(covariance: Covariance, tolerance_deg: float, tolerance_m: float) -> Refusal | None:
-    """Is an extrinsic of this covariance (6, 6) known to within the tolerance? Its rotation and its shift, with 90 %."""
-    sigma = np.sqrt(np.diag(covariance))
-    limits = largest_sigmas(tolerance_deg, tolerance_m)
-    if max(np.rad2deg(np.linalg.norm(sigma[:3])) / limits[0], np.linalg.norm(sigma[3:]) / limits[1]) <= np.sqrt(3):
-        return None
-    return too_uncertain(unobservable_directions(covariance, *limits), tolerance_deg, tolerance_m)
-
-
-def semantic_likelihood_ratio(consistency: PointScore | None, T: Transform) -> float:
-    """How much more probable classes make it that T_camera_lidar (4, 4) is right, by its rank in the null distribution; 1.0
-    without classes."""
-    if consistency is None:
-        return 1.0
-    level = consistency.n_levels - 1
-    here, others = consistency.at(level).value(T), consistency.values(null_extrinsics(T), level)
-    beaten_by = float((others > here).mean())
-    if beaten_by <= CONSISTENT_RANK and here - others.mean() >= CONSISTENT_Z * others.std():
-        return RATIO_CONSISTENT
-    return RATIO_INCONSISTENT if beaten_by > INCONSISTENT_RANK else 1.0
