@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -42,7 +43,16 @@ class Command(Protocol):
 
 
 class NodeService:
-    """A service of the node, to be inherited from. Used on the executor's thread."""
+    """A part of the node, such as a service, to be inherited from. Used on the executor's thread, but for add."""
+
+    def start(self) -> None:
+        """The node is active from now on: it receives messages and makes estimates."""
+
+    def check(self) -> None:
+        """To be called about once a second while it is active."""
+
+    def pause(self) -> None:
+        """It is not active any more; what has been found stays."""
 
     def stop(self) -> None:
         """The node ends: no thread of the service's own may go on. Called once, after the pipeline's threads have ended."""
@@ -53,18 +63,18 @@ class NodeService:
     def status(self) -> Any:
         """A diagnostic_msgs/DiagnosticStatus for /diagnostics, asked for every second; None = nothing to say."""
 
+    def add(self, event: Any) -> None:
+        """Any event of the pipeline (calib_ros/online/events.py); on any thread."""
+
 
 @cache
 def _entries(group: str) -> Mapping[str, EntryPoint]:
-    return {entry.name: entry for entry in sorted(entry_points(group=group), key=lambda e: e.name) if _is_there(entry)}
-
-
-def _is_there(entry: EntryPoint) -> bool:
-    """Whether its package is installed: a distribution may leave some of ours out."""
-    try:
-        return find_spec(entry.module.partition(".")[0]) is not None
-    except ImportError:
-        return False
+    found = {}
+    for entry in sorted(entry_points(group=group), key=lambda e: e.name):
+        with suppress(ImportError):  # a distribution may leave some of our packages out
+            if find_spec(entry.module.partition(".")[0]) is not None:
+                found[entry.name] = entry
+    return found
 
 
 def names(group: str) -> list[str]:

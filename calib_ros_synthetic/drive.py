@@ -28,12 +28,10 @@ from calib_ros_synthetic.rigs import RIGS, Fields
 from calib_ros_synthetic.scanners import PERIOD, PLAIN, SpinningScanner, in_frame, plain_scanner
 from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Floats, Solids
-from calib_ros_synthetic.street import BLOCK, VIEW_AHEAD
 from calib_ros_synthetic.trip import Ids, Trip, labels_of, named
 
 START = 1_600_000_000 * NANOSECONDS  # stamp of the first frame; 0 would mean "no stamp" to many tools
 CACHED_FRAMES = 4
-LONGEST = 10.0  # m; objects this far behind do not reach ahead of the camera
 CAMERA_IN_LIDAR = (0.29, 0.05, -0.11)  # m; position of the lens
 FOCAL = 0.58  # focal length as a share of the image width, as KITTI's
 
@@ -108,7 +106,6 @@ class SyntheticDrive:
     noise : factor on all sensor noise; 0 = none.
     T_camera_lidar : extrinsic (4, 4); by default a camera below and in front of the LiDAR, or where the rig has it, rotated by
         tilt_deg degrees about an axis that depends on the seed.
-    empty : stations (from, to), m from the start of the drive, between which there are no objects beside the road.
     rig : a name in rigs.RIGS. scene : a name in scenes.SCENES. condition : a name in conditions.CONDITIONS, by default the rig's.
     fields : all, xyzir, xyzi or xyz: what the clouds hold, by default what the rig's driver gives.
     ride : steady, or weaving: the vehicle swerves, brakes and accelerates.
@@ -135,7 +132,6 @@ class SyntheticDrive:
         noise: float = 1.0,
         tilt_deg: float = 2.0,
         T_camera_lidar: ArrayLike | None = None,
-        empty: tuple[float, float] | None = None,
         rig: str | None = None,
         scene: str = "street",
         condition: str | None = None,
@@ -184,12 +180,10 @@ class SyntheticDrive:
             self._scanner = self._installed.scanner
         if T_camera_lidar is not None:
             self.reference = se3.as_transform(T_camera_lidar, "T_camera_lidar")
-        if empty is not None and not -np.inf < empty[0] < empty[1] < np.inf:
-            raise BadInputError(f"synthetic drive: empty={empty} is not allowed; give the stations in m where it begins and ends")
         weaving = ride == WEAVING
         timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
         self._stamps = StampErrors(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
-        street = world(self.seed, timetable.station(self._seconds(self._frames)), empty)
+        street = world(self.seed, timetable.station(self._seconds(self._frames)))
         way = Ride(street.path, self.seed, street.lane, weaving)
         self._trip = Trip(street, way, timetable, weather, self.noise, self.speed > 0, spin)
         self._view: CameraView | None = None
@@ -204,7 +198,7 @@ class SyntheticDrive:
 
     @property
     def name(self) -> str:
-        """The source text of the drive, without parameters that exist only in Python (camera, T_camera_lidar, empty)."""
+        """The source text of the drive, without parameters that exist only in Python (camera, T_camera_lidar)."""
         changed = [f"{k}={v}" for k, v in self._parameters.items() if k == "seed" or v != self._defaults[k]]
         return "synthetic:" + ",".join(changed)
 
@@ -228,14 +222,6 @@ class SyntheticDrive:
         age_s: the image shows the street as seen that long before its stamp.
         """
         return self._render(self._position(index), T_camera_lidar, age_s)[0]
-
-    def emptied(self, start_s: float, end_s: float) -> SyntheticDrive:
-        """The same drive, with only the road visible ahead from start_s to end_s after the first frame."""
-        station = self._trip.station
-        empty = (station(start_s) - LONGEST, station(end_s) + VIEW_AHEAD + BLOCK)
-        drive = SyntheticDrive(**self._parameters, camera=self.camera, empty=empty)
-        drive.reference = self.reference
-        return drive
 
     def pose(self, index: int) -> Floats:
         """T_world_lidar (4, 4) at the frame's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""

@@ -87,9 +87,9 @@ class Builder:
         self._rows: list[tuple[object, ...]] = []
         self.at(0.0, 0.0)
 
-    def at(self, x: float, y: float, yaw: float = 0.0, z: float = 0.0, *, hidden: bool = False) -> None:
-        """Sets the frame of the object that the next solids belong to: metres, rad. hidden: they are not added."""
-        self._origin, self._yaw, self._hidden = (x, y, z), yaw, hidden
+    def at(self, x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> None:
+        """Sets the frame of the object that the next solids belong to: metres, rad."""
+        self._origin, self._yaw = (x, y, z), yaw
 
     def add(
         self,
@@ -104,8 +104,6 @@ class Builder:
         style: Numbers = (0.0, 0.0, 0.0, 0.0),
     ) -> None:
         """One solid: centre and half sizes (3,) in metres in the object's frame."""
-        if self._hidden:
-            return
         c, s, (x, y, z) = cos(self._yaw), sin(self._yaw), centre
         where = (self._origin[0] + c * x - s * y, self._origin[1] + s * x + c * y, self._origin[2] + z)
         self._rows.append((kind, surface, label, where, tuple(half), self._yaw, tuple(taper), tuple(colour), tuple(style)))

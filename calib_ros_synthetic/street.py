@@ -33,8 +33,6 @@ class Street:
     Other scenes are streets with other furniture. ground: a name in grounds.PAINTERS. kerb: m that all beyond the road lies above
     it. bend: factor on the bends of the centre line. view: m of it behind and ahead that sensors may see. cruise: usual speed,
     m/s. indoors: lamps at the ceiling instead of sun and sky.
-
-    empty: stations (from, to) in metres between which nothing stands; the rest of the street is the same as without it.
     """
 
     ground: ClassVar[str] = "street"
@@ -44,9 +42,8 @@ class Street:
     cruise: ClassVar[float] = 5.0
     indoors: ClassVar[bool] = False
 
-    def __init__(self, seed: int, length: float, empty: tuple[float, float] | None = None) -> None:
+    def __init__(self, seed: int, length: float) -> None:
         self.seed = seed
-        self.empty = empty
         self.path = Path(seed, length, self.bend)
         rng = np.random.default_rng([seed, 3])
         self.road = float(rng.uniform(4.9, 6.2))
@@ -95,9 +92,7 @@ class Street:
     def _at(self, b: Builder, s: float, d: float, turn: float = 0.0, z: float | None = None) -> Builder:
         """The Builder, with its frame at a station and an offset; z: m, beside the road's level the kerb's."""
         x, y, heading = self.path.place(s, d)
-        # What is left out is made all the same: the numbers it draws belong to what comes after it.
-        hidden = self.empty is not None and self.empty[0] <= s <= self.empty[1]
-        b.at(x, y, heading + turn, self.kerb if z is None else z, hidden=hidden)
+        b.at(x, y, heading + turn, self.kerb if z is None else z)
         return b
 
     def _houses(self, b: Builder, rng: np.random.Generator, start: float, side: int) -> None:

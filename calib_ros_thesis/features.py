@@ -109,7 +109,7 @@ def thesis_features(
         return points, PointLevels.of(points)
 
     def image_edges() -> ImageEdges:
-        gradient = gradient_edges(prepare(image, config.image), thesis)
+        gradient = gradient_edges(prepare(image), thesis)
         edges = blend(gradient, semantic, semantic_share(thesis, edges_of))
         focal_length = float(camera.K[0, 0])
         levels = [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in thesis.smoothing]

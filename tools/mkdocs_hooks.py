@@ -1,18 +1,16 @@
 """Hooks of the documentation site (mkdocs.yml): pages and links from outside docs/, and formulas without scripts.
 
 The pages of docs/ link to the repository as GitHub shows it (`../calib_ros/camera.py`, `../config/calib_ros.yaml`). In the site
-such a link leads to a page with that file's source, at the line of the function or class that the link's text names.
-A link to a file that does not exist is a warning, which `--strict` makes an error.
+such a link leads to a page with that file's source. A link to a file that does not exist is a warning, which `--strict` makes an
+error.
 """
 
 from __future__ import annotations
 
-import ast
 import html
 import logging
 import posixpath
 import re
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +40,7 @@ def on_files(files: Any, config: Any) -> Any:
     for name, uri in PAGES.items():
         texts[name] = (ROOT / name).read_text(encoding="utf-8")
         files.append(File.generated(config, uri, content=texts[name]))
-    linked = {_repository_path(page, target) for page, text in texts.items() for _, target in _links(text)}
+    linked = {_repository_path(page, target) for page, text in texts.items() for target in _links(text)}
     for name in sorted(linked):
         path = ROOT / name
         if path.is_file() and path.suffix != ".md" and not name.startswith("docs/"):
@@ -64,26 +62,19 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         target, text = match["target"], match["text"]
         if "://" in target or target.startswith(("#", "mailto:")):
             return match[0]
-        path, _, anchor = target.partition("#")
-        repository_path = _repository_path(name, target)
+        repository_path, anchor = _repository_path(name, target), target.partition("#")[2]
         if not (ROOT / repository_path).exists():
             LOG.warning("%s links to %s, which does not exist", name, target)
         elif (ROOT / repository_path).is_dir():
             return text
-        site_path, attributes = _site_path(repository_path), ""
-        if site_path.startswith("source/") and path.endswith(".py"):
-            line = _line(repository_path, text.strip("`"))
-            if line is None:
-                LOG.warning("%s names %s, which is not in %s", name, text, repository_path)
-            attributes = f'{{ data-line="{line or 1}" }}'
-        relative = posixpath.relpath(site_path, posixpath.dirname(uri) or ".")
-        return f"{match['picture']}[{text}]({relative}{'#' + anchor if anchor else ''}){attributes}"
+        relative = posixpath.relpath(_site_path(repository_path), posixpath.dirname(uri) or ".")
+        return f"{match['picture']}[{text}]({relative}{'#' + anchor if anchor else ''})"
 
     return "".join(part if part.startswith("```") else LINK.sub(replaced, part) for part in FENCE.split(markdown))
 
 
 def on_page_content(content: str, page: Any, config: Any, files: Any) -> str:
-    """Formulas become MathML. Links to source get the line as anchor here, since MkDocs does not see these anchors."""
+    """Formulas become MathML."""
 
     def replaced(match: re.Match[str]) -> str:
         display = "block" if match["tag"] == "div" else "inline"
@@ -92,15 +83,13 @@ def on_page_content(content: str, page: Any, config: Any, files: Any) -> str:
             LOG.warning("%s has a formula that cannot be drawn: %s", page.file.src_uri, match["tex"])
         return f'<{match["tag"]} class="formula">{formula}</{match["tag"]}>'
 
-    content = re.sub(r'<a data-line="(\d+)" href="([^"]+)"', r'<a href="\2#L-0-\1"', content)
     return FORMULA.sub(replaced, content)
 
 
-def _links(text: str) -> list[tuple[str, str]]:
-    """Texts and targets of the links of a page that lead to files."""
-    prose = FENCE.sub("", text)
-    found = [(match["text"], match["target"]) for match in LINK.finditer(prose)]
-    return [(text, target) for text, target in found if "://" not in target and not target.startswith(("#", "mailto:"))]
+def _links(text: str) -> list[str]:
+    """Targets of the links of a page that lead to files."""
+    found = [match["target"] for match in LINK.finditer(FENCE.sub("", text))]
+    return [target for target in found if "://" not in target and not target.startswith(("#", "mailto:"))]
 
 
 def _repository_path(page: str, target: str) -> str:
@@ -122,32 +111,3 @@ def _source_page(name: str) -> str:
     text = (ROOT / name).read_text(encoding="utf-8")
     header = f"---\ntitle: {name}\nsearch:\n  exclude: true\nhide: [toc]\n---\n\n# {name}\n\n"
     return f'{header}````{language} linenums="1"\n{text}````\n'
-
-
-@cache
-def _tree(name: str) -> ast.Module:
-    return ast.parse((ROOT / name).read_text(encoding="utf-8"))
-
-
-def _line(name: str, label: str) -> int | None:
-    """Where a module of the repository defines `module.Class.method`; line 1 for a label that is the file itself."""
-    _, *attributes = label.split(".")
-    if not attributes or attributes == ["py"] or "/" in label:
-        return 1
-    body: list[ast.stmt] = _tree(name).body
-    line = None
-    for attribute in attributes:
-        for node in body:
-            if _defines(node, attribute):
-                line, body = node.lineno, getattr(node, "body", [])
-                break
-        else:
-            return None
-    return line
-
-
-def _defines(node: ast.stmt, name: str) -> bool:
-    if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-        return node.name == name
-    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
-    return any(isinstance(target, ast.Name) and target.id == name for target in targets)

@@ -17,7 +17,6 @@ import configparser
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -86,37 +85,24 @@ def _names(module: str, names: Sequence[str]) -> list[str]:
     )
 
 
-@dataclass
-class Structure:
-    """arrows: (room, room) -> an example 'file imports module'. files: (module, module) -> the same, between files."""
-
-    arrows: dict[tuple[str, str], str] = field(default_factory=dict)
-    files: dict[tuple[str, str], str] = field(default_factory=dict)
-
-    @classmethod
-    def read(cls, packages: Sequence[str] = PACKAGES) -> Structure:
-        """Of the packages as they lie in the repository."""
-        own = cls()
-        for package in packages:
-            for path in package_files(package):
-                here = module_of(path)
-                for module in imports_of(path):
-                    if module.split(".")[0] not in packages:
-                        continue
-                    example = f"{path.relative_to(ROOT)} imports {module}"
-                    if module != here:
-                        own.files.setdefault((here, module), example)
-                    if room_of(module) != room_of(here):
-                        own.arrows.setdefault((room_of(here), room_of(module)), example)
-        return own
-
-    @property
-    def rooms(self) -> set[str]:
-        """All that import or are imported."""
-        return {room for arrow in self.arrows for room in arrow}
+Arrows = dict[tuple[str, str], str]  # who imports whom -> an example 'file imports module'
 
 
-def circles(arrows: Mapping[tuple[str, str], str]) -> list[list[str]]:
+def arrows_of(packages: Sequence[str] = PACKAGES) -> tuple[Arrows, Arrows]:
+    """Between rooms, and between modules, of the packages as they lie in the repository."""
+    rooms, files = Arrows(), Arrows()
+    for path in (path for package in packages for path in package_files(package)):
+        here = module_of(path)
+        for module in imports_of(path):
+            if module.split(".")[0] in packages and module != here:
+                example = f"{path.relative_to(ROOT)} imports {module}"
+                files.setdefault((here, module), example)
+                if room_of(module) != room_of(here):
+                    rooms.setdefault((room_of(here), room_of(module)), example)
+    return rooms, files
+
+
+def circles(arrows: Arrows) -> list[list[str]]:
     """Sets of names that import each other, directly or through others."""
     names = sorted({name for arrow in arrows for name in arrow})
     ends = np.array([[names.index(name) for name in arrow] for arrow in arrows], int).reshape(-1, 2).T
@@ -126,30 +112,13 @@ def circles(arrows: Mapping[tuple[str, str], str]) -> list[list[str]]:
     return [circle for circle in found if len(circle) > 1]
 
 
-def floors(arrows: Mapping[tuple[str, str], str]) -> dict[str, int]:
-    """Room -> floor from 0, the ground. ValueError where rooms form a circle."""
-    if circles(arrows):
-        raise ValueError("rooms that import each other lie on no floor")
-    out: dict[str, int] = {}
-
-    def floor(room: str) -> int:
-        if room not in out:
-            out[room] = 1 + max((floor(b) for a, b in arrows if a == room), default=-1)
-        return out[room]
-
-    for room in {room for arrow in arrows for room in arrow}:
-        floor(room)
-    return out
-
-
-def constants(path: Path) -> int:
-    """Names in capitals that a module assigns."""
-    count = 0
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
-        names = [n for t in targets for n in (t.elts if isinstance(t, ast.Tuple) else [t])]
-        count += sum(isinstance(n, ast.Name) and re.fullmatch(r"_?[A-Z][A-Z0-9_]*", n.id) is not None for n in names)
-    return count
+def floors(arrows: Arrows) -> dict[str, int]:
+    """Room -> floor from 0, the ground, of rooms that form no circle."""
+    on = {room: 0 for arrow in arrows for room in arrow}
+    for _ in on:
+        for above, below in arrows:
+            on[above] = max(on[above], on[below] + 1)
+    return on
 
 
 def options() -> int:
@@ -170,7 +139,7 @@ def classes(path: Path) -> int:
     return sum(isinstance(node, ast.ClassDef) for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
 
 
-def counts(all_files: Structure) -> dict[str, dict[str, int]]:
+def counts() -> dict[str, dict[str, int]]:
     """What has a ceiling: section -> name -> count."""
     files = {package: package_files(package) for package in (*PACKAGES, *LABORATORY, "test")}
     lines = {package: sum(p.read_text(encoding="utf-8").count("\n") for p in own) for package, own in files.items()}
@@ -179,33 +148,31 @@ def counts(all_files: Structure) -> dict[str, dict[str, int]]:
     rest = [p for pattern in ("*.py", "docs/**/*.py", "launch/*.py") for p in ROOT.glob(pattern) if p not in named]
     lines["all_but_test"] = sum(n for package, n in lines.items() if package != "test")
     lines["all_but_test"] += sum(path.read_text(encoding="utf-8").count("\n") for path in rest)
-    outside = [path for package, own in files.items() if package != "test" for path in own]
     other = {
         "files_of_calib_ros": len(files[CORE]),
         "options": options(),
         "words_of_docs": words(),
-        "classes_outside_tests": sum(map(classes, outside)),
-        "circles": len(circles(all_files.files)) + len(circles(all_files.arrows)),
+        "classes_outside_tests": sum(classes(path) for package, own in files.items() if package != "test" for path in own),
+        "circles": sum(len(circles(arrows)) for arrows in arrows_of((*PACKAGES, *LABORATORY))),
     }
     return {"lines": lines, "counts": other}
 
 
-def ceilings() -> configparser.ConfigParser:
-    """Of tools/ceilings.toml; its few lines are INI as well, which every Python reads."""
+def ceilings() -> dict[str, dict[str, int]]:
+    """As `counts`, of tools/ceilings.toml; its few lines are INI as well, which every Python reads."""
     read = configparser.ConfigParser()
     read.read_string(CEILINGS.read_text(encoding="utf-8"))
-    return read
+    return {section: {name: read.getint(section, name) for name in read.options(section)} for section in read.sections()}
 
 
 def above(found: Mapping[str, Mapping[str, int]]) -> list[str]:
     """A line for each count that is above its ceiling, or has none."""
-    read = ceilings()
-    limits = {section: {name: read.getint(section, name, fallback=-1) for name in found[section]} for section in found}
+    limits = ceilings()
     return [
-        f"{section}.{name}: {count}, ceiling {limits[section][name]}"
+        f"{section}.{name}: {count}, ceiling {limits[section].get(name, -1)}"
         for section, own in found.items()
         for name, count in own.items()
-        if count > limits[section][name]
+        if count > limits[section].get(name, -1)
     ]
 
 
@@ -213,19 +180,8 @@ def lower(found: Mapping[str, Mapping[str, int]]) -> None:
     """Writes the counts into the file of ceilings where they are less."""
     text = CEILINGS.read_text(encoding="utf-8")
     for name, count in (item for own in found.values() for item in own.items()):
-        if limit := re.search(rf"(?m)^{name} = (\d+)$", text):
-            text = text[: limit.start(1)] + str(min(count, int(limit[1]))) + text[limit.end(1) :]
+        text = re.sub(rf"(?m)^{name} = (\d+)$", lambda m, n=name, c=count: f"{n} = {min(c, int(m[1]))}", text)  # type: ignore[misc]
     CEILINGS.write_text(text, encoding="utf-8")
-
-
-def _table(found: Mapping[str, Mapping[str, int]]) -> list[str]:
-    rows = []
-    for package, lines in found["lines"].items():
-        files = package_files(package) if package != "all_but_test" else []
-        row = (len(files), lines, sum(map(classes, files)), sum(map(constants, files)))
-        rows.append(f"{package:24s}" + "".join(f"{n:10d}" if n else f"{'':10s}" for n in row))
-    head = f"{'':24s}" + "".join(f"{name:>10s}" for name in ("files", "lines", "classes", "constants"))
-    return [head, *rows, *(f"{name.replace('_', ' ')}: {count}" for name, count in found["counts"].items())]
 
 
 def main() -> int:
@@ -234,25 +190,27 @@ def main() -> int:
     asked.add_argument("--check", action="store_true", help=f"compare with {CEILINGS.name} only")
     asked.add_argument("--lower", action="store_true", help=f"lower {CEILINGS.name} to what is reached")
     args = asked.parse_args()
-    everything = Structure.read((*PACKAGES, *LABORATORY))
-    found = counts(everything)
+    found = counts()
     if args.lower:
         lower(found)
     if args.check or args.lower:
         print("\n".join(too_many := above(found)), end="\n" if too_many else "")
         return int(bool(too_many))
-    structure = Structure.read()
-    print("\n".join(_table(found)))
-    print(f"rooms {len(structure.rooms)}, arrows {len(structure.arrows)}")
-    of_rooms = circles(structure.arrows)
-    for circle in (*circles(everything.arrows), *circles(everything.files)):
+    print(f"{'':24s}" + "".join(f"{name:>10s}" for name in ("files", "lines", "classes")))
+    for package, lines in found["lines"].items():
+        files = package_files(package) if package != "all_but_test" else []
+        row = (len(files), lines, sum(map(classes, files)))
+        print((f"{package:24s}" + "".join(f"{n or '':10}" for n in row)).rstrip())
+    print("\n".join(f"{name.replace('_', ' ')}: {count}" for name, count in found["counts"].items()))
+    for circle in (one for arrows in arrows_of((*PACKAGES, *LABORATORY)) for one in circles(arrows)):
         print("  circle: " + ", ".join(circle))
-    if not of_rooms:
-        on = floors(structure.arrows)
+    rooms, _ = arrows_of()
+    if not circles(rooms):
+        on = floors(rooms)
         for number in sorted(set(on.values()), reverse=True):
             print(f"  floor {number}: " + ", ".join(sorted(room for room in on if on[room] == number)))
     if args.arrows:
-        for (a, b), example in sorted(structure.arrows.items()):
+        for (a, b), example in sorted(rooms.items()):
             print(f"  {a} -> {b}: {example}")
     return 0
 

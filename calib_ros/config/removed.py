@@ -7,7 +7,7 @@ from collections.abc import Iterable
 _FIELDS = {  # by stage
     "image": (
         "equalize_color clahe_clip clahe_tiles gaussian_sigma bilateral_diameter bilateral_color bilateral_space "
-        "gradient_percentile"
+        "gradient_percentile equalization filter"
     ),
     "lidar": (
         "jump_min side_jump_ratio top_jump_ratio jump_saturation reflectivity_step reflectivity_max_range reflectivity_max_jump "

@@ -18,16 +18,6 @@ FARTHEST_OFFSET_S = 60.0  # of motion.time_offset_s: messages wait no longer, an
 class ImageConfig(Stage):
     """Image preparation and edge maps (thesis 3.2, 3.4.1)."""
 
-    equalization: str = option(
-        "clahe",
-        "histogram equalisation: none, global (eq. 3.4), adaptive (local, no clip limit) or clahe (local, clip limit)",
-        choices=("none", "global", "adaptive", "clahe"),
-    )
-    filter: str = option(
-        "bilateral",
-        "noise filter: bilateral (eq. 3.5), gaussian (eq. 3.6, 3.7) or none",
-        choices=("bilateral", "gaussian", "none"),
-    )
     max_width: int = option(1280, "wider images are shrunk to this width for the registration, px", low=160, high=8192)
     projection: str = option(
         "auto",

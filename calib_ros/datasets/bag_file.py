@@ -114,9 +114,9 @@ class BagFile:
         """Topics of static transforms."""
         return [topic.name for topic in self.topics.values() if topic.type == TF and topic.name.endswith(TF_STATIC)]
 
-    def transforms(self, start: int | None = None, stop: int | None = None) -> list[tuple[int, Any]]:
-        """Messages of static transforms recorded in [start, stop), with the time of recording, ns."""
-        return [(recorded, self.decode(topic, data)) for topic, recorded, data in self.raw(self.statics, start, stop)]
+    def transforms(self) -> list[tuple[int, Any]]:
+        """Messages of static transforms, with the time of recording, ns."""
+        return [(recorded, self.decode(topic, data)) for topic, recorded, data in self.raw(self.statics)]
 
     def decode(self, topic: str, data: bytes) -> Any:
         """CDR bytes -> message of the topic's type, of Livox's own type its PointCloud."""

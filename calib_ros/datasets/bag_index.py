@@ -24,8 +24,6 @@ MAX_KEPT = 256 * 2**20  # bytes of messages held in memory: thirty frames of 2 M
 AUTO, HEADER, RECORDING = CLOCKS = "auto", "header", "recording"
 MAX_LATENCY = NANOSECONDS  # usually, from a sensor to the recorder
 QUICKEST = 0.9
-# Where static transforms are repeated more often than this, those at the bag's beginning and before the windows are enough.
-FEW_TRANSFORMS, BEGINNING = 100, 5 * NANOSECONDS
 
 
 class BagIndex:
@@ -74,8 +72,8 @@ class BagIndex:
         return self._bag.stop
 
     def read_spans(self, spans: list[Span]) -> None:
-        """Read only what was recorded in these spans, which neither overlap nor have been read; CameraInfo and static transforms
-        also around them, where they are rarer."""
+        """Read only what was recorded in these spans, which neither overlap nor have been read; CameraInfo also around them,
+        where it is rarer, and all static transforms."""
         self._kept = self._kept or {}
         period = self._bag.period(self.info.topic)
         for start, stop in spans:
@@ -85,19 +83,8 @@ class BagIndex:
                 self._add(*message)
             for message in self._bag.raw([self.info.topic], start - period, stop + period) if rare else ():
                 self._add(*message)
-        statics = self._bag.statics
-        few = sum(self._bag.topics[topic].messages for topic in statics) <= FEW_TRANSFORMS
-        if not self._transforms:
-            self._transforms += self._bag.transforms(*(() if few else (self._bag.start, self._bag.start + BEGINNING)))
-        if not few:
-            before = 2 * max(self._bag.period(topic) for topic in statics)
-            for start, stop in spans:
-                self._transforms += self._bag.transforms(start - before, stop)
-            self._transforms.sort(key=lambda one: one[0])
+        self._transforms = self._transforms or self._bag.transforms()
         self._finish()
-        if not few and not self._references:  # others may connect camera and LiDAR
-            self._transforms = self._bag.transforms()
-            self._find_references()
 
     def _add(self, topic: str, recorded: int, data: bytes) -> None:
         with located(self._bag.path, topic):
@@ -121,10 +108,7 @@ class BagIndex:
         self.clouds_ahead, of_clocks = clock_difference(self.image, self.cloud) if asked else (0, False)
         self.clock_difference = self.clouds_ahead if of_clocks else 0
         self.cloud.stamps = self.cloud.stamps - self.clock_difference
-        self._find_references()
-
-    def _find_references(self) -> None:
-        """The tree of all static transforms, and T_camera_lidar with its recording time, ns, whenever one has changed it."""
+        # T_camera_lidar with its recording time, ns, whenever a static transform has changed it.
         self._tree = StaticTransforms()
         self._references: list[tuple[int, Matrix]] = []
         for recorded, message in self._transforms:

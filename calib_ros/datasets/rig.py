@@ -1,4 +1,5 @@
-"""Opening the recording of several cameras and LiDARs by the description of its sensors."""
+"""Opening the recording of several cameras and LiDARs by the description of its sensors: of other packages, KITTI and nuScenes,
+and of plain folders, one for each camera, with the clouds of LiDARs in folders of their own, or beside a camera's images."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
-from calib_ros.datasets.folder_rig import FolderRig, is_folder_rig
+from calib_ros.datasets.camera_files import camera_file
+from calib_ros.datasets.folder import CLOUDS, IMAGES, FolderSource
 from calib_ros.datasets.kitti import KittiSource
 from calib_ros.datasets.nuscenes import NuScenesSource
 from calib_ros.datasets.open import is_bag, open_dataset
@@ -146,3 +148,104 @@ class OneLidarRig(ByDescription):
     @property
     def _first(self) -> KittiSource | NuScenesSource:
         return self._sources[self.cameras[0]]
+
+
+class FolderRig(ByDescription):
+    """Sub-folders of a folder, each `topic`, by default the name, of a sensor: of a camera as of `FolderSource`, of a LiDAR with
+    clouds/. A LiDAR without a folder is that of the first camera which has clouds. Images and scans of one name belong together.
+
+    Cameras without a calibration of their own are those, by name, of the file beside the folders. T_camera_lidar of a camera's
+    calibration is to the LiDAR of its own clouds, else to the only one. BadInputError for what is missing.
+    """
+
+    def __init__(self, path: Path, description: DescribedRig) -> None:
+        super().__init__(path.resolve().name, description)
+        self.path, self._recent = path, Recent(KEPT_CLOUDS)
+        self._pairs: dict[tuple[str, str], FolderSource] = {}
+        if not self.cameras or not self.lidars:
+            raise BadInputError(f"{path} is opened by its cameras' folders; list one camera or more, and one LiDAR or more")
+        self._folders = {name: folder_of(path, self.sensors[name]) for name in self.cameras}
+        for name, folder in self._folders.items():
+            if not (folder / IMAGES).is_dir():
+                has = sorted(child.name for child in path.iterdir() if (child / IMAGES).is_dir())
+                raise BadInputError(
+                    f"{folder / IMAGES} of camera {name} is missing; name by sensors.{name}.topic a folder that is there: "
+                    f"{', '.join(has) or '.'}"
+                )
+        self._folders |= {name: self._lidar_folder(name) for name in self.lidars}
+
+    def camera(self, name: str) -> Camera:
+        """As of any rig."""
+        return self.pair(name, self._lidar_of(name) or self.lidars[0]).camera
+
+    def frame_id(self, name: str) -> str:
+        """By the description, else the camera's name in its calibration, or the LiDAR's own."""
+        own = name if name in self.lidars else self.pair(name, self._lidar_of(name) or self.lidars[0]).camera_frame
+        return self.sensors[name].frame or own
+
+    def reference(self, name: str) -> Transform | None:
+        """As of any rig; None of sensors which no calibration joins to the reference."""
+        if self._lidar_of(name) is None or self._lidar_of(name) != self._lidar_of(self.reference_sensor):
+            return None
+        base, own = self._to_lidar(self.reference_sensor), self._to_lidar(name)
+        return None if base is None or own is None else np.asarray(base @ se3.inverse(own))
+
+    def pair(self, camera: str, lidar: str) -> FolderSource:
+        """As of any rig; the reference is known to the LiDAR of the camera's calibration."""
+        if (camera, lidar) not in self._pairs:
+            folder, beside = self._folders[camera], camera_file(self.path)
+            shared = beside if beside.is_file() and not camera_file(folder).is_file() else None
+            choice = None if shared is None else self.sensors[camera].topic or camera
+            source = FolderSource(folder, choice, self._folders[lidar] / CLOUDS, shared)
+            source.recent = self._recent
+            if self._lidar_of(camera) != lidar:
+                source.reference = None
+            self._pairs[camera, lidar] = source
+        return self._pairs[camera, lidar]
+
+    def scans(self, lidar: str) -> Timed:
+        """The scans that any camera has an image with."""
+        sources = [self.pair(camera, lidar) for camera in self.cameras]
+        # Cameras may stamp one scan differently, where it has no stamp of its own.
+        by_name = {name: (source, k) for source in reversed(sources) for k, name in enumerate(source.names)}
+        found = {source.stamp_of_scan(k): (source, k) for source, k in by_name.values()}
+        stamps = np.array(sorted(found), np.int64)
+
+        def read(k: int) -> object:
+            source, index = found[int(stamps[k])]
+            return source.scan(index)[1]
+
+        return Timed(stamps, read)
+
+    def _lidar_folder(self, name: str) -> Path:
+        folder, given = folder_of(self.path, self.sensors[name]), self.sensors[name].topic
+        if (folder / CLOUDS).is_dir():
+            return folder
+        found = [self._folders[camera] for camera in self.cameras if (self._folders[camera] / CLOUDS).is_dir()]
+        if given or not found or len(self.lidars) > 1:
+            raise BadInputError(
+                f"{folder / CLOUDS} of LiDAR {name} is missing; name by sensors.{name}.topic a folder with {CLOUDS}/"
+            )
+        return found[0]
+
+    def _lidar_of(self, name: str) -> str | None:
+        """The LiDAR that a sensor's reference is to."""
+        if name in self.lidars:
+            return name
+        own = [lidar for lidar in self.lidars if self._folders[lidar] == self._folders[name]]
+        return (own or list(self.lidars))[0] if own or len(self.lidars) == 1 else None
+
+    def _to_lidar(self, name: str) -> Transform | None:
+        """T_sensor_lidar (4, 4)."""
+        lidar = self._lidar_of(name)
+        return np.eye(4) if name in self.lidars or lidar is None else self.pair(name, lidar).reference
+
+
+def folder_of(path: Path, sensor: DescribedSensor) -> Path:
+    """Where the files of a sensor are."""
+    return path / (sensor.topic or sensor.name).lstrip("/")
+
+
+def is_folder_rig(path: Path, description: DescribedRig) -> bool:
+    """Whether a folder has the images of a camera that is described."""
+    return any((folder_of(path, sensor) / IMAGES).is_dir() for sensor in description.sensors if sensor.kind == CAMERA)

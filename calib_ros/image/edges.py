@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import ImageConfig
-from calib_ros.image.enhance import prepare, reach
+from calib_ros.image.enhance import BILATERAL_DIAMETER, prepare
 from calib_ros.image.mask import filled, without_border
 
 Map = NDArray[np.float32]
@@ -60,9 +59,7 @@ class EdgeLevel:
         return np.asarray(self.packed * np.float32(UNIT), np.float32)
 
 
-def oriented_edges(
-    gray: NDArray[np.uint8], config: ImageConfig, used: Mask | None = None, across: Map | None = None
-) -> tuple[Map, ...]:
+def oriented_edges(gray: NDArray[np.uint8], used: Mask | None = None, across: Map | None = None) -> tuple[Map, ...]:
     """Prepared grey image (H, W) -> edge strength of horizontal and of vertical gradients, two (H, W) maps in 0..1.
 
     Sobel magnitude, saturated at a percentile, half of it thinned by non-maximum suppression, split by the direction of
@@ -76,7 +73,9 @@ def oriented_edges(
     square += gx * gx
     magnitude = np.sqrt(square)
     magnitude[magnitude <= smallest_magnitude(magnitude, used)] = 0
-    full = _percentile(magnitude if used is None else magnitude[used], GRADIENT_PERCENTILE)
+    sample = (magnitude if used is None else magnitude[used]).ravel()[::4]  # a full sort would cost more than all the rest
+    k = _rank(len(sample), GRADIENT_PERCENTILE)
+    full = float(np.partition(sample, k)[k]) if len(sample) else 0.0
     ridge = np.where(np.abs(gx) >= np.abs(gy), _is_ridge(magnitude, 1), _is_ridge(magnitude, 0))
     edge = magnitude * np.float32(1 / (full + 1e-6))
     np.minimum(edge, np.float32(1), out=edge)
@@ -119,17 +118,6 @@ def _rank(count: int, percentile: float) -> int:
     return min(int(count * percentile / 100), count - 1)
 
 
-def _partitioned(values: Map, percentile: float) -> float:
-    k = _rank(len(values), percentile)
-    return float(np.partition(values, k)[k])
-
-
-def _percentile(values: Map, percentile: float) -> float:
-    """Percentile of every fourth value: a full sort would cost more than the rest of the edge map."""
-    sample = values.ravel()[::4]
-    return _partitioned(sample, percentile) if len(sample) else 0.0
-
-
 def _is_ridge(magnitude: Map, axis: int) -> NDArray[np.bool_]:
     out = np.ones(magnitude.shape, bool)
     before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
@@ -141,7 +129,6 @@ def _is_ridge(magnitude: Map, axis: int) -> NDArray[np.bool_]:
 def edge_levels(
     image: NDArray[np.uint8],
     focal_length: float,
-    config: ImageConfig,
     semantic: Map | None = None,
     share: float = 0.0,
     used: Mask | None = None,
@@ -153,8 +140,8 @@ def edge_levels(
     to be no edges, nor one along the border; None = everywhere. across: see `oriented_edges`.
     """
     if used is not None:
-        used = without_border(used, reach(config) + EDGE_REACH)
-    edges = oriented_edges(prepare(image, config), config, used, across)
+        used = without_border(used, BILATERAL_DIAMETER // 2 + EDGE_REACH)
+    edges = oriented_edges(prepare(image), used, across)
     if semantic is not None:
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
     if used is not None:

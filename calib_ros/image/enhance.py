@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import ImageConfig
-
 Image = NDArray[np.uint8]
 NO_LIMIT = 0.0  # of OpenCV's CLAHE: plain adaptive equalisation
 CLAHE_CLIP, CLAHE_TILES = 2.0, 8  # clip limit, and tiles per axis, also of adaptive equalisation: common in the literature
@@ -16,9 +14,10 @@ BILATERAL_DIAMETER = 5  # px; the time grows with its square
 BILATERAL_COLOR, BILATERAL_SPACE = 40.0, 5.0  # sigmas in grey levels (edges of objects are higher) and px (all of the diameter)
 
 
-def prepare(image: Image, config: ImageConfig) -> Image:
-    """Image (H, W[, 3]) as recorded -> grey (H, W), equalised and filtered by the configured methods."""
-    return smooth(equalize(to_gray(image), config), config)
+def prepare(image: Image) -> Image:
+    """Image (H, W[, 3]) as recorded -> grey (H, W), equalised by CLAHE, which leaves flat areas calm, and filtered bilaterally,
+    which keeps edges: of the thesis's methods those that serve every picture."""
+    return smooth(equalize(to_gray(image)))
 
 
 def to_gray(image: Image) -> Image:
@@ -26,15 +25,16 @@ def to_gray(image: Image) -> Image:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def equalize(image: Image, config: ImageConfig) -> Image:
-    """Histogram equalisation by the configured method (eq. 3.1 to 3.4) of grey (H, W), or channel by channel of (H, W, 3)."""
-    if config.equalization == "none":
+def equalize(image: Image, method: str = "clahe") -> Image:
+    """Histogram equalisation (eq. 3.1 to 3.4) of grey (H, W), or channel by channel of (H, W, 3). method: none, global, adaptive
+    (local, no clip limit) or clahe (local, clip limit)."""
+    if method == "none":
         return image
     if image.ndim == 3:
-        return np.dstack([equalize(np.ascontiguousarray(image[:, :, k]), config) for k in range(image.shape[2])])
-    if config.equalization == "global":
+        return np.dstack([equalize(np.ascontiguousarray(image[:, :, k]), method) for k in range(image.shape[2])])
+    if method == "global":
         return equalize_global(image)
-    limit = CLAHE_CLIP if config.equalization == "clahe" else NO_LIMIT
+    limit = CLAHE_CLIP if method == "clahe" else NO_LIMIT
     clahe = cv2.createCLAHE(limit, (CLAHE_TILES, CLAHE_TILES))
     return np.asarray(clahe.apply(image), np.uint8)
 
@@ -46,18 +46,9 @@ def equalize_global(gray: Image) -> Image:
     return np.asarray(np.rint(255 * share).astype(np.uint8)[gray])
 
 
-def smooth(gray: Image, config: ImageConfig) -> Image:
-    """Noise filter by the configured method, grey (H, W) uint8: bilateral (eq. 3.5; keeps edges) or Gaussian (eq. 3.6, 3.7)."""
-    if config.filter == "none":
-        return gray
-    if config.filter == "gaussian":
+def smooth(gray: Image, method: str = "bilateral") -> Image:
+    """Noise filter of grey (H, W) uint8: bilateral (eq. 3.5; keeps edges) or gaussian (eq. 3.6, 3.7)."""
+    if method == "gaussian":
         return np.asarray(cv2.GaussianBlur(gray, (0, 0), GAUSSIAN_SIGMA), np.uint8)
     filtered = cv2.bilateralFilter(gray, BILATERAL_DIAMETER, BILATERAL_COLOR, BILATERAL_SPACE)
     return np.asarray(filtered, np.uint8)
-
-
-def reach(config: ImageConfig) -> int:
-    """Distance in px from which a pixel acts on the one that the noise filter makes."""
-    if config.filter == "none":
-        return 0
-    return BILATERAL_DIAMETER // 2 if config.filter == "bilateral" else int(np.ceil(3 * GAUSSIAN_SIGMA))

@@ -1,7 +1,10 @@
-"""What the pipeline tells its owner, and what it asks it for."""
+"""What the pipeline tells its owner, and what it asks it for; and what people are told of it, few enough lines to be read."""
 
 from __future__ import annotations
 
+import math
+import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +16,8 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.sensor_health import SensorFault, SensorProblem
 from calib_ros.result import Extrinsic, Result
+
+REPEAT_S = 10.0  # of lines of a kind, whatever figures they give, one is written in so long
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +110,41 @@ class Remarks:
         if isinstance(error, TooFewFeaturesError) and self._fault is not None and self._fault.fault is SensorFault.LIDAR_BLIND:
             return  # which is told once, and not with every frame
         self._tell(Problem(str(error) if isinstance(error, CalibrationError) else defect(error), raised_at(error)))
+
+
+class QuietLog:
+    """Counts what comes within REPEAT_S of the last line of its kind; the newest of these is written afterwards. Thread-safe.
+
+    now: s, by a steady clock.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now, self._lock = now, threading.Lock()
+        # Of each kind when its last line was written, how many have come since, and what writes the newest of these.
+        self._told: dict[str, tuple[float, int, Callable[[str], object]]] = {}
+
+    def add(self, kind: str, text: str, write: Callable[[str], object]) -> None:
+        """A line. kind: what counts as the same, whatever the text. write: takes the text when its time has come."""
+        with self._lock:
+            now = self._now()
+            at, left_out, _ = self._told.get(kind, (-math.inf, 0, write))
+            if now - at >= REPEAT_S:
+                self._told[kind] = now, 0, write
+                write(text + _more(left_out))
+            else:
+                self._told[kind] = at, left_out + 1, lambda more: write(text + more)
+
+    def catch_up(self) -> None:
+        """Write what has been left out long enough; to be called about once a second."""
+        with self._lock:
+            now = self._now()
+            for kind, (at, left_out, write) in list(self._told.items()):
+                if now - at >= REPEAT_S:
+                    del self._told[kind]
+                    if left_out:
+                        self._told[kind] = now, 0, write
+                        write(_more(left_out - 1))
+
+
+def _more(count: int) -> str:
+    return f" ({count} more in {REPEAT_S:g} s)" if count else ""

@@ -160,5 +160,5 @@ def image_edges(image: NDArray[np.uint8], config: Config) -> Map:
     grey = np.ascontiguousarray(image[::step, ::step] if image.ndim == 2 else image[::step, ::step, 1])
     own = min(WIDTH, width)
     small = cv2.resize(grey, (own, max(round(height * own / width), 1)), interpolation=cv2.INTER_AREA)
-    edges = oriented_edges(np.asarray(small, np.uint8), config.image)
+    edges = oriented_edges(np.asarray(small, np.uint8))
     return blurred_levels(edges, REFERENCE_FOCAL_LENGTH, (BLUR,), local_contrast=True)[0].maps

@@ -7,7 +7,6 @@ from scan to scan for keyframes that come without odometry.
 from __future__ import annotations
 
 import math
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -184,9 +183,10 @@ class KeyframeBuffer:
 class SpeedGate:
     """Rejects frames taken while the vehicle drives or turns too fast for a keyframe.
 
-    Uses the newest measurement if it is of the frame's time, else the twist that the frame carries. Thread-safe. config may be
-    replaced at any time. newest: stamp, ns, speed, m/s, and turn rate, deg/s, of odometry or an IMU, None if the source lacks it.
-    rejected: frames rejected so far. last_rejection: why the newest of them was, for a person.
+    Uses the newest measurement if it is of the frame's time, else the twist that the frame carries. Measurements may come on
+    another thread than frames. config may be replaced at any time. newest: stamp, ns, speed, m/s, and turn rate, deg/s, of
+    odometry or an IMU, None if the source lacks it. rejected: frames rejected so far. last_rejection: why the newest of them was,
+    for a person.
     """
 
     def __init__(self, config: OnlineConfig) -> None:
@@ -194,7 +194,6 @@ class SpeedGate:
         self.newest: tuple[int, float | None, float | None] | None = None
         self.rejected = 0
         self.last_rejection = ""
-        self._lock = threading.Lock()
 
     def add_measurement(self, stamp: int, speed: float | None, turn_rate: float | None) -> None:
         """A measurement: stamp in ns, m/s and deg/s; None and values that are not finite are unknown."""
@@ -210,9 +209,7 @@ class SpeedGate:
         elif turn_rate is not None and turn_rate > self.config.max_turn_deg_s:
             problem = f"{turn_rate:.1f} deg/s are above online.max_turn_deg_s = {self.config.max_turn_deg_s:g}"
         if problem:
-            with self._lock:
-                self.rejected += 1
-                self.last_rejection = problem
+            self.rejected, self.last_rejection = self.rejected + 1, problem
         return not problem
 
     def motion_at(self, frame: Frame) -> tuple[float | None, float | None]:

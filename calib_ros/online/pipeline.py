@@ -289,13 +289,19 @@ class Pipeline:
             message = f"{what} {names.camera_frame}; give every camera-LiDAR pair its own node"
             self._tell(Problem(message, "other sensors"))
             return
+
+        def permit() -> bool:
+            """What comes from now on is the work of a keyframe, if the budget allows for one."""
+            allowed = self.load.allows_keyframe()
+            if allowed:
+                begin(Work.KEYFRAMES)
+            return allowed
+
         frame = self._inputs.decode(*pair, recalibrator.camera)
         if (ahead := self._pairing.clocks.ahead) and frame.cloud_stamp is not None:
             frame = replace(frame, cloud_stamp=frame.cloud_stamp - ahead)
         try:
-            is_keyframe = recalibrator.ingest(
-                frame, lambda since: self._scan_before(frame, since), lambda: self._allows_keyframe(begin)
-            )
+            is_keyframe = recalibrator.ingest(frame, lambda since: self._scan_before(frame, since), permit)
             self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
@@ -336,13 +342,6 @@ class Pipeline:
         with self._lock:
             self._hand_over(self._pairing.use_sweep())
 
-    def _allows_keyframe(self, begin: Callable[[Work], None]) -> bool:
-        """What comes from now on is the work of a keyframe, if the budget allows for one."""
-        allowed = self.load.allows_keyframe()
-        if allowed:
-            begin(Work.KEYFRAMES)
-        return allowed
-
     def _scan_before(self, frame: Frame, since: int) -> tuple[int, PointCloud] | None:
         """The newest scan before a frame's, after `since` (ns), whose pair was dropped by a busy worker, with its stamp."""
         with self._lock:
@@ -373,15 +372,12 @@ class Pipeline:
             try:
                 self._estimate()
             finally:
-                self._do_job()
-
-    def _do_job(self) -> None:
-        job = self._requests.begin(estimate=False)
-        if job is not None and job.work is not None:
-            with suppress(Exception), self.load.counting(Work.CHECKS, charged=False):  # who has asked is told
-                self._requests.run(job, job.work, self._estimator.check_cancelled)
-        if self._requests.waiting:
-            self._estimator.put(None)
+                job = self._requests.begin(estimate=False)
+                if job is not None and job.work is not None:
+                    with suppress(Exception), self.load.counting(Work.CHECKS, charged=False):  # who has asked is told
+                        self._requests.run(job, job.work, self._estimator.check_cancelled)
+                if self._requests.waiting:
+                    self._estimator.put(None)
 
     def _estimate(self) -> None:
         recalibrator = self.recalibrator

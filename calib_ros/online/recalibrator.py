@@ -375,7 +375,13 @@ class Recalibrator:
                 force_search = False
                 result = self.first_guess.estimate(self.calibrator, batch.features, names, progress)
             else:
-                result = self._search_or_refine(batch, progress, force_search)
+                tracker, box, start = self.tracker, self._search_box() if force_search else None, self.tracker.T
+                if not (force_search or tracker.settled):
+                    # A search on request may use all rounds; automatic ones are limited, since the next keyframe tries again.
+                    box, start = self._search_box(SEARCH_ROUNDS), tracker.search_center
+                # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
+                anchor = tracker.initial.T_camera_lidar
+                result = self.calibrator.estimate(batch.features, start, box, progress, anchor=anchor, near=box is None)
         except Cancelled:
             with self._lock:
                 self.keyframes.give_back(batch)
@@ -390,16 +396,6 @@ class Recalibrator:
 
     def _search_box(self, rounds: int | None = None) -> SearchBox:
         return SearchBox(self.config.search.rotation_deg, self.config.search.translation_m, rounds)
-
-    def _search_or_refine(self, batch: Batch, progress: Callback | None, force_search: bool) -> Result:
-        tracker = self.tracker
-        box, start = self._search_box() if force_search else None, tracker.T
-        if not (force_search or tracker.settled):
-            # A search on request may use all rounds; automatic ones are limited, since the next keyframe tries again.
-            box, start = self._search_box(SEARCH_ROUNDS), tracker.search_center
-        # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
-        anchor = tracker.initial.T_camera_lidar
-        return self.calibrator.estimate(batch.features, start, box, progress, anchor=anchor, near=box is None)
 
     def _update_tracker(self, result: Result, batch: Batch, on_request: bool) -> Extrinsic:
         with self._lock:

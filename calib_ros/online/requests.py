@@ -58,11 +58,12 @@ class Requests:
     """Jobs that wait, and the one under way. One is done at a time, those of a kind in the order in which they came. Thread-safe.
 
     A request is a future, whose cancel() ends it at once; a job that was asked for ends when nobody waits for it any more.
+    waiting: the jobs that have not begun.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: list[Pending] = []
+        self.waiting: list[Pending] = []
         self._running: Pending | None = None
         self._refusal: str | None = None  # "" = the node is stopping
 
@@ -70,11 +71,6 @@ class Requests:
     def refused(self) -> bool:
         """True between refuse() and accept()."""
         return self._refusal is not None
-
-    @property
-    def waiting(self) -> bool:
-        """True while there is a job that has not begun."""
-        return bool(self._waiting)
 
     def add(self, job: Pending, joins: Hashable = None, progress: Callback | None = None, obstacle: str = "") -> Future[Any]:
         """A new request; it fails at once with a CalibrationError for an obstacle, if requests are refused, or too many wait.
@@ -84,7 +80,7 @@ class Requests:
         """
         future: Future[Any] = Future()
         with self._lock:
-            alike, running = [own for own in self._waiting if own.kind == job.kind], self._running
+            alike, running = [own for own in self.waiting if own.kind == job.kind], self._running
             shared = next((own for own in alike if own.key == job.key), None)
             if running is not None and running.kind == job.kind and joins is not None and running.open_to == joins:
                 shared = running
@@ -92,7 +88,7 @@ class Requests:
             if not problem and shared is None and len(alike) >= MAX_WAITING:
                 problem = f"{MAX_WAITING} {job.kind}s wait already; ask again when one of them is answered"
             if not problem:
-                self._waiting += [] if shared else [job]
+                self.waiting += [] if shared else [job]
                 (shared or job).asked.append((future, progress))
                 return future
         future.set_exception(CalibrationError(problem))
@@ -104,10 +100,10 @@ class Requests:
         is_due: an estimate begins though nobody has asked for one. It is open to nobody: it does not search the whole box.
         """
         with self._lock:
-            self._waiting = [job for job in self._waiting if job.is_wanted()]
-            job = next((own for own in self._waiting if (own.kind == ESTIMATE) == estimate), None)
+            self.waiting = [job for job in self.waiting if job.is_wanted()]
+            job = next((own for own in self.waiting if (own.kind == ESTIMATE) == estimate), None)
             if job is not None:
-                self._waiting.remove(job)
+                self.waiting.remove(job)
                 job.open_to = open_to
             elif is_due and not self.refused:
                 job = Pending(ESTIMATE)
@@ -157,8 +153,8 @@ class Requests:
         node is stopping."""
         with self._lock:
             self._refusal = reason
-            ended = [*self._waiting, *filter(None, [self._running])]
-            self._waiting, self._running = [], None
+            ended = [*self.waiting, *filter(None, [self._running])]
+            self.waiting, self._running = [], None
         for job in ended:
             job.answer(error=CalibrationError(reason or job.ended))
 

@@ -102,15 +102,9 @@ def read_state(path: str | Path) -> State:
         except (AttributeError, LookupError, TypeError, ValueError, OverflowError, BadInputError):
             raise BadInputError(f"saved state {path} holds no usable {name}; {REMEDY}") from None
 
-    return State(result, usable("camera", _camera), usable("provenance", _provenance))
-
-
-def _camera(data: Any) -> Camera:
-    return Camera(data["K"], int(data["width"]), int(data["height"]), data["model"], data["D"])
-
-
-def _provenance(data: Any) -> dict[str, Any]:
-    return {**data, "sensor_stamp_ns": int(data.get("sensor_stamp_ns", 0))}
+    camera = usable("camera", lambda own: Camera(own["K"], int(own["width"]), int(own["height"]), own["model"], own["D"]))
+    stamp = "sensor_stamp_ns"
+    return State(result, camera, usable("provenance", lambda own: {**own, stamp: int(own.get(stamp, 0))}))
 
 
 def _digest(data: dict[str, Any]) -> str:

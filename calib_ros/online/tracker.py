@@ -157,7 +157,9 @@ class Tracker:
             return self.current
         if self._offset.differs(estimate) and (self.tentative or on_request):
             self._start_anew()
-        why = self._objection_to(estimate, on_request)
+        why = "" if estimate.converged else estimate.reason or estimate.status
+        if estimate.converged and self.settled and not on_request and estimate.covariance is not None:
+            why = self._too_far(estimate)
         if why:
             self._reject(estimate, why)
         else:
@@ -198,13 +200,6 @@ class Tracker:
         return self.current
 
     # ---- gate ---------------------------------------------------------------------------------------------------------
-
-    def _objection_to(self, estimate: Result, on_request: bool) -> str:
-        """Why an estimate is rejected, for a person; "" if it is not."""
-        if not estimate.converged:
-            return estimate.reason or estimate.status
-        known = self.settled and not on_request and estimate.covariance is not None
-        return self._too_far(estimate) if known else ""
 
     def _too_far(self, estimate: Result) -> str:
         """Why an estimate is farther from the current extrinsic than the process noise allows for; "" if it is not."""

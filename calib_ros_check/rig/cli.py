@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib_ros.cli.output import check_json, print_or_save, progress_bar
-from calib_ros.datasets.folder_rig import is_folder_rig
+from calib_ros.datasets.rig import is_folder_rig
 from calib_ros.rig.description import read_rig
 from calib_ros_check.cli import EXIT, options_of
 from calib_ros_check.fleet.recordings import is_fleet

@@ -164,7 +164,7 @@ class Mulfeat(Viewing):
         view, config = self._preprocess(frame), self.config
         index, P = edge_probability(view.measured, view.reflectivity, config, self.rows_per_ring, self.columns_per_step)
         require(len(index), self.min_points, WHAT, "check that the LiDAR sees objects")
-        edges = gradient_edges(prepare(view.gray, config.image), thesis_of(config))
+        edges = gradient_edges(prepare(view.gray), thesis_of(config))
         blur = self.smoothing * float(view.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         return MulfeatFeatures(view.camera, view.xyz[index], P, smoothed(edges, blur))
 

@@ -9,7 +9,6 @@ from functools import partial
 import cv2
 import numpy as np
 
-from calib_ros.config import ImageConfig
 from calib_ros.image.edges import GRADIENT_PERCENTILE, REFERENCE_FOCAL_LENGTH
 from calib_ros.image.enhance import (
     BILATERAL_COLOR,
@@ -32,12 +31,13 @@ METHODS = {
     "adaptive": "adaptive: a curve per tile",
     "clahe": "CLAHE: per tile, clipped",
 }
+USED = " Used in this run."
 STRONG = 0.5  # edge strength that captions call strong
 
 
 def preparation_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Original image to the prepared grey one."""
-    config, image, gray = scene.config.image, scene.frame.image, scene.gray
+    image, gray = scene.frame.image, scene.gray
     recorded, camera = scene.source.camera, scene.frame.camera
     made = [f"shrunk from {recorded.width} x {recorded.height} px"] if recorded.width != camera.width else []
     made += [] if recorded.is_pinhole else ["freed of its lens distortion, so that eq. 2.3 projects points onto it"]
@@ -51,16 +51,16 @@ def preparation_steps(scene: RegisteredFrame) -> Iterator[Step]:
     yield preparation_step(
         "Grey image",
         f"{color} Grey levels spread by {gray.std():.0f} around a mean of {gray.mean():.0f}. This is also what equalisation "
-        f"'none' leaves.{_used(config, 'none')}",
+        "'none' leaves.",
         gray,
     )
-    equalized = {method: equalize(gray, _with(config, method)) for method in METHODS}
+    equalized = {method: equalize(gray, method) for method in METHODS}
     yield from _equalized(scene, equalized)
-    yield from _filtered(scene, equalize(gray, config))
+    yield from _filtered(scene, equalized["clahe"])
 
 
 def _equalized(scene: RegisteredFrame, equalized: dict[str, Image]) -> Iterator[Step]:
-    config, image = scene.config.image, scene.frame.image
+    image = scene.frame.image
     tiles_text = f"{CLAHE_TILES} x {CLAHE_TILES} tiles"
     texts = {
         "global": "Global equalisation, eq. 3.1 to 3.4: the distribution of all pixels becomes the curve that maps grey levels. "
@@ -74,13 +74,13 @@ def _equalized(scene: RegisteredFrame, equalized: dict[str, Image]) -> Iterator[
         picture = equalized[method]
         numbers = f" Grey levels spread by {picture.std():.0f} instead of {scene.gray.std():.0f}."
         name = "CLAHE" if method == "clahe" else f"Equalised, {method}"
-        yield preparation_step(name, text + numbers + _used(config, method), picture)
+        yield preparation_step(name, text + numbers + (USED if method == "clahe" else ""), picture)
     if image.ndim == 3:
         yield preparation_step(
             "CLAHE on colour",
             "Figure 3.5: CLAHE on the blue, green and red channel by themselves. Colours shift where the channels' histograms "
             "differ. Not used: the method works on the grey image.",
-            equalize(image, _with(config, "clahe")),
+            equalize(image),
         )
     yield preparation_step(
         "Histograms",
@@ -101,7 +101,6 @@ def _equalized(scene: RegisteredFrame, equalized: dict[str, Image]) -> Iterator[
 
 
 def _filtered(scene: RegisteredFrame, equalized: Image) -> Iterator[Step]:
-    config = scene.config.image
     texts = {
         "bilateral": f"Bilateral filter, eq. 3.5: the mean over {BILATERAL_DIAMETER} px of pixels that are near (sigma "
         f"{BILATERAL_SPACE:g} px) and alike (sigma {BILATERAL_COLOR:g} grey levels). Texture goes, edges stay.",
@@ -109,10 +108,9 @@ def _filtered(scene: RegisteredFrame, equalized: Image) -> Iterator[Step]:
     }
     done: dict[str, Image] = {}
     for name, text in texts.items():
-        done[name] = smooth(equalized, dataclasses.replace(config, filter=name))
+        done[name] = smooth(equalized, name)
         change = float(cv2.absdiff(done[name], equalized).mean())
-        used = " Used in this run." if config.filter == name else ""
-        text += f" A pixel changes by {change:.1f} grey levels on average.{used}"
+        text += f" A pixel changes by {change:.1f} grey levels on average.{USED if name == 'bilateral' else ''}"
         yield preparation_step(f"{name.capitalize()} filter", text, done[name])
     window = busiest(outlines(equalized), *_size(equalized))
     yield preparation_step(
@@ -125,11 +123,10 @@ def _filtered(scene: RegisteredFrame, equalized: Image) -> Iterator[Step]:
 
 def edge_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Prepared image to E^I."""
-    config, thesis = scene.config.image, thesis_of(scene.config)
+    thesis = thesis_of(scene.config)
     yield edge_step(
         "Prepared image",
-        f"What the edge operators get: equalisation {config.equalization}, filter {config.filter} "
-        f"(the dotted box of figure 3.10).",
+        "What the edge operators get: equalisation clahe, filter bilateral (the dotted box of figure 3.10).",
         scene.prepared,
     )
     thresholds = f"{thesis.canny_low:g} and {thesis.canny_high:g} of a full edge"
@@ -144,7 +141,7 @@ def edge_steps(scene: RegisteredFrame) -> Iterator[Step]:
         whole = f"what {1 - scene.semantic_share:.0%} of {whole} is made of; the rest are {scene.semantic_edges}, see Semantics"
     for operator in OPERATORS:
         edges = gradient_edges(scene.prepared, dataclasses.replace(thesis, operator=operator))
-        used = f" Used in this run: this is {whole}." if thesis.operator == operator else ""
+        used = f"{USED[:-1]}: this is {whole}." if thesis.operator == operator else ""
         share = f"{(edges > STRONG).mean():.1%} of the pixels are stronger than {STRONG:g}.{used}"
         yield edge_step(f"{operator.capitalize()} edges", texts[operator] + share, edge_picture(edges))
     focal_length = float(scene.features.camera.K[0, 0])
@@ -171,14 +168,6 @@ def edge_steps(scene: RegisteredFrame) -> Iterator[Step]:
         tiles(pictures, names, len(names), scene.frame.camera.width),
         wide=True,
     )
-
-
-def _with(config: ImageConfig, equalization: str) -> ImageConfig:
-    return dataclasses.replace(config, equalization=equalization)
-
-
-def _used(config: ImageConfig, method: str) -> str:
-    return " Used in this run." if config.equalization == method else ""
 
 
 def _size(gray: Image) -> tuple[int, int]:

@@ -109,7 +109,7 @@ class RegisteredFrame:
     @cached_property
     def prepared(self) -> Image:
         """The image (h, w) as the edge operators get it."""
-        return prepare(self.frame.image, self.config.image)
+        return prepare(self.frame.image)
 
     @cached_property
     def unsmoothed(self) -> NDArray[np.float32]:

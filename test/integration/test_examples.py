@@ -192,24 +192,3 @@ def test_a_notebook_holds_the_blocks_of_its_page(name: str) -> None:
     code = ["".join(cell["source"]) for cell in json.loads(written)["cells"] if cell["cell_type"] == "code"]
     assert [re.sub(r"^%%bash.*\n", "", text) for text in code] == [block.text.strip() for block in runnable(page)]
     assert any(text.startswith("%%bash") for text in code) == any(block.language == "bash" for block in runnable(page))
-
-
-def test_a_page_is_taken_apart_as_it_is_written(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(
-        "One.\n\n<!-- exit: 3 -->\n```bash\nexit 3\n```\n\n```text\n...\n```\n\n<!-- not run: x -->\n```bash\nrm\n```\n"
-    )
-    blocks_of = [part for part in blocks(page) if not isinstance(part, str)]
-    assert [(b.language, b.text, b.line, b.markers) for b in blocks_of] == [
-        ("bash", "exit 3\n", 5, {"exit": "3"}), ("text", "...\n", 9, {}), ("bash", "rm\n", 14, {"not run": "x"}),
-    ]  # fmt: skip
-    assert runnable(page) == blocks_of[:1]
-    assert run(blocks_of[0], page, {}) == ""
-    with pytest.raises(AssertionError, match="exits with 1"):
-        run(TOOL.Block("bash", "false\ntrue\n", 1, {}), page, {})
-    with pytest.raises(AssertionError, match="not printed"):
-        assert_printed("converged: 4 frames", "refused: 4 frames", "page")
-    assert_printed("converged: 4 frames", "note\nconverged: 5 frames\n", "page")
-    cells = json.loads(TOOL.notebook(page.read_text()))["cells"]
-    assert [cell["cell_type"] for cell in cells] == ["markdown", "code", "markdown"]
-    assert cells[1]["source"] == ["%%bash --no-raise-error\n", "exit 3"]

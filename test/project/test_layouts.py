@@ -36,9 +36,3 @@ def test_foxglove_shows_overlay_diagnostics_extrinsic_and_drift() -> None:
         topic, _, field = path["value"].partition(".")
         assert topic == "/calib_ros/extrinsic"
         assert field in Extrinsic.get_fields_and_field_types()
-
-
-def test_setup_installs_them() -> None:
-    assert 'glob("config/*")' in (CONFIG.parent / "setup.py").read_text()
-    names = {"calib_ros.yaml", "vehicle.yaml", "calib_ros.rviz", "foxglove_layout.json", "fastdds_profile.xml"}
-    assert {*names, "fastdds_profile_large.xml"} <= {path.name for path in CONFIG.iterdir()}

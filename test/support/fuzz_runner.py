@@ -1,6 +1,6 @@
 """The fuzzer's own process: its memory is limited, a hang ends it with a stack, and what it found goes to stdout as JSON.
 
-python -W error fuzz_runner.py messages|texts|commands SEED COUNT
+python -W error fuzz_runner.py messages|commands SEED COUNT
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from fuzzing import HEIGHT, STAMP, WIDTH, K, MessageFuzzer, damage_folder, scan,
 from paths import ROOT
 from sample_sources import originals
 
-from calib_ros import result, se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, load_stages
+from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.messages import (
@@ -42,7 +41,6 @@ from calib_ros.messages import (
 )
 from calib_ros.messages.video import VideoDecoder, packet_of, picture_of
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.state import load_state
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
 
@@ -183,39 +181,11 @@ def in_use(camera: Camera, good: Frame) -> None:
 SHIPPED = ROOT / "config" / "calib_ros.yaml"
 
 
-def texts(run: Run, seed: int, count: int) -> None:
-    """Configurations, parameter files, results and states."""
-    rng = np.random.default_rng(seed)
-    samples = {"config": configurations(rng), "result": results(), "state": results()}
-    work: dict[str, Callable[[Path], Any]] = {
-        "config": lambda path: Config.from_dict(load_stages(path)),
-        "result": lambda path: usable(result.load(path)),
-        "state": lambda path: usable(load_state(path, CAMERA, "camera", "lidar")),
-    }
-    with tempfile.TemporaryDirectory() as folder:
-        run.start()
-        for k in range(count):
-            kind = ("config", "result", "state", "config")[k % 4]
-            path = mutated(rng, samples[kind], Path(folder))
-            run.case(kind, f"{kind} {k}", lambda p=path, w=work[kind]: w(p))
-
-
 def mutated(rng: np.random.Generator, samples: list[tuple[str, str]], folder: Path) -> Path:
     """A file made of one of the samples (name, text), with something wrong."""
     name, text = samples[int(rng.integers(len(samples)))]
     (folder / name).write_bytes(text_file(rng, text))
     return folder / name
-
-
-def usable(loaded: Result) -> None:
-    """A result that was read can be written again, as JSON, YAML and a message."""
-    se3.as_transform(loaded.T_camera_lidar)
-    for yaml_format in (False, True):
-        result.parse(loaded.dumps(yaml_format), "what was written")
-    loaded.dumps().encode()
-    if not 0 <= loaded.frames_used < 2**32:
-        raise ValueError(f"frames_used = {loaded.frames_used}")
-    "".join((loaded.status, loaded.reason, loaded.camera_frame, loaded.lidar_frame)).encode()
 
 
 def configurations(rng: np.random.Generator) -> list[tuple[str, str]]:
@@ -247,7 +217,7 @@ def commands(run: Run, seed: int, count: int) -> None:
     from calib_ros.cli.main import main
 
     rng = np.random.default_rng(seed)
-    texts_of = {"--config": configurations(rng), "--initial": results()}
+    texts_of = {"--config": configurations(rng), "--initial": results(), "export": results()}
     with tempfile.TemporaryDirectory() as name:
         whole = originals(Path(name))
         terminal = os.open(Path(name) / "terminal", os.O_RDWR | os.O_CREAT)
@@ -257,9 +227,10 @@ def commands(run: Run, seed: int, count: int) -> None:
             source = whole[k % len(whole)]
             broken = Path(name) / "broken" / source.name
             shutil.copytree(source, broken)
-            if rng.random() < 0.2:
-                option = ("--config", "--initial")[int(rng.integers(2))]
-                argv = ["replay", str(broken), option, str(mutated(rng, texts_of[option], Path(name)))]
+            if rng.random() < 0.3:
+                option = ("--config", "--initial", "export")[int(rng.integers(3))]
+                text = str(mutated(rng, texts_of[option], Path(name)))
+                argv = ["export", text, "--format", "yaml"] if option == "export" else ["replay", str(broken), option, text]
             else:
                 damage_folder(rng, broken)
                 stores = [p for p in broken.iterdir() if p.suffix in (".mcap", ".db3", ".bag") and p.is_file()]
@@ -290,6 +261,6 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore", FutureWarning)  # names of former versions, which a mutation may make
     what, first, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     this = Run()
-    {"messages": messages, "texts": texts, "commands": commands}[what](this, first, number)
+    {"messages": messages, "commands": commands}[what](this, first, number)
     sys.__stdout__.write(json.dumps(this.report()) + "\n")
     sys.__stdout__.flush()

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 import yaml
 from calib_ros_msgs.msg import Extrinsic, Rig
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy._rclpy_pybind11 import InvalidHandle
-from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_peer import LATCHED, camera_info_message, cloud_message
+from ros_peer import LATCHED, NodeAndPeer, camera_info_message, cloud_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import Trigger
 from vehicle import QUICK
-from waiting import LIMIT_S, until
+from waiting import LIMIT_S
 
 from calib_ros import se3
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -67,7 +60,7 @@ def again(items: Iterable[Measured], after_s: float) -> list[Measured]:
     return [(stamp + round(after_s * NANOSECONDS), name, value) for stamp, name, value in items]
 
 
-class RigPeer:
+class RigPeer(NodeAndPeer):
     """The node under test, its pairs and a peer, each on an executor's thread. parameters: as of `Peer`. lidars: how many of the
     rig's; the cameras are paired with the first one."""
 
@@ -77,11 +70,7 @@ class RigPeer:
         self.rig, self.cameras, self.lidar = rig, tuple(cameras), rig.lidars[0]
         self._patch = pytest.MonkeyPatch()
         self._patch.setattr(pacing, "SAVED_S", 1e6)  # which frames become keyframes must not depend on the machine
-        self.context = Context()
-        rclpy.init(context=self.context)
-        overrides = [Parameter(n.replace("__", "."), value=v) for n, v in {"rig_file": str(rig_file), **values}.items()]
-        self.node = CalibNode(context=self.context, parameter_overrides=overrides)
-        self.peer = rclpy.create_node("peer", context=self.context)
+        super().__init__(CalibNode, {"rig_file": str(rig_file), **values})
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         topics = [(CameraInfo, f"/{c}/camera_info") for c in cameras] + [(Image, f"/{c}/image") for c in cameras]
         topics += [(PointCloud2, f"/{lidar}/points") for lidar in rig.lidars[:lidars]]
@@ -95,13 +84,8 @@ class RigPeer:
         for camera in cameras:
             heard = self.extrinsics[camera].append
             self.peer.create_subscription(Extrinsic, f"/calib_ros/{camera}/{self.lidar}/extrinsic", heard, LATCHED)
-        self._spinning = [self._spin(self.node), self._spin(self.peer)]
+        self.spin()
         self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()), "the subscriptions")
-
-    @property
-    def calibration(self) -> Any:
-        """Of the rig."""
-        return self.node.calibration
 
     def pair(self, camera: str) -> Any:
         """The interface of a pair."""
@@ -144,50 +128,17 @@ class RigPeer:
                     pass
                 assert self.pair(camera).pipeline.wait_idle(LIMIT_S)
 
-    def change(self, **named: Any) -> None:
-        """Set parameters of the node, with __ for the dot; they must be taken."""
-        answer = self.node.set_parameters_atomically([Parameter(n.replace("__", "."), value=v) for n, v in named.items()])
-        assert answer.successful, answer.reason
-
     def trigger(self, name: str) -> str:
         """The answer of a service below the node's name."""
-        client = self.peer.create_client(Trigger, f"/calib_ros/{name}")
-        assert client.wait_for_service(LIMIT_S)
-        asked = client.call_async(Trigger.Request())
-        self.until(asked.done, name)
-        assert asked.result().success, asked.result().message
-        return str(asked.result().message)
-
-    def until(self, condition: Callable[[], Any], what: object = "") -> Any:
-        """Wait until the condition holds."""
-        return until(condition, what, state=lambda: self.calibration.health.last_error[0])
+        answer = self.call(self.peer.create_client(Trigger, f"/calib_ros/{name}"), Trigger.Request())
+        assert answer.success, answer.message
+        return str(answer.message)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.statuses |= {status.name: status for status in message.status}
 
-    def _spin(self, node: Any) -> tuple[SingleThreadedExecutor, threading.Thread]:
-        executor = SingleThreadedExecutor(context=self.context)
-        executor.add_node(node)
-
-        def run() -> None:
-            with suppress(ExternalShutdownException, InvalidHandle):
-                executor.spin()
-
-        thread = threading.Thread(target=run)
-        thread.start()
-        return executor, thread
-
-    def __enter__(self) -> RigPeer:
-        return self
-
     def __exit__(self, *_: object) -> None:
-        self.node.stop()
-        for executor, thread in self._spinning:
-            executor.shutdown(timeout_sec=LIMIT_S)
-            thread.join(LIMIT_S)
-        self.node.destroy_node()
-        self.peer.destroy_node()
-        rclpy.try_shutdown(context=self.context)
+        super().__exit__()
         self._patch.undo()
 
 

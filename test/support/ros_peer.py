@@ -94,8 +94,83 @@ class Goal:
         return answer.status, answer.result
 
 
-class Peer:
-    """The node under test and a peer node in one process, each with its own executor thread, over real DDS.
+class NodeAndPeer:
+    """The node under test and a peer node in one process, each with its own executor thread, over real DDS. parameters: of the
+    node, with __ for the dot."""
+
+    def __init__(self, node_type: Any, parameters: dict[str, Any]) -> None:
+        self.context = Context()
+        rclpy.init(context=self.context)
+        self.node = node_type(context=self.context, parameter_overrides=_values(parameters))
+        self.peer = rclpy.create_node("peer", context=self.context)
+        self._executors: list[tuple[SingleThreadedExecutor, threading.Thread]] = []
+
+    def spin(self) -> None:
+        """To be called when the peer has all it listens with."""
+        for node in (self.node, self.peer):
+            executor = SingleThreadedExecutor(context=self.context)
+            executor.add_node(node)
+            thread = threading.Thread(target=_spin, args=(executor,))
+            thread.start()
+            self._executors.append((executor, thread))
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.node.stop()
+        for executor, thread in self._executors:
+            executor.shutdown(timeout_sec=LIMIT_S)
+            thread.join(LIMIT_S)
+        self.node.destroy_node()
+        self.peer.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    @property
+    def calibration(self) -> Any:
+        """All of the node but its kind; None while a managed node is not configured."""
+        return self.node.calibration
+
+    def last_error(self) -> str:
+        """The newest problem; none while a managed node is not configured."""
+        return self.calibration.health.last_error[0] if self.calibration is not None else ""
+
+    def until(self, condition: Callable[[], Any], what: object = "") -> Any:
+        """Wait until the condition holds."""
+        return until(condition, what, state=lambda: f"last error: {self.last_error()}")
+
+    def change(self, **named: Any) -> None:
+        """Set parameters of the node, with __ for the dot, all at once; they must be taken."""
+        assert self.set(**named) == ""
+
+    def set(self, **named: Any) -> str:
+        """The same; why they are refused, "" if they are taken."""
+        answer = self.node.set_parameters_atomically(_values(named))
+        return "" if answer.successful else answer.reason or "refused"
+
+    def call(self, client: Any, request: Any) -> Any:
+        """The answer of a service."""
+        future = self.call_async(client, request)
+        self.until(future.done, client.srv_name)
+        return future.result()
+
+    def call_async(self, client: Any, request: Any) -> Any:
+        """The future of the answer."""
+        assert client.wait_for_service(LIMIT_S)
+        return client.call_async(request)
+
+
+def _values(named: dict[str, Any]) -> list[Parameter]:
+    return [Parameter(name.replace("__", "."), value=value) for name, value in named.items()]
+
+
+def _spin(executor: SingleThreadedExecutor) -> None:
+    with suppress(ExternalShutdownException, InvalidHandle):  # rclpy may wake what is being shut down
+        executor.spin()
+
+
+class Peer(NodeAndPeer):
+    """The node under test and a peer node for its sensors.
 
     node_type: a managed node is to be configured by the test. parameters: of the node, with __ for the dot. Without others than
     these it runs no networks and makes an estimate at every keyframe, though tests send frames faster than a vehicle does; data
@@ -107,11 +182,7 @@ class Peer:
         parameters.setdefault("online__rest_period_s", 0.0)
         parameters.setdefault("online__max_load", 1.0)
         parameters.setdefault("max_data_age_s", 3600.0)
-        self.context = Context()
-        rclpy.init(context=self.context)
-        overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
-        self.node = node_type(context=self.context, parameter_overrides=overrides)
-        self.peer = rclpy.create_node("peer", context=self.context)
+        super().__init__(node_type, parameters)
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         self.image_pub = self.peer.create_publisher(image_type, "image", reliable)
         self.info_pub = self.peer.create_publisher(CameraInfo, "camera_info", reliable)
@@ -126,14 +197,9 @@ class Peer:
         }
         # Before its node spins: rclpy shows an action client to the executor before it has made its lock.
         self._calibrate = ActionClient(self.peer, Calibrate, "/calib_ros/calibrate")
-        self._executors = [self._spin(self.node), self._spin(self.peer)]
+        self.spin()
         if self.calibration is not None:
             self.await_subscriptions()
-
-    @property
-    def calibration(self) -> Any:
-        """All of the node but its kind; None while a managed node is not configured."""
-        return self.node.calibration
 
     @property
     def pipeline(self) -> Any:
@@ -163,44 +229,6 @@ class Peer:
         adaptive = self.calibration.sensors.adaptive
         self.until(lambda: all(follows._current.get_publisher_count() for follows in adaptive), "the publishers")
         self.pipeline.load = LoadBudget(self.pipeline.config.online, lambda: 1000 * time.monotonic())
-
-    def _spin(self, node: Any) -> tuple[SingleThreadedExecutor, threading.Thread]:
-        executor = SingleThreadedExecutor(context=self.context)
-        executor.add_node(node)
-
-        def run() -> None:
-            with suppress(ExternalShutdownException, InvalidHandle):  # rclpy may wake what is being shut down
-                executor.spin()
-
-        thread = threading.Thread(target=run)
-        thread.start()
-        return executor, thread
-
-    def __enter__(self) -> Peer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.node.stop()
-        for executor, thread in self._executors:
-            executor.shutdown(timeout_sec=LIMIT_S)
-            thread.join(LIMIT_S)
-        self.node.destroy_node()
-        self.peer.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-    def until(self, condition: Callable[[], Any], what: object = "") -> Any:
-        """Wait until the condition holds."""
-        return until(condition, what, state=lambda: f"last error: {self.last_error()}")
-
-    def change(self, **named: Any) -> None:
-        """Set parameters of the node, with __ for the dot, all at once; they must be taken."""
-        assert self.set(**named) == ""
-
-    def set(self, **named: Any) -> str:
-        """The same; why they are refused, "" if they are taken."""
-        changes = [Parameter(name.replace("__", "."), value=value) for name, value in named.items()]
-        answer = self.node.set_parameters_atomically(changes)
-        return "" if answer.successful else answer.reason or "refused"
 
     def publish(self, frame: Frame, settle: bool = True, **cloud_options: Any) -> None:
         """One frame as three messages; settle = wait until the node has worked it off."""
@@ -254,21 +282,6 @@ class Peer:
 
     def trigger(self, name: str) -> Trigger.Response:
         return self.call(self._triggers[name], Trigger.Request())
-
-    def call(self, client: Any, request: Any) -> Any:
-        """The answer of a service."""
-        future = self.call_async(client, request)
-        self.until(future.done, client.srv_name)
-        return future.result()
-
-    def call_async(self, client: Any, request: Any) -> Any:
-        """The future of the answer."""
-        assert client.wait_for_service(LIMIT_S)
-        return client.call_async(request)
-
-    def last_error(self) -> str:
-        """The newest problem; none while a managed node is not configured."""
-        return self.calibration.health.last_error[0] if self.calibration is not None else ""
 
     def warns(self, *texts: str) -> bool:
         """Whether the newest diagnostics are a warning with these texts."""

@@ -74,18 +74,18 @@ class Pairing:
 
     def use_sweep(self) -> list[Intake]:
         """Pair by what is known of the sweep. Of pairs that become final by it, the newest is to be taken in."""
-        return self._use(self.sweep.ns)
+        offset = self.sweep.ns
+        return [] if offset is None else self._to_take_in(self.synchronizer.set_cloud_offset(offset)[-1:])
 
     def use_stamps(self) -> list[Intake]:
         """Pair by what the stamps are said to be, while nobody can tell the sweep."""
-        return self._use(self.sweep.stamped_ns) if self.synchronizer.cloud_offset is None else []
+        if self.synchronizer.cloud_offset is not None:
+            return []
+        return self._to_take_in(self.synchronizer.set_cloud_offset(self.sweep.stamped_ns)[-1:])
 
     def newest_cloud_between(self, since: int, until: int) -> tuple[int, Any] | None:
         """The newest cloud message stamped after `since` and before `until` (ns), with its stamp."""
         return max((item for item in self._clouds if since < item[0] < until), key=lambda item: item[0], default=None)
-
-    def _use(self, offset: int | None) -> list[Intake]:
-        return [] if offset is None else self._to_take_in(self.synchronizer.set_cloud_offset(offset)[-1:])
 
     def _to_take_in(self, pairs: list[tuple[Any, Any]]) -> list[Intake]:
         """The pairs, or, while nothing is known of the sweep, what is to be looked at."""

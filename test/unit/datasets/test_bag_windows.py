@@ -207,22 +207,6 @@ def test_static_transforms_are_those_of_the_whole_bag(tmp_path, storage):
         assert np.abs(bag[middle].reference - T).max() < 1e-9
 
 
-@pytest.mark.parametrize("beginning", [True, False])
-def test_static_transforms_that_are_repeated_all_the_time(tmp_path, beginning):
-    """With another one that connects camera and LiDAR, sent once: at the beginning, or in the middle of the recording."""
-
-    def write(recorder: Recorder, stamp: int) -> None:
-        if stamp == START + (0 if beginning else 6000 * MS):
-            recorder.static(stamp, ("base", "cam", A))
-        for k in range(3):
-            recorder.static(stamp + k * 30 * MS, ("base", "lidar", B))
-        trio(recorder, stamp)
-
-    bag = assert_frames_of_the_whole(record(tmp_path / "bag", write), 4)
-    assert bag.windows == 4
-    assert bag.reference is not None
-
-
 def test_a_bag_of_several_files(tmp_path):
     """Made by hand: the metadata of two bags, one after the other."""
     first = record(tmp_path / "first", trio)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import numpy as np
 import pytest
+from paths import ROOT
 from scenes import RenderedDrive, on_pixels_of_their_class
 
 from calib_ros import se3
@@ -15,12 +17,18 @@ from calib_ros.frame import Frame
 from calib_ros.frame import SemanticClass as Label
 from calib_ros_synthetic import rays
 from calib_ros_synthetic.camera import Scene, render
+from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_synthetic.multi_rigs import MULTI_RIGS
 from calib_ros_synthetic.rays import Rays, intersect
+from calib_ros_synthetic.rig import open_drive
+from calib_ros_synthetic.rigs import RIGS
 from calib_ros_synthetic.scanners import PERIOD, plain_scanner
+from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Builder, Kind, Solids
 from calib_ros_synthetic.street import Street
 
+SIX = "six_cameras_one_lidar"
 SMALL = {"rings": 16, "width": 160, "height": 96}
 SHARP = {"rings": 32, "width": 620, "height": 188, "speed": 0, "noise": 0}
 
@@ -209,6 +217,40 @@ def test_noise_has_the_stated_size_and_can_be_switched_off() -> None:
     np.testing.assert_array_equal(clean.labels(2).image, noisy.labels(2).image)
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("synthetic:sed=3", "seed, frames, rings"),
+        ("synthetic:seed", "key=value"),
+        ("synthetic:rings=20", "rings=20.*0, 16, 32, 64, 128"),
+        ("synthetic:frames=abc", "frames=abc.*whole number"),
+        ("synthetics", "no synthetic drive"),
+        ("synthetic:rig=os2", f"rig=os2 is not known.*vlp16_narrow.*os1_128_windshield.*{SIX}"),
+        ("synthetic:scene=moon", "scene=moon is not known.*street.*warehouse"),
+        ("synthetic:condition=fog", "condition=fog is not known.*clear.*night"),
+        ("synthetic:fields=all,fields=rgb", "fields=rgb is not known.*xyzi"),
+        ("synthetic:rig=vlp16_narrow,rings=32", "rings=32 does not go with rig=vlp16_narrow"),
+        (f"synthetic:rig={SIX},camera=top", "camera=top is not known; choose one of front, front_left"),
+        (f"synthetic:rig={SIX},lidar=front", "lidar=front is not known; choose one of lidar_top"),
+        (f"synthetic:rig={SIX},knock=roof", "knock=roof is not known; choose one of lidar_top, front"),
+        (f"synthetic:rig={SIX},speed=0", "speed=0 does not go with several sensors"),
+        (f"synthetic:rig={SIX},rings=32", "'rings=32' is not understood; write key=value with seed"),
+        (f"synthetic:rig={SIX},knock_deg=90", "knock_deg=90 is not allowed; it must be a number from 0 to 20"),
+    ],
+)
+def test_texts_that_name_no_drive_are_refused(text: str, message: str) -> None:
+    with pytest.raises(BadInputError, match=message):
+        open_drive(text)
+
+
+def test_the_page_lists_all_there_are() -> None:
+    page = (ROOT / "docs" / "synthetic.md").read_text(encoding="utf-8")
+    for title, names in {"Rigs": RIGS, "Scenes": SCENES, "Conditions": CONDITIONS, "Rigs of several sensors": MULTI_RIGS}.items():
+        section = page.partition(f"## {title}\n")[2].partition("\n## ")[0].partition("\n| parameter")[0]
+        rows = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
+        assert (rows or re.findall(r"`(\w+)`", section)) == list(names), title
+
+
 def test_source_text_and_bad_parameters() -> None:
     drive = SyntheticDrive.from_text(" synthetic:seed=3, frames=16,rings=32,width=640,height=480,speed=0,noise=0.5 ")
     assert (drive.seed, len(drive), drive.rings, drive.speed, drive.noise) == (3, 16, 32, 0.0, 0.5)
@@ -218,15 +260,6 @@ def test_source_text_and_bad_parameters() -> None:
     assert again._parameters == drive._parameters
     assert SyntheticDrive.from_text("synthetic").name == SyntheticDrive().name
     assert all(isinstance(k, str) and isinstance(v, str) for k, v in drive.describe().items())
-    for text, message in (
-        ("synthetic:sed=3", "seed, frames, rings"),
-        ("synthetic:seed", "key=value"),
-        ("synthetic:rings=20", "rings=20.*0, 16, 32, 64, 128"),
-        ("synthetic:frames=abc", "frames=abc.*whole number"),
-        ("synthetics", "no synthetic drive"),
-    ):
-        with pytest.raises(BadInputError, match=message):
-            SyntheticDrive.from_text(text)
     wrong = [("seed", -1), ("frames", 0), ("frames", 2.5), ("frames", True), ("rings", 48), ("width", 10), ("height", 0)]
     wrong += [("speed", float("nan")), ("stride", 0), ("noise", -0.1), ("noise", "much"), ("tilt_deg", 90)]
     for name, value in wrong:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
-from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, UNLABELLED
 from calib_ros.lidar.deskew import moved
 from calib_ros_synthetic.drive import SyntheticDrive
@@ -135,23 +131,3 @@ def test_a_pair_is_an_ordinary_source() -> None:
     assert isinstance(open_drive("synthetic:rig=os1_64_robot", 2), SyntheticDrive)
     with pytest.raises(IndexError):
         pair[2]
-
-
-def test_what_does_not_go_with_several_sensors_is_said() -> None:
-    for bad, message in (
-        (f"rig={SIX},camera=top", "camera=top is not known; choose one of front, front_left"),
-        (f"rig={SIX},lidar=front", "lidar=front is not known; choose one of lidar_top"),
-        (f"rig={SIX},knock=roof", "knock=roof is not known; choose one of lidar_top, front"),
-        (f"rig={SIX},speed=0", "speed=0 does not go with several sensors"),
-        (f"rig={SIX},rings=32", "'rings=32' is not understood; write key=value with seed"),
-        (f"rig={SIX},knock_deg=90", "knock_deg=90 is not allowed; it must be a number from 0 to 20"),
-        ("rig=six_cameras", f"rig=six_cameras is not known.*os1_64_robot.*{SIX}"),
-    ):
-        with pytest.raises(BadInputError, match=message):
-            open_drive(f"synthetic:{bad}")
-
-
-def test_the_page_lists_all_rigs_of_several_sensors() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "synthetic.md").read_text(encoding="utf-8")
-    section = page.partition("## Rigs of several sensors\n")[2].partition("\n| parameter")[0]
-    assert re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE) == list(MULTI_RIGS)

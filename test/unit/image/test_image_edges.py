@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from calib_ros.config import ImageConfig
 from calib_ros.image.edges import (
     LARGEST,
     MIN_MAGNITUDE,
@@ -21,7 +20,6 @@ from calib_ros.image.edges import (
 )
 from calib_ros.image.enhance import prepare, to_gray
 
-IMAGE = ImageConfig()
 FOCAL = 720.0
 
 
@@ -52,18 +50,18 @@ def full_size(level: EdgeLevel, axis: int) -> np.ndarray:
 @pytest.mark.parametrize("angle", [0, 20, 45, 70, 90, 110, 160, 180, 250, 270])
 def test_an_edge_is_shared_out_by_its_direction(angle):
     """One along the columns or rows shows in the map of its gradient alone."""
-    horizontal, vertical = (m[20:-20, 20:-20] for m in oriented_edges(half_plane(angle, width=10), IMAGE))
+    horizontal, vertical = (m[20:-20, 20:-20] for m in oriented_edges(half_plane(angle, width=10)))
     share = horizontal.sum() / (horizontal.sum() + vertical.sum())
     assert share == pytest.approx(np.cos(np.deg2rad(angle)) ** 2, abs=0.02)
     if angle % 90 == 0:
-        maps = oriented_edges(half_plane(angle), IMAGE)
+        maps = oriented_edges(half_plane(angle))
         own = angle // 90 % 2
         assert maps[own].max() > 0.9
         assert maps[1 - own].max() < 1e-4
 
 
 def test_strengths_lie_between_nothing_and_a_full_edge():
-    horizontal, vertical = oriented_edges(blocks(), IMAGE)
+    horizontal, vertical = oriented_edges(blocks())
     total = horizontal + vertical
     assert (horizontal >= 0).all()
     assert (vertical >= -1e-6).all()
@@ -81,9 +79,9 @@ def noisy(image: np.ndarray, sigma: float) -> np.ndarray:
 @pytest.mark.parametrize("sigma", [3.0, 8.0, 15.0])
 def test_noise_is_no_edge_and_edges_stand_out_of_it(sigma):
     """The limit follows the noise: about two pixels in a hundred of a flat picture pass, whatever its strength."""
-    flat = sum(oriented_edges(noisy(np.full((240, 320), 120, np.uint8), sigma), IMAGE))
+    flat = sum(oriented_edges(noisy(np.full((240, 320), 120, np.uint8), sigma)))
     assert (flat > 0).mean() == pytest.approx(0.02, abs=0.01)
-    step = sum(oriented_edges(noisy(half_plane(0), sigma), IMAGE))
+    step = sum(oriented_edges(noisy(half_plane(0), sigma)))
     assert (step[:, 159:161] > 0).mean() > 0.95
     assert (np.delete(step, np.s_[157:163], axis=1) > 0).mean() < 0.03
 
@@ -92,7 +90,7 @@ def test_what_is_everywhere_is_not_taken_for_noise_where_some_of_the_picture_is_
     """Leaves on two thirds of a picture, a road on the rest."""
     leaves = blocks(size=3)
     leaves[160:] = 120
-    found = sum(oriented_edges(noisy(leaves, 3.0), IMAGE))
+    found = sum(oriented_edges(noisy(leaves, 3.0)))
     assert (found[:150] > 0).mean() > 0.6
     assert (found[170:] > 0).mean() < 0.03
 
@@ -110,7 +108,7 @@ def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis, monkeypatch):
     row = np.round(40 + 180 / (1 + np.exp(-(x - 80.0) / 3))).astype(np.uint8)  # steepest at pixel 80
     picture = np.tile(row, (160, 1)) if axis else np.tile(row[:, None], (1, 160))
     monkeypatch.setattr("calib_ros.image.edges.GRADIENT_PERCENTILE", 100.0)
-    profile = oriented_edges(picture, IMAGE)[1 - axis][80] if axis else oriented_edges(picture, IMAGE)[1][:, 80]
+    profile = oriented_edges(picture)[1 - axis][80] if axis else oriented_edges(picture)[1][:, 80]
     assert profile.argmax() == 80
     assert profile[80] == pytest.approx(1, abs=0.01)
     assert profile[[78, 79, 81, 82]] == pytest.approx(0.47, abs=0.04)
@@ -128,7 +126,7 @@ def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis, monkeypatch):
     ],
 )
 def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
-    levels = edge_levels(texture(), focal, IMAGE)
+    levels = edge_levels(texture(), focal)
     assert [level.scale for level in levels] == scales
     assert [level.sigma for level in levels] == pytest.approx(blurs)
     assert [level.maps.shape for level in levels] == [(2, 240 // s, 320 // s) for s in scales]
@@ -136,14 +134,14 @@ def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
 
 def test_maps_are_standardised():
     for shape in ((240, 320), (239, 317), (61, 83), (50, 400)):
-        for level in edge_levels(texture(shape=shape), FOCAL, IMAGE):
+        for level in edge_levels(texture(shape=shape), FOCAL):
             assert level.maps.dtype == np.float32
             assert level.maps.mean(axis=(1, 2)) == pytest.approx([0, 0], abs=1e-3)
             assert level.maps.std(axis=(1, 2)) == pytest.approx([1, 1], abs=1e-3)
 
 
 def without_local_contrast(picture: np.ndarray, focal: float) -> list[EdgeLevel]:
-    return blurred_levels(oriented_edges(prepare(picture, IMAGE), IMAGE), focal)
+    return blurred_levels(oriented_edges(prepare(picture)), focal)
 
 
 @pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
@@ -177,9 +175,9 @@ def test_the_blur_is_as_wide_as_it_says(focal):
 
 def test_a_colour_picture_of_grey_is_a_grey_picture_and_one_without_contrast_has_no_edges():
     for value, shape in itertools.product((0, 128, 255), ((120, 160), (120, 160, 3))):
-        assert not any(level.maps.any() for level in edge_levels(np.full(shape, value, np.uint8), FOCAL, IMAGE))
+        assert not any(level.maps.any() for level in edge_levels(np.full(shape, value, np.uint8), FOCAL))
     grey = texture()
-    first, again, colour = (edge_levels(picture, FOCAL, IMAGE) for picture in (grey, grey, np.dstack([grey] * 3)))
+    first, again, colour = (edge_levels(picture, FOCAL) for picture in (grey, grey, np.dstack([grey] * 3)))
     for a, b, c in zip(first, again, colour, strict=True):
         assert np.array_equal(a.maps, b.maps)
         assert np.abs(a.maps - c.maps).max() < 0.05

@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, ShiftNoise, log_student, shift_evidence
+from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, ShiftNoise, shift_evidence
 
 C = np.diag(np.r_[[np.deg2rad(0.1)] * 3, [0.02] * 3] ** 2)
-
-
-def test_density_is_student():
-    S, x = np.diag([2.0, 0.5, 1.0]), np.array([1.0, -0.5, 2.0])
-    found = log_student(float(x @ np.linalg.solve(S, x)), float(np.linalg.slogdet(S)[1]), 3, 7.0)
-    assert found == pytest.approx(multivariate_t(np.zeros(3), S, 7.0).logpdf(x))
 
 
 @pytest.mark.parametrize("freedom", [12.0, 60.0])

@@ -8,7 +8,7 @@ import numpy as np
 from driven import Driven, config
 
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.quiet_log import QuietLog
+from calib_ros.online.events import QuietLog
 from calib_ros_synthetic.drive import SyntheticDrive
 
 

@@ -19,14 +19,12 @@ class Recorder:
     def __init__(self, blocked: bool = False) -> None:
         self.items: list[object] = []
         self.errors: list[Exception] = []
-        self.threads: set[str] = set()
         self.started, self.go = threading.Semaphore(0), threading.Event()
         if not blocked:
             self.go.set()
         self.worker: Worker[object] = Worker("recorder", self.work, self.errors.append)
 
     def work(self, item: object) -> None:
-        self.threads.add(threading.current_thread().name)
         self.started.release()
         while not self.go.wait(0.002):
             self.worker.check_cancelled()
@@ -58,13 +56,6 @@ def make() -> Iterator[Callable[..., Recorder]]:
     for recorder in made:
         recorder.go.set()
         assert recorder.worker.stop(SOON)
-
-
-def test_items_are_worked_on_in_another_thread(make):
-    recorder = make()
-    recorder.put(0, None, 2)
-    assert recorder.items == [0, None, 2]
-    assert recorder.threads == {"recorder_0"}
 
 
 def test_the_newest_item_replaces_those_that_wait(make):

@@ -271,7 +271,7 @@ def test_a_share_of_masks_is_blended_in_before_the_blur(frame: Frame, edges_of: 
     config = update(Config(), {"semantics": {"image_classes": "source", "cloud_classes": ""}})
     extract = FeatureExtractor(frame.camera, config)
     semantics = replace(SegmentationModels(config.semantics)(frame), edges_of=edges_of)
-    gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
+    gradient = oriented_edges(prepare(extract.working_image(frame.image)))
     edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, semantics.edges, strict=True)]
     blended = blurred_levels(edges, float(extract.camera.K[0, 0]), local_contrast=True)
     for a, b, c in zip(extract(frame, semantics).levels, blended, extract(frame).levels, strict=True):
@@ -297,7 +297,7 @@ def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, 
     assert calibrator.objectives([plain], frame.reference, frame.reference).remark.startswith("no semantic edges")
     features = whole.own
     image = calibrator.extract.working_image(frame.image)
-    gradient = gradient_edges(prepare(image, config.image), thesis_of(config))
+    gradient = gradient_edges(prepare(image), thesis_of(config))
     expected = blend(gradient, np.minimum(seen.edges.sum(axis=0), 1), share)
     focal = float(calibrator.extract.camera.K[0, 0])
     for sigma, own in zip(thesis_of(config).smoothing, features.image_edges, strict=True):

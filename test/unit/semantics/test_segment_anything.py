@@ -154,7 +154,7 @@ def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text
     (tmp_path / "encoder.yaml").write_text(text)
     image = np.full((64, 64, 3), COLOUR, np.uint8)
     halves = segmenter_of(settings(encoder, decoder))
-    embedded = halves.encoder(image, later())
+    embedded = halves.embedded(image, later())
     cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
     assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
     network = segmentation(tmp_path / "net.onnx", 19, "o 1 19 64 64", inputs="1 3 64 64")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from calib_ros.config import ImageConfig
 from calib_ros.errors import BadInputError
 from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, to_gray
 from calib_ros_thesis.config import ThesisConfig
@@ -40,7 +39,7 @@ def test_a_4x4_picture_is_equalised_as_computed_by_hand():
     # H = 6, 5, 4, 1; CDF = 6, 11, 15, 16; 255 * CDF / 16 = 95.625, 175.3125, 239.0625, 255.
     expected = [[96, 96, 96, 96], [96, 96, 175, 175], [175, 175, 175, 239], [239, 239, 239, 255]]
     assert equalize_global(gray).tolist() == expected
-    assert equalize(gray, ImageConfig(equalization="global")).tolist() == expected
+    assert equalize(gray, "global").tolist() == expected
     # The darkest level is part of the distribution: 255 * 2 / 4 = 127.5, rounded to even; cv2.equalizeHist leaves it at 0.
     assert equalize_global(np.array([[0, 0], [255, 255]], np.uint8)).tolist() == [[128, 128], [255, 255]]
     for value in (0, 7, 255):
@@ -48,14 +47,13 @@ def test_a_4x4_picture_is_equalised_as_computed_by_hand():
 
 
 def test_adaptive_equalisation_looks_at_the_neighbourhood_alone(monkeypatch):
-    adaptive = ImageConfig(equalization="adaptive")
     monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 4)
     picture = np.hstack([noise(3, (64, 64), 20), noise(4, (64, 64), 20) + np.uint8(200)])  # dark and bright
     corner = np.s_[:8, :8]  # of the outermost tile, where no other tile has a share
-    assert np.ptp(equalize(picture, adaptive)[corner]) > 230
+    assert np.ptp(equalize(picture, "adaptive")[corner]) > 230
     assert np.ptp(equalize_global(picture)[corner]) < 130  # the dark half shares the range with the bright one
     monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 1)
-    one = equalize(picture, adaptive).astype(int)
+    one = equalize(picture, "adaptive").astype(int)
     assert np.abs(one - equalize_global(picture)).max() <= 1  # float32 against float64 at halves
 
 
@@ -65,29 +63,24 @@ def test_clahe_is_opencvs_with_its_clip_limit_and_tiles(tiles, monkeypatch):
     expected = cv2.createCLAHE(clipLimit=3.5, tileGridSize=(tiles, tiles)).apply(gray)
     monkeypatch.setattr("calib_ros.image.enhance.CLAHE_CLIP", 3.5)
     monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", tiles)
-    assert np.array_equal(equalize(gray, ImageConfig()), expected)
+    assert np.array_equal(equalize(gray), expected)
     other = cv2.createCLAHE(clipLimit=3.5, tileGridSize=(tiles + 1, tiles + 1)).apply(gray)
     assert not np.array_equal(other, expected)
 
 
 @pytest.mark.parametrize("method", ["none", "global", "adaptive", "clahe"])
 def test_colours_are_equalised_one_by_one(method):
-    config = ImageConfig(equalization=method)
     picture = np.dstack([noise(k, high=high) for k, high in enumerate((50, 120, 256))])
-    alone = [equalize(picture[:, :, k].copy(), config) for k in range(3)]
-    assert np.array_equal(equalize(picture, config), np.dstack(alone))
+    alone = [equalize(picture[:, :, k].copy(), method) for k in range(3)]
+    assert np.array_equal(equalize(picture, method), np.dstack(alone))
 
 
 def test_preparing_equalises_grey_levels_not_colours():
     picture = np.dstack([noise(k, high=high) for k, high in enumerate((30, 120, 256))])
-    grey = equalize_global(to_gray(picture))
-    config = ImageConfig(equalization="global", filter="none")
-    assert np.array_equal(prepare(picture, config), grey)
-    assert np.array_equal(prepare(to_gray(picture), config), grey)
-    assert not np.array_equal(to_gray(equalize(picture, config)), grey)
-    both = ImageConfig(equalization="global", filter="gaussian")  # noise is filtered after the equalisation
-    assert np.array_equal(prepare(to_gray(picture), both), smooth(grey, both))
-    assert np.array_equal(prepare(to_gray(picture), ImageConfig(equalization="none", filter="none")), to_gray(picture))
+    grey = equalize(to_gray(picture))
+    assert not np.array_equal(to_gray(equalize(picture)), grey)
+    for image in (picture, to_gray(picture)):  # noise is filtered after the equalisation
+        assert np.array_equal(prepare(image), smooth(grey))
 
 
 @pytest.mark.parametrize(("diameter", "color", "space"), [(5, 40.0, 5.0), (7, 100.0, 2.0)])
@@ -103,7 +96,7 @@ def test_the_bilateral_filter_is_equation_3_5(diameter, color, space, monkeypatc
         expected[y, x] = (w * values).sum() / w.sum()
     for name, value in (("DIAMETER", diameter), ("COLOR", color), ("SPACE", space)):
         monkeypatch.setattr(f"calib_ros.image.enhance.BILATERAL_{name}", value)
-    assert np.abs(smooth(gray, ImageConfig()) - expected).max() < 0.51
+    assert np.abs(smooth(gray) - expected).max() < 0.51
     assert np.abs(gray - expected).max() > 5
 
 
@@ -116,7 +109,7 @@ def test_the_gaussian_filter_is_equations_3_6_and_3_7(sigma, monkeypatch):
     kernel /= kernel.sum()  # the rest lies beyond three sigma
     expected = ndimage.convolve(gray.astype(float), kernel, mode="mirror")
     monkeypatch.setattr("calib_ros.image.enhance.GAUSSIAN_SIGMA", sigma)
-    filtered = smooth(gray, ImageConfig(filter="gaussian"))
+    filtered = smooth(gray, "gaussian")
     assert np.abs(filtered - expected).max() < 2  # fixed point arithmetic
     assert np.abs(filtered - expected).mean() < 0.5
 
