@@ -244,22 +244,18 @@ def covariance_of(score: PointScore, T: Transform) -> Covariance:
     return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))
 
 
-class Looks:
-    """The looks of one check from the extrinsic, one after the other. optima: T_camera_lidar (4, 4) of all, by chance or not."""
-
-    def __init__(self, inputs: CheckInputs) -> None:
-        self.optima: list[Matrix] = []
-        self._inputs = inputs
-
-    def match(self, calibrator: Calibrator, features: Sequence[FrameFeatures], box: SearchBox | None) -> Result | None:
-        """The match of a refinement (None), or of a search in a box; None if it is one of chance."""
-        result = calibrator.estimate(features, self._inputs.T, box, self._inputs.progress)
-        optimum = result.T_camera_lidar if result.converged else result.optimum
-        if optimum is not None:
-            self.optima.append(optimum)
-        if result.refusal is RefusalCode.WRONG_TIMES and result.evidence is not None:  # an optimum that matches for all that
-            return result if result.evidence.p_value <= calibrator.config.refine.max_p_value else None
-        return result if result.converged else None
+def look(
+    calibrator: Calibrator, features: Sequence[FrameFeatures], box: SearchBox | None, inputs: CheckInputs, optima: list[Matrix]
+) -> Result | None:
+    """The match of a refinement (None), or of a search in a box, from the extrinsic; None if it is one of chance. optima: its
+    T_camera_lidar (4, 4) is added, by chance or not."""
+    result = calibrator.estimate(features, inputs.T, box, inputs.progress)
+    optimum = result.T_camera_lidar if result.converged else result.optimum
+    if optimum is not None:
+        optima.append(optimum)
+    if result.refusal is RefusalCode.WRONG_TIMES and result.evidence is not None:  # an optimum that matches for all that
+        return result if result.evidence.p_value <= calibrator.config.refine.max_p_value else None
+    return result if result.converged else None
 
 
 def match_of(result: Result) -> float:

@@ -39,8 +39,8 @@ from calib_ros_check.alternatives import (
     Alternatives,
     CheckInputs,
     Explanation,
-    Looks,
     covariance_of,
+    look,
     match_of,
 )
 from calib_ros_check.cameras import (
@@ -159,11 +159,12 @@ class Checker:
 
     def _find(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation | None:
         """What the scenes show; None if nothing matches beyond chance."""
-        looks, alternatives = Looks(inputs), self._alternatives
-        both = [looks.match(self._calibrator, features, box) for box in (None, NEAR)]
+        optima: list[Matrix] = []
+        alternatives = self._alternatives
+        both = [look(self._calibrator, features, box, inputs, optima) for box in (None, NEAR)]
         near = max((own for own in both if own is not None), key=match_of, default=None)
         # What is off by more than NEAR is as rare as something mixed up, and is looked for afterwards.
-        given = alternatives.as_given(features, inputs.T, looks.optima)
+        given = alternatives.as_given(features, inputs.T, optima)
         # Where the scenes match beyond doubt, only a picture can be another one: a transform would lead elsewhere.
         tried = alternatives.hypotheses(features, inputs, near is not None and match_of(near) >= UNDOUBTED_Z)
         explained = alternatives.mixed_up(features, inputs, tried, given)
@@ -171,11 +172,11 @@ class Checker:
             explained = alternatives.another_camera(features, inputs, given, len(tried))
         if explained is not None:
             return explained
-        found = near or looks.match(self._further, features, FAR)
+        found = near or look(self._further, features, FAR, inputs, optima)
         if found is None and inputs.classified is not None:
             # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
             features = inputs.classified(spread_positions(CLASSIFIED_FRAMES, len(features)))
-            found = looks.match(self._further, features, FAR)
+            found = look(self._further, features, FAR, inputs, optima)
         return None if found is None else self._at_optimum(features, found, inputs)
 
     def _at_optimum(self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs) -> Explanation:

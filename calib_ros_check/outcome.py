@@ -99,47 +99,19 @@ class CauseFinding:
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
-    """Whether an extrinsic is right.
+    """Whether an extrinsic is right to within a tolerance.
 
-    Attributes
-    ----------
-    verdict : CheckVerdict
-        In all: fail where the extrinsic is off by more than the tolerance, or another cause was found.
-    reason : str
-        For people, one line: what was found, and what to do.
-    tolerance : Tolerance
-        What the verdict is about.
-    T_checked : ndarray, shape (4, 4)
-        T_camera_lidar that was checked.
-    T_estimated : ndarray, shape (4, 4), or None
-        T_camera_lidar that the scenes show, with any other cause mended; None where they show none.
-    covariance : ndarray, shape (6, 6), or None
-        Of a left perturbation (rx, ry, rz, tx, ty, tz) of it, rad and m.
-    shared_covariance : ndarray, shape (6, 6), or None
-        The part of it that intrinsics and clocks leave open: other recordings of the same sensors have it in common.
-    p_within : float
-        Probability that the extrinsic is within the tolerance; NaN where nothing is known.
-    rotation, translation : Deviation
-        In all, deg and m.
-    axes : tuple of Deviation
-        rx, ry, rz (deg) and tx, ty, tz (m): the rotation vector of R_checked R_true^T and t_checked - t_true, in the camera's
-        axes (x right, y down, z forward).
-    causes : tuple of CauseFinding
-        All other causes that were considered.
-    time_offset_s, time_offset_sigma_s : float or None
-        Of the clocks, as motion.time_offset_s; None where the frames do not show it.
-    z_score, p_value : float
-        Of the match that the estimate rests on, see `Evidence`; NaN without one.
-    frames_used : int
-        Frames that the estimate rests on.
-    frame_names : tuple of str
-        Names of all frames.
-    notes : tuple of str
-        What else there is to know, for people.
-    elapsed_s, cpu_s : float
-        Wall-clock and CPU time of the check.
-    data_stamp : int
-        Stamp of the newest frame, ns, by the sensors' clock; 0 if unknown.
+    verdict: in all; fail where the extrinsic is off by more, or another cause was found. reason: one line for people, what was
+    found, and what to do. T_checked, T_estimated: T_camera_lidar (4, 4) that was checked, and that the scenes show with any other
+    cause mended; None where they show none. covariance: (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz) of the latter, rad
+    and m. shared_covariance: the part of it that intrinsics and clocks leave open, which other recordings of the same sensors
+    have in common. p_within: probability that the extrinsic is within the tolerance; NaN where nothing is known. rotation,
+    translation: in all, deg and m. axes: rx, ry, rz (deg) and tx, ty, tz (m), the rotation vector of R_checked R_true^T and
+    t_checked - t_true, in the camera's axes (x right, y down, z forward). causes: all other causes that were considered.
+    time_offset_s, time_offset_sigma_s: of the clocks, as motion.time_offset_s; None where the frames do not show it. z_score,
+    p_value: of the match that the estimate rests on, see `Evidence`; NaN without one. frames_used: that the estimate rests on, of
+    frame_names. notes: what else there is to know, for people. elapsed_s, cpu_s: time of the check. data_stamp: of the newest
+    frame, ns, by the sensors' clock; 0 if unknown.
     """
 
     verdict: CheckVerdict

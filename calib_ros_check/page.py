@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import yaml
+
+from calib_ros.config import Config
 from calib_ros.errors import MissingDependencyError
+from calib_ros.io import write_atomically
+from calib_ros_check.outcome import Tolerance
 
 # Strings, so that they are installed with the code whatever installs it.
 STYLE = """\
@@ -114,3 +120,11 @@ def page_template(template: str, **filters: Callable[..., Any]) -> Any:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=loader)
     environment.filters |= {"base64": lambda data: base64.b64encode(data).decode(), **filters}
     return environment.get_template("page")
+
+
+def write_page(path: str | Path, template: Any, config: Config, tolerance: Tolerance, **values: Any) -> None:
+    """Write a page of a check, atomically. template: see `page_template`; values: what it shows, but for configuration and
+    tolerance. BadInputError if the folder cannot be written."""
+    values["facts"] = {"tolerance": f"{tolerance.deg:g} deg, {100 * tolerance.m:g} cm", **values["facts"]}
+    page = template.render(configuration=yaml.safe_dump(config.to_dict(), sort_keys=False), **values)
+    write_atomically(path, page.encode("utf-8", "backslashreplace"))

@@ -7,17 +7,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.frame import Frame
-from calib_ros.io import check_output, write_atomically
+from calib_ros.io import check_output
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.overlay import render
 from calib_ros_check.outcome import CheckResult, Deviation, Tolerance
-from calib_ros_check.page import page_template
+from calib_ros_check.page import page_template, write_page
 from calib_ros_check.tolerance import Judgement, amount, signed
 
 PICTURES = 3
@@ -132,27 +131,28 @@ def write_report(path: str | Path, result: CheckResult, frames: Sequence[Frame],
 
     MissingDependencyError without Jinja2, BadInputError if the folder cannot be written.
     """
-    template = page_template(TEMPLATE)
     facts = {
         "recording": source,
         "extrinsic": f"T_{result.camera_frame}_{result.lidar_frame}",
-        "tolerance": f"{result.tolerance.deg:g} deg, {100 * result.tolerance.m:g} cm",
         "frames": f"{result.frames_used} of {len(result.frame_names)} used",
         "time": f"{result.elapsed_s:.1f} s ({result.cpu_s:.1f} s of CPU)",
         "checked": result.stamp,
     }
-    page = template.render(
+    pictures = [(frame.name, picture_of(frame, result.T_checked, result.T_estimated, config)) for frame in _shown(frames)]
+    write_page(
+        path,
+        page_template(TEMPLATE),
+        config,
+        result.tolerance,
         command="check",
         title=f"Check of {source}",
         facts=facts,
-        configuration=yaml.safe_dump(config.to_dict(), sort_keys=False),
         result=result,
         rows=deviation_rows(result, result.tolerance),
         causes=[(CAUSE_NAMES[f.cause.value], f.state.value, f.message) for f in result.causes],
-        pictures=[(frame.name, picture_of(frame, result.T_checked, result.T_estimated, config)) for frame in _shown(frames)],
+        pictures=pictures,
         both=result.T_estimated is not None,
     )
-    write_atomically(path, page.encode())
 
 
 def check_report(path: str | Path) -> None:

@@ -15,7 +15,7 @@ from calib_ros_check.fleet.claims import find_claims
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
 from calib_ros_check.fleet.history import VERDICTS, Row, row_of, vehicles
 from calib_ros_check.fleet.jobs import OTHER, lost, options_key, run_checks
-from calib_ros_check.fleet.page import page_of_fleet, write_page
+from calib_ros_check.fleet.page import page_of_fleet, write_fleet_page
 from calib_ros_check.fleet.recordings import find_recordings
 from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
 from calib_ros_check.jobs.journal import Journal
@@ -60,7 +60,7 @@ def check_fleet(
             files.append(out / "fleet.parquet")
     except MissingDependencyError as error:
         notes.append(str(error))
-    write_page(page, fleet, options, facts or {})
+    write_fleet_page(page, fleet, options, facts or {})
     return replace(fleet, files=files)
 
 

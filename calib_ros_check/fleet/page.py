@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from calib_ros.errors import CalibrationError
-from calib_ros.io import write_atomically
 from calib_ros_check.fleet.certificates import Certificate
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
 from calib_ros_check.fleet.history import ERROR, VERDICTS, Row, VehicleChange
 from calib_ros_check.fleet.plot import HEIGHT, LEFT, RIGHT, TOP, WIDTH, plots
-from calib_ros_check.page import page_template
+from calib_ros_check.page import page_template, write_page
 from calib_ros_check.recording import CheckOptions, opened, positions_of, read_frames
 from calib_ros_check.report import DEVIATIONS, SHEET, STYLE, deviation_rows, picture_of
 from calib_ros_check.tolerance import AXES, amount, signed
@@ -177,7 +175,7 @@ def page_of_fleet() -> Any:
     return page_template(TEMPLATE)
 
 
-def write_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[str, str]) -> None:
+def write_fleet_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[str, str]) -> None:
     """Write the page, atomically. facts: further ones for its end. Frames that cannot be read here make no pictures."""
     checks, rows, certificates = options.options, fleet.rows, fleet.certificates
     tiles = [(verdict, count, verdict) for verdict, count in fleet.counts.items()]
@@ -197,12 +195,15 @@ def write_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[s
         doubtful = [*map(_told, fleet.changes), *((f"{row.recording} ({row.vehicle})", off, "") for row in rows if row.outlier)]
         shown = sorted(fleet.vehicles, key=lambda own: (not own.changes, not any(row.outlier for row in own.rows), own.name))
         sections = [(own, None, plots(own, fleet.variances), [], [], [], []) for own in shown[:MOST_VEHICLES]]
-    page = page_of_fleet().render(
+    write_page(
+        path,
+        page_of_fleet(),
+        checks.config,
+        checks.tolerance,
         command="certify" if certificates else "check",
         title=title,
-        facts={"Tolerance": f"{checks.tolerance.deg:g} deg, {100 * checks.tolerance.m:g} cm", "Extrinsic": checks.extrinsic},
+        facts={"extrinsic": checks.extrinsic},
         details={**_details(fleet, options.false_alarms), **facts},
-        configuration=yaml.safe_dump(checks.config.to_dict(), sort_keys=False),
         what=what,
         caption=caption,
         csv=path.with_suffix(".csv").name,
@@ -215,7 +216,6 @@ def write_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[s
         vehicles_left_out=len(fleet.vehicles) - len(sections),
         plot=PLOT_SIZE,
     )
-    write_atomically(path, page.encode("utf-8", "backslashreplace"))
 
 
 def _certified(own: Certificate, fleet: Fleet, checks: CheckOptions) -> tuple[Any, ...]:

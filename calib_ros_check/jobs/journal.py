@@ -8,19 +8,12 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.outcome import plain
 
 Answer = dict[str, Any]  # what a job found, as JSON has it: numbers, texts, lists and dictionaries; None for NaN
-
-
-class Job(Protocol):
-    """A piece of work: a dataclass whose values JSON has. key: the same for the same work, and no other."""
-
-    @property
-    def key(self) -> str: ...
 
 
 NAME = "results.jsonl"
@@ -32,10 +25,11 @@ class Journal:
     """Answers of finished jobs in the file results.jsonl of `folder`, which is made if it is missing; a context manager.
 
     The first line holds `about`, what the answers depend on (JSON values), and `what` wrote it; each further one a job and its
-    answer. An existing file is gone on with if its `about` is the same, or emptied if `fresh`, but never that of another `what`.
-    One process at a time has it. done: key of a job -> its answer. notes: what was wrong with the file, and what was done about
-    it. Raises BadInputError for a folder that cannot be written or that another process has, for the journal of another `what`,
-    another `about`, or a damaged first line.
+    answer. A job is a dataclass whose values JSON has; its `key` is the same for the same piece of work, and of no other. An
+    existing file is gone on with if its `about` is the same, or emptied if `fresh`, but never that of another `what`. One process
+    at a time has it. done: key of a job -> its answer. notes: what was wrong with the file, and what was done about it. Raises
+    BadInputError for a folder that cannot be written or that another process has, for the journal of another `what`, another
+    `about`, or a damaged first line.
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any], fresh: bool = False, what: str = "evaluation"):
@@ -82,7 +76,7 @@ class Journal:
             else:
                 self.notes.append(f"{self.path}: line {number} is damaged and left out; its job is done again")
 
-    def add(self, job: Job, answer: Answer) -> None:
+    def add(self, job: Any, answer: Answer) -> None:
         """Write one finished job. Numbers that are NaN or infinite become None. CalibrationError if the disk is full."""
         self.done[job.key] = self._append({"key": job.key, "job": job, "answer": answer})["answer"]
 

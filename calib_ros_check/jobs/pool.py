@@ -13,19 +13,17 @@ from concurrent.futures import CancelledError
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import cv2
 
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
-from calib_ros_check.jobs.journal import Answer, Job, Journal
+from calib_ros_check.jobs.journal import Answer, Journal
 
-J = TypeVar("J", bound=Job)
-RunJobs: TypeAlias = Callable[[Sequence[J]], list[Answer]]  # the answers of a group, one per job, in its order; picklable
-Results: TypeAlias = Generator[
-    tuple[Sequence[J], list[Answer] | str], None, None
-]  # every group with its answers, or how its worker ended
+Group: TypeAlias = Sequence[Any]  # jobs that share work, see Journal
+RunJobs: TypeAlias = Callable[[Any], list[Answer]]  # the answers of a group, one per job, in its order; picklable
+Results: TypeAlias = Generator[tuple[Group, list[Answer] | str], None, None]  # answers of groups, or how their workers ended
 ADDRESS = re.compile(r"([a-z]+://)?[^/\s]+:\d{1,5}")  # a client that was given another one waits in vain
 CONNECT_S, WITHOUT_WORKERS_S, LOOK_S, POLL_S = 8.0, 60.0, 1.0, 0.02
 # A job that ends its worker ends no other, and workers leave Ctrl-C to this process.
@@ -38,13 +36,13 @@ GOES_ON = "the same command goes on where it stopped"
 
 
 def run(
-    groups: Sequence[Sequence[J]],
-    run_jobs: RunJobs[J],
+    groups: Sequence[Group],
+    run_jobs: RunJobs,
     journal: Journal,
     progress: Callable[[int, int], None],
     workers: int = 1,
     scheduler: str = "",
-    lost: Callable[[Sequence[J], str], list[Answer]] | None = None,
+    lost: Callable[[Any, str], list[Answer]] | None = None,
 ) -> None:
     """Run all jobs that `journal` has no answer for, and add each answer as it arrives. progress: told how many are done, of all.
 
@@ -66,7 +64,7 @@ def run(
     total = len({job.key for group in groups for job in group})
     done = total - sum(map(len, missing))
     progress(done, total)
-    results: Results[J] = ((group, _by_one_thread(run_jobs, group)) for group in missing)
+    results: Results = ((group, _by_one_thread(run_jobs, group)) for group in missing)
     if missing and (scheduler or ((workers > 1 or lost is not None) and find_spec("distributed") is not None)):
         results = _on_workers(missing, run_jobs, workers, scheduler)
     unanswered = ""
@@ -85,12 +83,14 @@ def run(
         raise CalibrationError(f"{unanswered}; out of memory? use fewer --workers, or give them more; {GOES_ON}")
 
 
-def _on_workers(groups: Sequence[Sequence[J]], run_jobs: RunJobs[J], workers: int, scheduler: str) -> Results[J]:
+def _on_workers(groups: Sequence[Group], run_jobs: RunJobs, workers: int, scheduler: str) -> Results:
     """A worker holds one group at a time: Dask blames all that a lost one held. Still it may have been another's fault, or memory
     was short: so that what ends its worker runs once more, alone."""
-    waiting, died, alone, seen = deque(groups), deque[Sequence[J]](), False, time.monotonic()
-    running: dict[Any, tuple[Sequence[J], float]] = {}
+    waiting, died, alone, seen = deque(groups), deque[Group](), False, time.monotonic()
+    running: dict[Any, tuple[Group, float]] = {}
     with _client(min(workers, len(groups)), scheduler) as client:
+        from distributed import KilledWorker
+
         while waiting or running or died:
             if not waiting and not running:
                 waiting, alone = deque([died.popleft()]), True
@@ -107,12 +107,22 @@ def _on_workers(groups: Sequence[Sequence[J]], run_jobs: RunJobs[J], workers: in
                 time.sleep(POLL_S)
             for future in [own for own in running if own.done()]:
                 group, since = running.pop(future)
-                found, hung = _result(future), time.monotonic() - since > HANG_S * len(group)
-                if found is None and not alone and not hung:
-                    died.append(group)
-                else:
-                    how = f"worker hung for {HANG_S:g} s per job" if hung else "worker ended, also alone"
-                    yield group, how if found is None else found
+                try:
+                    yield group, future.result()
+                except KilledWorker:
+                    if time.monotonic() - since > HANG_S * len(group):
+                        yield group, f"worker hung for {HANG_S:g} s per job"
+                    elif alone:
+                        yield group, "worker ended, also alone"
+                    else:
+                        died.append(group)
+                except CancelledError:
+                    raise CalibrationError(f"the Dask scheduler is lost; {GOES_ON}") from None
+                except ImportError as error:
+                    needed = f"calib_ros {VERSION}, and what it needs, must be installed on all workers"
+                    raise CalibrationError(f"{needed}: {error}") from None
+                finally:
+                    future.release()  # here, since what deletes it would swallow Ctrl-C
 
 
 @contextmanager
@@ -143,23 +153,6 @@ def _client(workers: int, scheduler: str) -> Iterator[Any]:
         yield client
 
 
-def _result(future: Any) -> list[Answer] | None:
-    """Of a group; None if its worker ended."""
-    from distributed import KilledWorker
-
-    try:
-        answers: list[Answer] = future.result()
-    except KilledWorker:
-        return None
-    except CancelledError:
-        raise CalibrationError(f"the Dask scheduler is lost; {GOES_ON}") from None
-    except ImportError as error:
-        raise CalibrationError(f"calib_ros {VERSION}, and what it needs, must be installed on all workers: {error}") from None
-    finally:
-        future.release()  # here, since what deletes it would swallow Ctrl-C
-    return answers
-
-
 def _asked(call: Callable[..., Any], *given: Any, **named: Any) -> Any:
     """What the client itself does: whatever it raises, it has lost the scheduler."""
     try:
@@ -168,7 +161,7 @@ def _asked(call: Callable[..., Any], *given: Any, **named: Any) -> Any:
         raise CalibrationError(f"the Dask scheduler is lost; {GOES_ON}") from error
 
 
-def _answer(run_jobs: RunJobs[J], group: Sequence[J], limit_s: float, wanted: str) -> list[Answer]:
+def _answer(run_jobs: RunJobs, group: Group, limit_s: float, wanted: str) -> list[Answer]:
     """On a worker, which the kernel ends after limit_s, whatever it is doing, and another takes its place. wanted: version of
     calib_ros that asks."""
     if wanted != VERSION:
@@ -180,7 +173,7 @@ def _answer(run_jobs: RunJobs[J], group: Sequence[J], limit_s: float, wanted: st
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def _by_one_thread(run_jobs: RunJobs[J], group: Sequence[J]) -> list[Answer]:
+def _by_one_thread(run_jobs: RunJobs, group: Group) -> list[Answer]:
     """Of OpenCV, so that CPU time and sums do not depend on the workers. BLAS has one thread from the start."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

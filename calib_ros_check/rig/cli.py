@@ -31,9 +31,9 @@ def check_one_rig(args: argparse.Namespace) -> int:
         found = check_recording(args.source[0], options, lambda text, share: step(share))
     print_or_save(found, summary(found), args.json)
     if args.report is not None:
-        from calib_ros_check.rig.page import write_page
+        from calib_ros_check.rig.page import write_rig_page
 
-        write_page(args.report, found, options.config)
+        write_rig_page(args.report, found, options.config)
     return EXIT[found.verdict]
 
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import yaml
-
 from calib_ros.config import Config
-from calib_ros.io import write_atomically
 from calib_ros.result import VERSION
-from calib_ros_check.page import page_template
-from calib_ros_check.report import STYLE, picture_of
+from calib_ros_check.page import page_template, write_page
+from calib_ros_check.report import SHEET, STYLE, picture_of
 from calib_ros_check.rig.check import RigCheck
 from calib_ros_check.tolerance import Judgement
 
@@ -37,18 +34,13 @@ TEMPLATE = (
 {% endif %}
 <h2>Frames</h2>
 <p class="intro">Before: as given. After: as the pair's scenes show it. Points are coloured by depth, near ones warm.</p>
-<div class="grid">
-{% for name, picture in pictures %}
-<figure class="wide"><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="{{ name }}">
-<figcaption><b>{{ name }}</b></figcaption></figure>
-{% endfor %}
-</div>
-{% endblock %}
 """
+    + SHEET
+    + "{% endblock %}\n"
 )
 
 
-def write_page(path: str | Path, found: RigCheck, config: Config) -> None:
+def write_rig_page(path: str | Path, found: RigCheck, config: Config) -> None:
     """Write the page, atomically. MissingDependencyError without Jinja2, BadInputError if the folder cannot be written."""
     sensors = [[name, own.verdict.value, *_errors(own.judgement), own.reason] for name, own in found.sensors.items()]
     pairs = [[f"{p.target} with {p.source}", p.verdict.value, *_errors(p.judgement), p.reason] for p in found.pairs]
@@ -57,29 +49,27 @@ def write_page(path: str | Path, found: RigCheck, config: Config) -> None:
         for loop in found.solution.loops
     ]
     names = ["verdict", "rotation", "translation", ""]
-    page = page_template(TEMPLATE).render(
+    pictures = [
+        (f"{p.target} with {p.source}", picture_of(p.frame, p.check.T_checked, p.check.T_estimated, config))
+        for p in found.pairs
+        if p.frame is not None and p.check is not None
+    ]
+    write_page(
+        path,
+        page_template(TEMPLATE),
+        config,
+        found.tolerance,
         command="check",
         title=f"Check of {found.source}",
-        facts={
-            "recording": found.source,
-            "reference": found.solution.reference,
-            "tolerance": f"{found.tolerance.deg:g} deg, {100 * found.tolerance.m:g} cm",
-            "version": VERSION,
-        },
-        configuration=yaml.safe_dump(config.to_dict(), sort_keys=False),
+        facts={"recording": found.source, "reference": found.solution.reference, "version": VERSION},
         found=found,
         tables=[
             ("Sensors", ["sensor", *names], sensors),
             ("Pairs", ["pair", *names], pairs),
             ("Loops", ["sensors", "closes", "rotation", "translation"], loops),
         ],
-        pictures=[
-            (f"{p.target} with {p.source}", picture_of(p.frame, p.check.T_checked, p.check.T_estimated, config))
-            for p in found.pairs
-            if p.frame is not None and p.check is not None
-        ],
+        pictures=pictures,
     )
-    write_atomically(path, page.encode())
 
 
 def _errors(judgement: Judgement) -> list[str]:

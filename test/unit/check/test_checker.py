@@ -19,7 +19,7 @@ from calib_ros.frame import PointCloud
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
-from calib_ros_check.alternatives import FEW_FRAMES, NEAR, CheckInputs, Looks
+from calib_ros_check.alternatives import FEW_FRAMES, NEAR, CheckInputs, look
 from calib_ros_check.cameras import camera_guesses
 from calib_ros_check.checker import Checker
 from calib_ros_check.evidence import Candidate
@@ -97,10 +97,10 @@ def test_further_looks_are_at_half_the_p_value_whatever_the_clocks(drive, monkey
     )
     for calibrator in (checker._calibrator, checker._further):
         monkeypatch.setattr(calibrator, "estimate", lambda *_: late)
-    looks = Looks(CheckInputs(truth, Tolerance()))
-    assert looks.match(checker._calibrator, [], NEAR) is late
-    assert (looks.match(checker._further, [], NEAR) is late) == taken
-    assert len(looks.optima) == 2, "what is not taken competes all the same"
+    inputs, optima = CheckInputs(truth, Tolerance()), []
+    assert look(checker._calibrator, [], NEAR, inputs, optima) is late
+    assert (look(checker._further, [], NEAR, inputs, optima) is late) == taken
+    assert len(optima) == 2, "what is not taken competes all the same"
 
 
 def test_a_check_may_be_ended_in_every_stage(made, checker):

@@ -15,7 +15,7 @@ from calib_ros.errors import MissingDependencyError
 from calib_ros_check.fleet.cli import summary
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
 from calib_ros_check.fleet.history import Row, row_of, utc, vehicles
-from calib_ros_check.fleet.page import MOST_ROWS, change_size, write_page
+from calib_ros_check.fleet.page import MOST_ROWS, change_size, write_fleet_page
 from calib_ros_check.fleet.plot import plots
 from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
 
@@ -126,7 +126,7 @@ def test_parquet_has_types_and_without_pyarrow_says_what_to_install(
 
 def page_of(fleet: Fleet, folder: Path) -> str:
     path = folder / "fleet.html"
-    write_page(path, fleet, FleetOptions(["x"], folder), {"Command": "check x"})
+    write_fleet_page(path, fleet, FleetOptions(["x"], folder), {"Command": "check x"})
     return path.read_text()
 
 

@@ -25,7 +25,7 @@ from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.rig.check import PairCheck, RigCheck, as_given, as_row, check_rig, judged
 from calib_ros_check.rig.cli import summary
-from calib_ros_check.rig.page import write_page
+from calib_ros_check.rig.page import write_rig_page
 from calib_ros_check.tolerance import judge, unknown
 
 TOLERANCE = Tolerance(0.5, 0.1)
@@ -140,7 +140,7 @@ def test_result_and_page_hold_every_sensor_and_pair(tmp_path: Path) -> None:
     assert data["sensors"]["c0"]["rotation"]["error"] == pytest.approx(1.5, abs=0.2)
     assert [(p["target"], p["source"]) for p in data["pairs"]] == list(RIGS["loops"][1])
     assert all(loop["closes"] for loop in data["loops"])
-    write_page(tmp_path / "check.html", found, QUICK)
+    write_rig_page(tmp_path / "check.html", found, QUICK)
     page = (tmp_path / "check.html").read_text()
     assert all(f'<td class="words">{name}</td>' in page for name in found.sensors)
     assert "<h2>Loops</h2>" in page
