@@ -23,12 +23,12 @@ EXTRAS = {
     "semantics": ["onnxruntime"],
     # The vehicle's motion from consecutive scans, where no odometry gives it; LiDARs of a rig to each other.
     "motion": ["small_gicp"],
-    # Pages of `calib-ros check`, of one recording or a fleet; fleet.parquet.
-    "fleet": ["Jinja2", "pyarrow"],
+    # Pages of `calib-ros check`, of one recording or a fleet; fleet.parquet; several processes, or those of a cluster.
+    "fleet": ["Jinja2", "distributed", "pyarrow"],
     # `calib-ros view`: the page in the browser.
     "view": ["nicegui"],
-    # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
-    "evaluation": ["Jinja2", "matplotlib"],
+    # `calib-ros evaluate` and `calib-ros steps`: reports, tables, pages and plots.
+    "evaluation": ["Jinja2", "distributed", "matplotlib", "pandas"],
 }
 EXTRAS["all"] = sorted({library for libraries in EXTRAS.values() for library in libraries})
 EXTRAS |= {
@@ -44,8 +44,6 @@ EXTRAS |= {
         "ros-std-srvs==5.5.1",
         f"{PACKAGE}_msgs=={VERSION}",
     ],
-    # `--scheduler` of `calib-ros check` and `calib-ros evaluate`: a Dask cluster.
-    "cluster": ["distributed"],
     # colcon test picks pytest because it is named here.
     "test": ["pytest", "pytest-timeout", "pytest-xdist", "onnx", "selenium"],
 }

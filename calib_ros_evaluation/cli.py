@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 
 from calib_ros.cli.arguments import SOURCE, add_camera_and_topics, add_preset, add_source, add_yaw_and_config
-from calib_ros.errors import BadInputError
+from calib_ros.errors import BadInputError, MissingDependencyError
 
 
 class Steps:
@@ -26,7 +26,7 @@ class Steps:
 
     def run(self, args: argparse.Namespace) -> int:
         """Write the page; 0."""
-        from calib_ros_evaluation.commands import run_steps
+        from calib_ros_evaluation.steps.command import run_steps
 
         print(run_steps(args))
         return 0
@@ -66,18 +66,19 @@ class Evaluate:
 
     def run(self, args: argparse.Namespace) -> int:
         """Evaluate, or compare two evaluations; 0."""
-        from calib_ros_evaluation.commands import compare_tables, run_evaluation, run_protocol
-
         if args.compare and args.source:
             raise BadInputError("--compare takes two tables of earlier evaluations; leave the sources out")
         if not args.compare and not args.source:
             raise BadInputError("give at least one source, or --compare A.csv B.csv")
         if args.protocol and args.compare:
             raise BadInputError("--protocol runs trials, --compare reads those of two evaluations; give one of them")
-        if args.compare:
-            print(compare_tables(*args.compare))
-        else:
-            print(run_protocol(args) if args.protocol is not None else run_evaluation(args))
+        try:
+            from calib_ros_evaluation.commands import run_evaluation
+        except ModuleNotFoundError as error:
+            if error.name != "pandas":
+                raise
+            raise MissingDependencyError("the tables need pandas: pip install pandas, or apt install python3-pandas") from None
+        print(run_evaluation(args))
         return 0
 
 

@@ -6,23 +6,24 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
+import pandas as pd
 import yaml
 
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.cluster import ClusterPool
 from calib_ros_check.jobs.journal import Answer, Journal
-from calib_ros_check.jobs.local import LocalPool
-from calib_ros_check.jobs.pool import Pool, run
-from calib_ros_evaluation.csv_files import TRIALS, write_trials
-from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
+from calib_ros_check.jobs.pool import run
+from calib_ros_evaluation.csv_files import TRIALS, write_table
+from calib_ros_evaluation.experiments.answers import Answers, collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
-from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache, code_fingerprint, inspect_sources
-from calib_ros_evaluation.methods.registry import NAMES, check_names
+from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, code_fingerprint, inspect_sources
+from calib_ros_evaluation.methods.registry import NAMES, check_names, methods
 from calib_ros_evaluation.report.page import check_report, write_report
-from calib_ros_evaluation.results import Results
+from calib_ros_evaluation.report.sections import Section, sections
+from calib_ros_evaluation.report.tables import summary
 from calib_ros_semantics.models.segmentation import SegmentationModels
 
 Progress = Callable[[str, int, int], None]  # called with the stage (frames, trials), done and total
@@ -48,15 +49,45 @@ class RunOptions:
         if self.workers < 1:
             raise BadInputError(f"--workers {self.workers}: give at least 1")
 
+
+@dataclass(frozen=True)
+class StudyReport:
+    """What came of a study. said: lines for the terminal. table: the rows of the file `name`, empty = there is none. notes: for
+    people. facts: for the head of the report."""
+
+    title: str
+    sections: Sequence[Section]
+    said: Sequence[str]
+    name: str
+    table: pd.DataFrame
+    notes: Sequence[str] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+
+class Study(Protocol):
+    """What is done with the sources of an evaluation."""
+
     @property
-    def settings(self) -> str:
-        """The configuration as YAML."""
-        return yaml.safe_dump(self.setup.config.to_dict(), sort_keys=False)
+    def about(self) -> Mapping[str, str]:
+        """What the answers depend on, beside sources, configuration and code."""
+        ...
+
+    def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
+        """All there is to do, in the order of the report. BadInputError for sources that do not fit the study."""
+        ...
+
+    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
+        """The answers, in order."""
+        ...
+
+    def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
+        """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
+        ...
 
 
 @dataclass(frozen=True)
-class EvaluationOptions(RunOptions):
-    """methods: in the order of the report."""
+class Experiments:
+    """Those of the thesis and more; a Study. methods: in the order of the report."""
 
     plan: Plan = FULL
     methods: tuple[str, ...] = NAMES
@@ -64,63 +95,73 @@ class EvaluationOptions(RunOptions):
 
     def __post_init__(self) -> None:
         check_names(self.methods)
-        super().__post_init__()
+
+    @property
+    def about(self) -> Mapping[str, str]:
+        """See Study."""
+        return {}
+
+    def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
+        """See Study."""
+        return jobs(self.plan, summaries, self.methods, self.experiments)
+
+    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
+        """See Study."""
+        return run_jobs(setup, todo)
+
+    def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
+        """See Study."""
+        known = methods(setup.config)
+        results = collect_results(planned, answers, {name: known[name].title for name in self.methods})
+        trials, whole = results.trials, summary(results)
+        failed = len(results.failures) + int((trials.status == "failed").sum())
+        notes = [f"{failed} of {len(planned)} jobs failed; the end of the report says why"] if failed else []
+        facts = {"Trials": f"{len(trials)} calibrations, {trials.cpu_s.sum() / 60:.1f} CPU minutes"} if len(trials) else {}
+        said = [whole.text(), ""] if whole.rows else []
+        return StudyReport("Camera-LiDAR calibration: methods compared", sections(results), said, TRIALS, trials, notes, facts)
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """What came of it. files: the report first. notes: for people."""
+class Evaluation(NamedTuple):
+    """What came of it. said: lines for the terminal. files: the report first. notes: for people."""
 
-    results: Results
+    said: Sequence[str]
     files: list[Path]
-    notes: list[str] = field(default_factory=list)
+    notes: list[str]
 
 
-def evaluate(options: EvaluationOptions, facts: Mapping[str, str], progress: Progress = silent) -> Evaluation:
+def evaluate(options: RunOptions, study: Study, facts: Mapping[str, str], progress: Progress = silent) -> Evaluation:
     """Do what the journal in the folder does not hold yet, then write table and report. facts: for the head of the report.
 
-    Interrupted or killed at any moment, the same options go on where it stopped. Raises BadInputError for a folder that holds
-    an evaluation of something else, and what sources raise that cannot be used.
+    Interrupted or killed at any moment, the same options go on where it stopped; with more of the same to do, what is there is
+    kept. Raises BadInputError for a folder that holds an evaluation of something else, and what sources raise that cannot be
+    used.
     """
-    models = SegmentationModels(options.setup.config.semantics).load()
-    summaries = inspect_sources(options.setup, options.frames, partial(progress, "frames"))
-    planned = jobs(options.plan, summaries, options.methods, options.experiments)
-    answers, damage = answered(options, {}, summaries, planned, run_jobs, progress)
-    cache = WorkerCache(options.setup)
-    results = collect_results(planned, answers, {name: cache.methods[name].title for name in options.methods})
-    notes = [*models, *damage, *(text for one in summaries for text in one.notes)]
-    failed = len(results.failures) + sum(trial.status == "failed" for trial in results.trials)
-    if failed:
-        notes.append(f"{failed} of {len(planned)} jobs failed; the end of the report says why")
-    facts = {**facts, **_facts(results, summaries, notes)}
-    report = write_report(options.out, results, facts, options.settings)
-    if not results.trials:
-        (options.out / TRIALS).unlink(missing_ok=True)  # an earlier one
-        return Evaluation(results, report, notes)
-    write_trials(options.out / TRIALS, results.trials)
-    return Evaluation(results, [*report, options.out / TRIALS], notes)
-
-
-def answered(
-    options: RunOptions,
-    about: Mapping[str, str],
-    summaries: list[SourceSummary],
-    planned: Sequence[EvaluationJob],
-    work: Callable[[Setup, Sequence[EvaluationJob]], list[Answer]],
-    progress: Progress,
-) -> tuple[dict[str, Answer], list[str]]:
-    """Answers of all planned jobs, by their keys: those that the journal lacks are worked off. And notes on a damaged
-    journal. about: what else the journal is about."""
-    check_report(options.out)
-    about = {"version": __version__, "code": code_fingerprint(), "configuration": options.setup.fingerprint, **about}
-    with Journal(options.out, about, options.fresh) as journal:
+    setup, out = options.setup, options.out
+    models = SegmentationModels(setup.config.semantics).load()
+    summaries = inspect_sources(setup, options.frames, partial(progress, "frames"))
+    planned = study.jobs(setup, summaries)
+    check_report(out)
+    about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint, **study.about}
+    with Journal(out, about, options.fresh) as journal:
         same_frames(journal, summaries)
-        workers: Pool = ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers)
-        run(groups(planned), partial(work, options.setup), journal, workers, partial(progress, "trials"))
-        return dict(journal.done), journal.notes
+        work, told = partial(study.work, setup), partial(progress, "trials")
+        run(groups(planned), work, journal, told, options.workers, options.scheduler)
+        answers, damage = dict(journal.done), journal.notes
+    found = study.report(setup, planned, answers)
+    notes = [*models, *damage, *(text for one in summaries for text in one.notes), *found.notes]
+    facts = {**facts, "Sources": "; ".join(f"{one.label}: {len(one.frames)} frames" for one in summaries), **found.facts}
+    facts |= {"Left out": "; ".join(notes)} if notes else {}
+    settings = yaml.safe_dump(setup.config.to_dict(), sort_keys=False)
+    files = write_report(out, found.title, facts, settings, found.sections)
+    if found.table.empty:
+        (out / found.name).unlink(missing_ok=True)  # an earlier one
+    else:
+        write_table(out / found.name, found.table)
+        files.append(out / found.name)
+    return Evaluation(found.said, files, notes)
 
 
-def same_frames(journal: Journal, summaries: list[SourceSummary]) -> None:
+def same_frames(journal: Journal, summaries: Sequence[SourceSummary]) -> None:
     """Frames of the same name and number must be those that earlier answers are about; where they lie does not matter.
     BadInputError if they are not."""
     for one in summaries:
@@ -134,13 +175,3 @@ def same_frames(journal: Journal, summaries: list[SourceSummary]) -> None:
                     f"{journal.path}: frame {position} of {one.label}, or its reference, is another than when this evaluation "
                     "was begun; choose another --out, or --fresh to begin anew"
                 )
-
-
-def _facts(results: Results, summaries: list[SourceSummary], notes: list[str]) -> dict[str, str]:
-    out = {"Sources": "; ".join(f"{one.label}: {len(one.frames)} frames" for one in summaries)}
-    if results.trials:
-        cpu = sum(trial.cpu_s for trial in results.trials)
-        out["Trials"] = f"{len(results.trials)} calibrations, {cpu / 60:.1f} CPU minutes"
-    if notes:
-        out["Left out"] = "; ".join(notes)
-    return out

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from calib_ros_evaluation.curves import Curves
@@ -15,86 +16,33 @@ Matrix = NDArray[np.float64]
 SUCCESS_DEG, SUCCESS_M = 0.5, 0.1  # a trial that ends nearer than both to the reference has found it
 SET = 3  # frames whose curves are averaged, as in figure 4.16
 THESIS_THRESHOLD = 0.7  # of similarity (section 3.6)
-# What makes a trial the same in two evaluations, which are compared trial by trial.
+# What makes a trial the same in two evaluations, which are compared trial by trial. frames: positions in the scene, "0 4 8".
+# start_deg, start_m: half width per axis of the start error.
 IDENTITY = ("experiment", "method", "scene", "frames", "start_deg", "start_m", "seed")
+STATUSES = ("done", "refused", "failed")  # refused: by the method itself: it then ends where it started; failed: with an error
 TWIST_AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
+END, START = ([f"{name}_{axis}" for axis in TWIST_AXES] for name in ("end", "start"))  # twists log(T T_ref^-1)
+SCORES = ("score_start", "score_end", "score_reference")  # by the method's own score; NaN where there is none
+# Of the table of trials: a row for each calibration from a wrong start. Errors are those of eq. 2.19, cpu_s is without features.
+COLUMNS = (
+    *IDENTITY,
+    *("status", "reason", "success", "rotation_deg", "translation_m", "start_rotation_deg", "start_translation_m"),
+    *(*END, *START, *SCORES, "evaluations", "cpu_s", "features_cpu_s"),
+)
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One calibration from a wrong start: a row of the table of trials, whose columns (see COLUMNS) are these fields in order.
-
-    A twist has a column for each axis, and `success` follows `reason`.
-    """
-
-    experiment: str
-    method: str
-    scene: str
-    frames: tuple[int, ...]  # positions in the scene
-    start_deg: float  # half width per axis of the start error
-    start_m: float
-    seed: int
-    status: str  # done, refused (by the method itself: it then ends where it started) or failed (with an error)
-    reason: str
-    rotation_deg: float  # eq. 2.19 at the end
-    translation_m: float
-    start_rotation_deg: float  # the same at the start
-    start_translation_m: float
-    end: tuple[float, ...]  # twist (6,) log(T_end T_ref^-1), deg and m
-    start: tuple[float, ...]  # twist (6,) of the start
-    score_start: float  # by the method's own score; NaN where there is none
-    score_end: float
-    score_reference: float
-    evaluations: int
-    cpu_s: float  # of the optimisation, without features
-    features_cpu_s: float  # of all its frames
-
-    @property
-    def success(self) -> bool:
-        """Done, and within SUCCESS_DEG and SUCCESS_M of the reference. A refused trial stays at its start, which is no success
-        even where it happens to be near."""
-        return self.status == "done" and self.rotation_deg < SUCCESS_DEG and self.translation_m < SUCCESS_M
-
-    @property
-    def start_success(self) -> bool:
-        """The start itself is within SUCCESS_DEG and SUCCESS_M."""
-        return self.start_rotation_deg < SUCCESS_DEG and self.start_translation_m < SUCCESS_M
-
-    @property
-    def identity(self) -> tuple[object, ...]:
-        """Values of IDENTITY."""
-        return tuple(getattr(self, name) for name in IDENTITY)
-
-    def row(self) -> list[Any]:
-        """Values of COLUMNS."""
-        values: list[Any] = []
-        for name in (field.name for field in fields(self)):
-            value = getattr(self, name)
-            values += value if name in TWISTS else [" ".join(map(str, value)) if name == "frames" else value]
-            values += [int(self.success)] if name == "reason" else []
-        return values
+def trials_table(rows: Sequence[Mapping[str, Any]], limit_deg: float = SUCCESS_DEG, limit_m: float = SUCCESS_M) -> pd.DataFrame:
+    """Rows with COLUMNS as a table. success: done, and within the limits of the reference. A refused trial stays at its start,
+    which is no success even where it happens to be near."""
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    near = (table.rotation_deg < limit_deg) & (table.translation_m < limit_m)
+    return table.assign(success=((table.status == "done") & near).astype(int))
 
 
-TWISTS = ("end", "start")
-
-
-def _columns() -> tuple[str, ...]:
-    names: list[str] = []
-    for name in (field.name for field in fields(Trial)):
-        names += [f"{name}_{axis}" for axis in TWIST_AXES] if name in TWISTS else [name]
-        names += ["success"] if name == "reason" else []
-    return tuple(names)
-
-
-COLUMNS = _columns()
-
-
-@dataclass(frozen=True, eq=False)
-class CurveResult:
+class CurveResult(NamedTuple):
     """Loss curves of a method around the reference on one set of frames (figures 4.7, 4.10, 4.13). label: of the scene, for
     people."""
 
-    experiment: str
     method: str
     label: str
     curves: Curves
@@ -152,27 +100,23 @@ def algorithm_6(matrix: Matrix, threshold: float) -> list[int]:
     return chosen
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What a method costs on one scene, CPU time of one core. memory_mb: most that arrays took while features were made and the
-    score was evaluated."""
+class Cost(NamedTuple):
+    """What a method costs on so many frames, CPU time of one core. memory_mb: most that arrays took while features were made and
+    the score was evaluated."""
 
     method: str
-    scene: str
     frames: int
     features_ms_per_frame: float
     evaluation_ms: float
     memory_mb: float
 
 
-@dataclass(frozen=True)
-class Trust:
+class Trust(NamedTuple):
     """F_C of Levinson and Thrun on one frame, the share of neighbours that score worse. right: at the reference. wrong: (deg, m,
     F_C) of extrinsics that are off by so much."""
 
-    scene: str
     right: float
-    wrong: tuple[tuple[float, float, float], ...]
+    wrong: Sequence[Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -180,7 +124,7 @@ class Results:
     """All that an evaluation found, in the order of its plan. titles: method name -> for people, in the order to be shown."""
 
     titles: dict[str, str]
-    trials: Sequence[Trial] = ()
+    trials: pd.DataFrame = field(default_factory=lambda: trials_table([]))
     curves: Sequence[CurveResult] = ()
     costs: Sequence[Cost] = ()
     failures: Sequence[tuple[str, str]] = ()  # what other job failed, and why

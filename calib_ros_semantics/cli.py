@@ -20,7 +20,7 @@ from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.io import make_folder
 from calib_ros.overlay import write_png
 from calib_ros.registration.classes import IMAGE, MASKS
-from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel
+from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.segmentation import ADVICE, ModelSlot, SegmentationModels, error_line, judge, load_model
 
 RUNS = 3  # the first is slower: libraries and memory are made ready
@@ -72,7 +72,11 @@ def _tried(slot: ModelSlot, frame: Frame, config: SemanticsConfig, out: str | No
     kind, before, began = slot.kind, _fresh_peak_mb(), time.perf_counter()
     model = load_model(kind, slot.path, config)
     loaded = time.perf_counter() - began
-    seconds, answer = _runs(model, frame, config)
+    seconds: list[float] = []
+    while len(seconds) < RUNS and sum(seconds) < config.budget_s:
+        began = time.perf_counter()
+        answer = model(frame, Deadline(config.budget_s))
+        seconds.append(time.perf_counter() - began)
     doubt, little = judge(model, answer)
     answer, borders = answer if kind == IMAGE else (answer, None)
     lines = [
@@ -96,16 +100,6 @@ def _tried(slot: ModelSlot, frame: Frame, config: SemanticsConfig, out: str | No
 
 def _wrapped(text: str) -> list[str]:
     return textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
-
-
-def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
-    """Seconds of each run, fewer if they are long, and the output of the last one."""
-    seconds: list[float] = []
-    while len(seconds) < RUNS and sum(seconds) < config.budget_s:
-        began = time.perf_counter()
-        answer = model(frame, Deadline(config.budget_s))
-        seconds.append(time.perf_counter() - began)
-    return seconds, answer
 
 
 def _found(kind: str, answer: Any, needed: str) -> str:

@@ -43,7 +43,7 @@ FOREIGN = [
 ]  # fmt: skip
 
 SMOKE = """
-import rclpy, tf2_msgs.msg, calib_ros, cv2, jinja2, matplotlib, onnxruntime, rosbags, scipy, sklearn
+import rclpy, tf2_msgs.msg, calib_ros, cv2, jinja2, matplotlib, onnxruntime, pandas, rosbags, scipy, sklearn
 import rclpy.action, rclpy.lifecycle
 from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic

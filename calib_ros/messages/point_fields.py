@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud
-from calib_ros.messages.wire import WireHeader, payload, stamp_ns, wire_header
+from calib_ros.messages.wire import WireHeader, payload, shown, stamp_ns, wire_header
 
 REQUIRED = ("x", "y", "z")  # m in the LiDAR frame
 # Quantity of a point -> lower-case field names that drivers use, preferred first.
@@ -105,7 +105,9 @@ def cloud_of_columns(columns: Mapping[str, NDArray[Any]], stamp: int = 0) -> Poi
     known = {name.strip().lower(): column for name, column in columns.items() if column.dtype.kind in "iufb"}
     missing = [name for name in REQUIRED if name not in known]
     if missing:
-        raise BadInputError(f"no field {', '.join(missing)} among ({', '.join(columns) or 'none'}); a point needs x, y and z")
+        raise BadInputError(
+            f"no field {', '.join(missing)} among ({', '.join(map(shown, columns)) or 'none'}); a point needs x, y and z"
+        )
     chosen: dict[str, NDArray[Any]] = {}
     for quantity, names in POINT_FIELDS.items():
         name = next((name for name in names if name in known), None)
@@ -189,7 +191,7 @@ def _columns(msg: Any, width: int, height: int) -> dict[str, NDArray[Any]]:
     missing = [name for name in REQUIRED if name not in fields]
     if missing:
         raise BadInputError(
-            f"PointCloud2: no field {', '.join(missing)} among ({', '.join(fields) or 'none'}); "
+            f"PointCloud2: no field {', '.join(missing)} among ({', '.join(map(shown, fields)) or 'none'}); "
             "choose the topic of a 3-D LiDAR with x, y, z"
         )
     point_step = int(msg.point_step)
@@ -226,4 +228,6 @@ def _check_field(name: str, field: Any, point_step: int) -> None:
     offset = int(field.offset)
     end = offset + np.dtype(code).itemsize * max(int(field.count), 1)  # PCL, too, takes a count of 0 for 1
     if offset < 0 or end > point_step:
-        raise BadInputError(f"PointCloud2: field {name} ends at byte {end}, but point_step is {point_step}; check its driver")
+        raise BadInputError(
+            f"PointCloud2: field {shown(name)} ends at byte {end}, but point_step is {point_step}; check its driver"
+        )

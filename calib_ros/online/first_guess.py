@@ -54,19 +54,11 @@ class FirstGuess:
     @property
     def needs_classes(self) -> bool:
         """True while the classes of keyframes are waited for."""
-        return self.pending and self._uses_classes
-
-    @property
-    def _uses_classes(self) -> bool:
-        return self.config.initial.method in (*BY_CLASSES, AUTO)
-
-    @property
-    def _uses_motion(self) -> bool:
-        return self.config.initial.method in (MOTION, AUTO)
+        return self.pending and self.config.initial.method in (*BY_CLASSES, AUTO)
 
     def add(self, frame: Frame) -> None:
         """A frame of the drive, in grey, if it is one of those whose motion is used."""
-        if not self._uses_motion:
+        if self.config.initial.method not in (MOTION, AUTO):
             return
         with self._lock:
             if self._run:
@@ -112,13 +104,16 @@ class FirstGuess:
 
         features: of the keyframes.
         """
-        tried: list[Result] = []
-        if self._uses_motion:
+        method, tried = self.config.initial.method, list[Result]()
+        if method in (MOTION, AUTO):
             tried.append(self._from_motion(calibrator, features, initial, progress))
-        if self._uses_classes and not any(r.converged for r in tried):
+        if method in (*BY_CLASSES, AUTO) and not any(r.converged for r in tried):
             tried.append(self._from_classes(calibrator, features, initial, progress))
-        others_failed = self._tried_at is not None and not any(r.converged for r in tried)
-        if self.config.initial.method == AUTO and others_failed and not self._classes_may_come(calibrator, features):
+        failed = method == AUTO and self._tried_at is not None and not any(r.converged for r in tried)
+        # No classes may come any more that the guess would wait for.
+        if failed and (
+            calibrator.segmentation.missing(IMAGE, CLOUD) or len(views_of(features)) >= self.config.online.min_keyframes
+        ):
             nominal = calibrator.estimate(features, initial.T_camera_lidar, NOMINAL_BOX, progress)
             tried.append(replace(nominal, origin=InitialSource.NOMINAL))
         best = better(tried)
@@ -155,11 +150,6 @@ class FirstGuess:
         result, _ = best_registration(hypotheses, register, guess.box)
         self._tried_at, self._failure = newest, result.reason
         return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
-
-    def _classes_may_come(self, calibrator: Calibrator, features: Sequence[FrameFeatures]) -> bool:
-        """True while enough keyframes still wait for their classes."""
-        missing = calibrator.segmentation.missing(IMAGE, CLOUD)
-        return not missing and len(views_of(features)) < self.config.online.min_keyframes
 
     def _from_classes(
         self, calibrator: Calibrator, features: Sequence[FrameFeatures], initial: Result, progress: Callback | None

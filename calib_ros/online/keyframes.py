@@ -60,19 +60,12 @@ class KeyframeSelector:
         permit: asked only about an image that is to be a keyframe; where it refuses, the next image is as good. spacing_s:
         smallest time between keyframes, where that is longer than the configured one.
         """
-        if self._histogram is not None and self._is_too_early(stamp, spacing_s):
-            return False  # nobody needs to look at it
-        return self.select_histogram(histogram(image), stamp, permit)
-
-    def _is_too_early(self, stamp: int, spacing_s: float = 0.0) -> bool:
-        return not is_due(self._stamp, stamp, max(self.config.keyframe_spacing_s, spacing_s), self._in_step)
-
-    def select_histogram(self, new: Histogram, stamp: int, permit: Permit = lambda: True) -> bool:
-        """The same for the histogram of an image."""
         last = self._histogram  # reset() may come from another thread
+        spacing_s = max(self.config.keyframe_spacing_s, spacing_s)
+        if last is not None and not is_due(self._stamp, stamp, spacing_s, self._in_step):
+            return False  # nobody needs to look at it
+        new = histogram(image)
         if last is not None:
-            if self._is_too_early(stamp):
-                return False
             self.last_similarity = similarity(last, new)
             overdue = is_due(self._stamp, stamp, INTERVAL_S, self._in_step)
             changed = self.last_similarity < STATIC_SIMILARITY

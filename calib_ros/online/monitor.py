@@ -226,7 +226,7 @@ class Monitor:
             self.reset()
             return Assessment(Verdict.MOVED, message, p_value, since)
         limit = self._threshold() if count >= FAILED_WINDOWS * WINDOW else 0.0  # 0: they rather speak for it
-        if together.conclusive and evidence < limit and count >= min(2, CONFIRM):
+        if together.conclusive and evidence < limit and count >= 2:
             without_sync = max(count - window, 0) if self._out_of_sync else 0
             self.reset()
             message = "the extrinsic fits the newest keyframes after all"
@@ -235,14 +235,12 @@ class Monitor:
 
     def _evidence(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> float:
         """What the shift of the tested keyframes says against the extrinsic; less than nothing where it cannot count."""
-        counts = test.conclusive and test.significant and not self._is_small(test, keyframes)
-        return test.evidence if counts else min(test.evidence, 0.0)
-
-    def _is_small(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> bool:
-        """Is the shift one that the estimates follow, or that a scan bent by unknown motion may have?"""
+        # A small shift may be one that the estimates follow, or that a scan bent by unknown motion has.
         seconds = max(k.unknown_motion_s for k in keyframes)
         least_deg = max(LEAST_DEG, USUAL_TURN_DEG_S * seconds)
-        return test.deg < least_deg and test.m < max(LEAST_M, USUAL_SPEED_M_S * seconds)
+        is_small = test.deg < least_deg and test.m < max(LEAST_M, USUAL_SPEED_M_S * seconds)
+        counts = test.conclusive and test.significant and not is_small
+        return test.evidence if counts else min(test.evidence, 0.0)
 
     def _describe(self, test: ShiftTest, count: int) -> str:
         frames, verb = (f"the newest {count} keyframes", "") if count > 1 else ("the newest keyframe", "es")

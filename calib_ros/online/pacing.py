@@ -89,7 +89,6 @@ class LoadBudget:
     def __init__(self, config: OnlineConfig, clock: Callable[[], float] = time.monotonic, purse: Purse | None = None) -> None:
         self.config = config
         self._purse = purse or Purse(config, clock)
-        self._clock, self._lock = self._purse.clock, self._purse.lock
         self._seconds = dict.fromkeys(Work, 0.0)
         self._keyframes = self._postponed = self._forced = 0
         self._last = dict.fromkeys((Work.KEYFRAMES, Work.ESTIMATES, Work.CLASSES), -float("inf"))  # when the last one began
@@ -118,7 +117,7 @@ class LoadBudget:
 
     def add(self, work: Work, seconds: float, charged: bool = True) -> None:
         """So much CPU time went into this."""
-        with self._lock:
+        with self._purse.lock:
             self._update()
             self._seconds[work] += seconds
             if not charged:
@@ -136,7 +135,7 @@ class LoadBudget:
         """The calling thread receives the messages: its CPU time counts from now on. Does nothing where it cannot be told."""
         if not hasattr(time, "pthread_getcpuclockid"):
             return
-        with self._lock, suppress(OSError):
+        with self._purse.lock, suppress(OSError):
             own = time.pthread_getcpuclockid(threading.get_ident())
             if self._executor is None or self._executor[0] != own:
                 self._executor = own, time.clock_gettime(own)
@@ -145,7 +144,7 @@ class LoadBudget:
 
     def allows_keyframe(self) -> bool:
         """True if a frame that is to be a keyframe may be one; it is counted as one then."""
-        with self._lock:
+        with self._purse.lock:
             now = self._update()
             turn = not self._estimate_waits or self._keyframes_since_s < self._last_estimate_s
             affordable = self._purse.saved >= 0 and turn
@@ -159,7 +158,7 @@ class LoadBudget:
 
     def allows_estimate(self, due: bool) -> bool:
         """True if an estimate is due and may begin. If it is due and may not, keyframes make room for it."""
-        with self._lock:
+        with self._purse.lock:
             now = self._update()
             affordable = self._purse.saved >= 0 or now - self._last[Work.ESTIMATES] >= ESTIMATE_EVERY_S
             self._estimate_waits = due and not affordable
@@ -167,12 +166,12 @@ class LoadBudget:
 
     def start_estimate(self) -> None:
         """An estimate begins, on request or not."""
-        with self._lock:
-            self._last[Work.ESTIMATES], self._estimate_waits = self._clock(), False
+        with self._purse.lock:
+            self._last[Work.ESTIMATES], self._estimate_waits = self._purse.clock(), False
 
     def allows_classes(self, needed: bool = False) -> bool:
         """True if a keyframe may be given classes. needed: without them there will be no estimate."""
-        with self._lock:
+        with self._purse.lock:
             now = self._update()
             enough = self._purse.saved >= CLASSES_RESERVE * SAVED_S * self.config.max_load
             allowed = needed or enough or now - self._last[Work.CLASSES] >= CLASSES_EVERY_S
@@ -184,13 +183,13 @@ class LoadBudget:
 
     def counts(self) -> LoadCounts:
         """Everything so far."""
-        with self._lock:
+        with self._purse.lock:
             self._update()
             return LoadCounts(dict(self._seconds), self._keyframes, self._postponed, self._forced)
 
     def _update(self) -> float:
         """With the lock held: the time, with what was saved up and received until then."""
-        now = self._clock()
+        now = self._purse.clock()
         limit = self.config.max_load
         self._purse.saved = min(self._purse.saved + limit * (now - self._purse.at), SAVED_S * limit)
         self._purse.at = now

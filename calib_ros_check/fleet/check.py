@@ -18,10 +18,8 @@ from calib_ros_check.fleet.jobs import OTHER, lost, options_key, run_checks
 from calib_ros_check.fleet.page import page_of_fleet, write_page
 from calib_ros_check.fleet.recordings import find_recordings
 from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
-from calib_ros_check.jobs.cluster import ClusterPool
 from calib_ros_check.jobs.journal import Journal
-from calib_ros_check.jobs.local import LocalPool
-from calib_ros_check.jobs.pool import Pool, run
+from calib_ros_check.jobs.pool import run
 from calib_ros_check.recording import REFERENCE, TF, CheckOptions
 
 Progress = Callable[[int, int], None]
@@ -78,9 +76,8 @@ def _checked(options: FleetOptions, progress: Progress) -> tuple[list[Row], list
         # What failed for another reason than the recording may succeed now.
         for key in [key for key, answer in journal.done.items() if answer.get("from") == OTHER]:
             del journal.done[key]
-        pool: Pool = ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers or os.cpu_count() or 1)
-        work = partial(run_checks, _portable(options.options))
-        run([[job] for job in jobs], work, journal, pool, progress, lost)
+        work, workers = partial(run_checks, _portable(options.options)), options.workers or os.cpu_count() or 1
+        run([[job] for job in jobs], work, journal, progress, workers, options.scheduler, lost)
         return [row_of(job, journal.done[job.key]) for job in jobs], list(journal.notes)
 
 

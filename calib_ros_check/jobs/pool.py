@@ -1,111 +1,190 @@
-"""Runs jobs that have no answer yet, on workers: processes of this machine (`local`), or of a Dask cluster (`cluster`)."""
+"""Runs jobs that have no answer yet: by Dask, on processes of this machine or a running cluster; without it, in this process."""
 
 from __future__ import annotations
 
-import contextlib
-import importlib
+import logging
+import pickle
+import re
+import signal
+import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
-from typing import Protocol, TypeAlias, TypeVar
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, TypeAlias, TypeVar
 
 import cv2
 
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
+from calib_ros.result import VERSION
 from calib_ros_check.jobs.journal import Answer, Job, Journal
 
 J = TypeVar("J", bound=Job)
 RunJobs: TypeAlias = Callable[[Sequence[J]], list[Answer]]  # the answers of a group, one per job, in its order; picklable
-# What becomes of a group whose worker ended again and again, and how it ended: its answers, or an exception.
-Lost: TypeAlias = Callable[[Sequence[J], str], list[Answer]]
-Results: TypeAlias = Generator[tuple[Sequence[J], list[Answer]], None, None]
-Ended: TypeAlias = list[tuple[Sequence[J], str]]  # groups whose workers ended, and how
-
+Results: TypeAlias = Generator[
+    tuple[Sequence[J], list[Answer] | str], None, None
+]  # every group with its answers, or how its worker ended
+ADDRESS = re.compile(r"([a-z]+://)?[^/\s]+:\d{1,5}")  # a client that was given another one waits in vain
+CONNECT_S, WITHOUT_WORKERS_S, LOOK_S, POLL_S = 8.0, 60.0, 1.0, 0.02
+# A job that ends its worker ends no other, and workers leave Ctrl-C to this process.
+LOCAL = {
+    "distributed.scheduler.allowed-failures": 0,
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
+}
+HANG_S = 1800.0  # for one job: checks and trials take seconds, with large models minutes
 GOES_ON = "the same command goes on where it stopped"
-NAMED = 3  # jobs of a group in an error
-
-
-class Pool(Protocol):
-    """Workers: processes of this machine (`LocalPool`), or of a cluster (`ClusterPool`)."""
-
-    def results(self, run_jobs: RunJobs[J], groups: Sequence[Sequence[J]], lost: Lost[J] | None = None) -> Results[J]:
-        """Every group with its answers as it is finished, in any order. A group is jobs that share work; one worker does all.
-
-        Closing the generator stops all workers. lost: gives the answers of groups that end their workers again and again.
-        Raises what `run_jobs` raises, and CalibrationError if there are no workers, or, without `lost`, for such a group.
-        """
-        ...
 
 
 def run(
     groups: Sequence[Sequence[J]],
     run_jobs: RunJobs[J],
     journal: Journal,
-    pool: Pool,
     progress: Callable[[int, int], None],
-    lost: Lost[J] | None = None,
+    workers: int = 1,
+    scheduler: str = "",
+    lost: Callable[[Sequence[J], str], list[Answer]] | None = None,
 ) -> None:
-    """Run all jobs that `journal` has no answer for, and add each answer as it arrives.
+    """Run all jobs that `journal` has no answer for, and add each answer as it arrives. progress: told how many are done, of all.
 
-    progress: called with the number of finished jobs, those of earlier runs included, and of all. lost: see Pool. Raises what
-    `run_jobs` raises; answers until then are kept.
+    A group is jobs that share work; one worker does all. workers: processes of this machine; one is this process itself, unless
+    `lost` is given. scheduler: of a running cluster instead, with this version and the data at the same paths. A group whose
+    worker ends runs again at the end, alone. One that ends it again, or takes more than HANG_S per job, has the answers that
+    `lost` gives; without it, a CalibrationError names its jobs when all others are done.
+
+    Raises what `run_jobs` raises; BadInputError for no such scheduler; MissingDependencyError for one without Dask; and
+    CalibrationError where it is lost, or no workers are left.
     """
-    total = len({job.key for group in groups for job in group})
-    missing = _missing(groups, journal)
-    done = total - sum(map(len, missing))
-    progress(done, total)
-    if not missing:
-        return
-    with closing(pool.results(run_jobs, missing, lost)) as results:
-        for group, answers in results:
-            for job, answer in zip(group, answers, strict=True):
-                journal.add(job, answer)
-            done += len(group)
-            progress(done, total)
-
-
-def _missing(groups: Sequence[Sequence[J]], journal: Journal) -> list[list[J]]:
-    """Groups of the jobs without an answer, each job once."""
-    known = set(journal.done)
-    missing = []
+    if workers < 1:
+        raise BadInputError(f"workers must be at least 1, got {workers}")
+    known, missing = set(journal.done), []
     for group in groups:
         new = list({job.key: job for job in group if job.key not in known}.values())
         known.update(job.key for job in new)
-        if new:
-            missing.append(new)
-    return missing
+        missing += [new] if new else []
+    total = len({job.key for group in groups for job in group})
+    done = total - sum(map(len, missing))
+    progress(done, total)
+    results: Results[J] = ((group, _by_one_thread(run_jobs, group)) for group in missing)
+    if missing and (scheduler or ((workers > 1 or lost is not None) and find_spec("distributed") is not None)):
+        results = _on_workers(missing, run_jobs, workers, scheduler)
+    unanswered = ""
+    with closing(results):
+        for group, found in results:
+            if isinstance(found, str) and lost is not None:
+                found = lost(group, f"its {found}")
+            if isinstance(found, str):
+                unanswered = unanswered or f"jobs whose {found}: {', '.join(job.key for job in group)}"
+                continue
+            for job, answer in zip(group, found, strict=True):
+                journal.add(job, answer)
+            done += len(group)
+            progress(done, total)
+    if unanswered:
+        raise CalibrationError(f"{unanswered}; out of memory? use fewer --workers, or give them more; {GOES_ON}")
+
+
+def _on_workers(groups: Sequence[Sequence[J]], run_jobs: RunJobs[J], workers: int, scheduler: str) -> Results[J]:
+    """A worker holds one group at a time: Dask blames all that a lost one held. Still it may have been another's fault, or memory
+    was short: so that what ends its worker runs once more, alone."""
+    waiting, died, alone, seen = deque(groups), deque[Sequence[J]](), False, time.monotonic()
+    running: dict[Any, tuple[Sequence[J], float]] = {}
+    with _client(min(workers, len(groups)), scheduler) as client:
+        while waiting or running or died:
+            if not waiting and not running:
+                waiting, alone = deque([died.popleft()]), True
+            threads, now = _asked(client.nthreads), time.monotonic()
+            seen = now if threads else seen
+            if now - seen > WITHOUT_WORKERS_S or max(threads.values(), default=1) > 1:
+                wrong = "workers of several threads, where CPU times need one" if threads else "no workers"
+                raise CalibrationError(f"the Dask scheduler has {wrong}; start `dask worker ADDRESS --nthreads 1`; {GOES_ON}")
+            while waiting and len(running) < len(threads):
+                work = partial(_answer, run_jobs, waiting[0], HANG_S * len(waiting[0]), VERSION)
+                future = _asked(client.submit, lambda data: pickle.loads(data)(), pickle.dumps(work), pure=False)
+                running[future] = waiting.popleft(), now
+            while not any(own.done() for own in running) and time.monotonic() - now < LOOK_S:
+                time.sleep(POLL_S)
+            for future in [own for own in running if own.done()]:
+                group, since = running.pop(future)
+                found, hung = _result(future), time.monotonic() - since > HANG_S * len(group)
+                if found is None and not alone and not hung:
+                    died.append(group)
+                else:
+                    how = f"worker hung for {HANG_S:g} s per job" if hung else "worker ended, also alone"
+                    yield group, how if found is None else found
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """OpenCV with one thread, BLAS too where threadpoolctl is installed: so CPU time and sums do not depend on the workers."""
+def _client(workers: int, scheduler: str) -> Iterator[Any]:
+    """Of a running cluster, or of one with so many processes of this machine, which end with the context."""
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise MissingDependencyError("a Dask cluster needs distributed: pip install distributed") from None
+    with ExitStack() as stack:
+        if not scheduler:
+            stack.enter_context(dask.config.set(LOCAL))
+            here: dict[str, Any] = {"processes": True, "memory_limit": 0, "silence_logs": logging.CRITICAL, "host": "127.0.0.1"}
+            here |= {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}
+            try:
+                cluster = LocalCluster(n_workers=workers, threads_per_worker=1, **here)
+            except RuntimeError as error:
+                raise CalibrationError(f"workers end at their start: {error}; out of memory? {GOES_ON}") from None
+            scheduler = stack.enter_context(cluster).scheduler_address
+        try:
+            if not ADDRESS.fullmatch(scheduler):
+                raise ValueError(scheduler)
+            client = stack.enter_context(Client(scheduler, timeout=CONNECT_S, set_as_default=False))
+        except (OSError, ValueError):
+            advice = "start one with `dask scheduler`, and give its address, as tcp://HOST:8786"
+            raise BadInputError(f"no Dask scheduler answers at {scheduler!r}; {advice}") from None
+        yield client
+
+
+def _result(future: Any) -> list[Answer] | None:
+    """Of a group; None if its worker ended."""
+    from distributed import KilledWorker
+
+    try:
+        answers: list[Answer] = future.result()
+    except KilledWorker:
+        return None
+    except CancelledError:
+        raise CalibrationError(f"the Dask scheduler is lost; {GOES_ON}") from None
+    except ImportError as error:
+        raise CalibrationError(f"calib_ros {VERSION}, and what it needs, must be installed on all workers: {error}") from None
+    finally:
+        future.release()  # here, since what deletes it would swallow Ctrl-C
+    return answers
+
+
+def _asked(call: Callable[..., Any], *given: Any, **named: Any) -> Any:
+    """What the client itself does: whatever it raises, it has lost the scheduler."""
+    try:
+        return call(*given, **named)
+    except Exception as error:
+        raise CalibrationError(f"the Dask scheduler is lost; {GOES_ON}") from error
+
+
+def _answer(run_jobs: RunJobs[J], group: Sequence[J], limit_s: float, wanted: str) -> list[Answer]:
+    """On a worker, which the kernel ends after limit_s, whatever it is doing, and another takes its place. wanted: version of
+    calib_ros that asks."""
+    if wanted != VERSION:
+        raise ImportError(f"one has calib_ros {VERSION}")
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        return _by_one_thread(run_jobs, group)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def _by_one_thread(run_jobs: RunJobs[J], group: Sequence[J]) -> list[Answer]:
+    """Of OpenCV, so that CPU time and sums do not depend on the workers. BLAS has one thread from the start."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        limits = importlib.import_module("threadpoolctl").threadpool_limits(1)
-    except ImportError:
-        limits = contextlib.nullcontext()
-    try:
-        with limits:
-            yield
+        return run_jobs(group)
     finally:
         cv2.setNumThreads(before)
-
-
-def all_answers(
-    spread: Callable[[Sequence[Sequence[J]], Ended[J]], Results[J]], groups: Sequence[Sequence[J]], lost: Lost[J] | None
-) -> Results[J]:
-    """The answers of all groups by `spread`, which yields those of groups that are finished, and adds the others to a list.
-
-    They run once more, each alone: memory may have been short, or another group have ended the worker. See Pool.
-    """
-    ended: Ended[J] = []
-    again: Ended[J] = []
-    yield from spread(groups, ended)
-    for group, _ in ended:
-        yield from spread([group], again)
-    for group, how in again:
-        if lost is None:
-            names = ", ".join(job.key for job in group[:NAMED]) + (f" and {len(group) - NAMED} more" * (len(group) > NAMED))
-            advice = f"out of memory? use fewer --workers, or give them more; {GOES_ON}"
-            raise CalibrationError(f"jobs whose {how}, also alone: {names}; {advice}")
-        yield group, lost(group, f"its {how}, also alone")

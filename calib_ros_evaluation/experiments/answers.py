@@ -15,12 +15,24 @@ from calib_ros_evaluation.experiments.frames import averaging, similarities
 from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
 from calib_ros_evaluation.experiments.trial import cost, loss_curves, trial, trust
-from calib_ros_evaluation.results import Averaging, Cost, CurveResult, Results, Similarity, Trial, Trust
+from calib_ros_evaluation.protocols.definitions import PROTOCOLS
+from calib_ros_evaluation.results import (
+    SCORES,
+    TWIST_AXES,
+    Averaging,
+    Cost,
+    CurveResult,
+    Results,
+    Similarity,
+    Trust,
+    trials_table,
+)
 
 T = TypeVar("T")
+Answers = Mapping[str, Answer]  # by the keys of their jobs
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
 KINDS: dict[str, Callable[[WorkerCache, EvaluationJob], Answer]] = {
-    **dict.fromkeys(TRIALS, trial),
+    **dict.fromkeys((*TRIALS, *PROTOCOLS), trial),
     "curves": loss_curves,
     "averaging": averaging,
     "similarity": similarities,
@@ -42,7 +54,7 @@ def run_jobs(setup: Setup, jobs: Sequence[EvaluationJob]) -> list[Answer]:
     return answers
 
 
-def collect_results(jobs: Sequence[EvaluationJob], answers: Mapping[str, Answer], titles: Mapping[str, str]) -> Results:
+def collect_results(jobs: Sequence[EvaluationJob], answers: Answers, titles: Mapping[str, str]) -> Results:
     """Results of all jobs that have an answer, in their order. titles: method name -> for people.
 
     BadInputError for an answer that cannot be one of its job.
@@ -58,27 +70,30 @@ def collect_results(jobs: Sequence[EvaluationJob], answers: Mapping[str, Answer]
             failures.append((f"{what}, {job.scene}, frames {' '.join(map(str, job.frames[:10]))}", answer["error"]))
         else:
             name, reader = READ[job.experiment]
-            found[name].append(read_answer(reader, job, answer))
-    return Results(dict(titles), failures=tuple(failures), **found)
+            found[name] += read_answers(reader, [job], answers)
+    return Results(dict(titles), failures=failures, **found | {"trials": trials_table(found["trials"])})
 
 
-def read_answer(reader: Callable[[EvaluationJob, Answer], T], job: EvaluationJob, answer: Answer) -> T:
-    """What a reader makes of an answer. BadInputError for one that cannot be one of the job."""
-    try:
-        return reader(job, answer)
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadInputError(
-            f"the answer of {job.key} is damaged ({type(error).__name__}: {error}); remove its line from results.jsonl, or "
-            "give --fresh"
-        ) from None
+def read_answers(reader: Callable[[EvaluationJob, Answer], T], jobs: Sequence[EvaluationJob], answers: Answers) -> list[T]:
+    """What a reader makes of the answers of all jobs that have one. BadInputError for one that cannot be one of its job."""
+    found = []
+    for job in jobs:
+        try:
+            found += [reader(job, answers[job.key])] if job.key in answers else []
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadInputError(
+                f"the answer of {job.key} is damaged ({type(error).__name__}: {error}); remove its line from results.jsonl, or "
+                "give --fresh"
+            ) from None
+    return found
 
 
-def trial_of(job: EvaluationJob, answer: Answer) -> Trial:
-    """The trial that an answer of `calibrated` tells of."""
-    size = {name: job.option(name) for name in ("start_deg", "start_m", "seed")}
+def trial_of(job: EvaluationJob, answer: Answer) -> dict[str, Any]:
+    """The row of the table of trials that an answer of `calibrated` tells of."""
+    twists = {f"{name}_{axis}": answer[name][k] for name in ("start", "end") for k, axis in enumerate(TWIST_AXES)}
     scores = {name: math.nan if answer[name] is None else float(answer[name]) for name in SCORES}
-    twists = {name: tuple(answer[name]) for name in ("start", "end")}
-    return Trial(job.experiment, job.method, job.scene, job.frames, **size, **(answer | scores | twists))
+    known = {"experiment": job.experiment, "method": job.method, "scene": job.scene, "frames": " ".join(map(str, job.frames))}
+    return known | dict(job.options) | {name: answer[name] for name in TOLD} | twists | scores
 
 
 def _averaging(job: EvaluationJob, answer: Answer) -> Averaging:
@@ -96,14 +111,16 @@ def _curves(offsets: Any, values: Any) -> Curves:
     return Curves(np.array(offsets, float), np.array(values, float))
 
 
-COSTS = ("features_ms_per_frame", "evaluation_ms", "memory_mb")
-SCORES = ("score_start", "score_end", "score_reference")
+TOLD = (
+    *("status", "reason", "rotation_deg", "translation_m", "start_rotation_deg", "start_translation_m"),
+    *("evaluations", "cpu_s", "features_cpu_s"),
+)
 # Experiment -> the field of Results that its results belong to, and what reads an answer.
 READ: dict[str, tuple[str, Callable[[EvaluationJob, Answer], Any]]] = {
     **dict.fromkeys(TRIALS, ("trials", trial_of)),
-    "curves": ("curves", lambda j, a: CurveResult(j.experiment, j.method, a["label"], _curves(a["offsets"], a["values"]))),
+    "curves": ("curves", lambda j, a: CurveResult(j.method, a["label"], _curves(a["offsets"], a["values"]))),
     "averaging": ("averagings", _averaging),
     "similarity": ("similarities", _similarity),
-    "cost": ("costs", lambda j, a: Cost(j.method, j.scene, len(j.frames), *(a[name] for name in COSTS))),
-    "trust": ("trusts", lambda j, a: Trust(j.scene, a["right"], tuple((deg, m, share) for deg, m, share in a["wrong"]))),
+    "cost": ("costs", lambda j, a: Cost(j.method, len(j.frames), *(a[name] for name in Cost._fields[2:]))),
+    "trust": ("trusts", lambda j, a: Trust(a["right"], [(deg, m, share) for deg, m, share in a["wrong"]])),
 }

@@ -19,6 +19,7 @@ from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache
 from calib_ros_evaluation.methods.levinson import Levinson, worse_share
+from calib_ros_evaluation.protocols.definitions import PROTOCOLS, Size
 
 Matrix = NDArray[np.float64]
 BATCHES, EVALUATIONS = 7, 10  # the middle batch counts; the clock of CPU time is too coarse for one evaluation
@@ -30,25 +31,26 @@ DIRECTIONS = 8
 
 
 def wrong_start(T: Matrix, job: EvaluationJob) -> Matrix:
-    """T_camera_lidar (4, 4) of a trial: off by a left twist, uniform in +- start_deg and +- start_m per axis.
+    """T_camera_lidar (4, 4) of a trial: off by a left twist, uniform in +- start_deg and +- start_m per axis, or as a published
+    protocol says.
 
     The direction depends on scene, frames and seed alone: all methods begin at the same place, and at larger sizes farther along
-    the same way.
+    the same way. Of a protocol it is the same for any number of frames, so that these are compared on alike starts.
     """
-    rng = np.random.default_rng([int(job.option("seed")), zlib.crc32(job.scene.encode()), *job.frames])
+    seed = [int(job.option("seed")), zlib.crc32(job.scene.encode())]
+    if job.experiment in PROTOCOLS:
+        size = Size(job.option("start_deg"), job.option("start_m"))
+        return PROTOCOLS[job.experiment].start(T, size, np.random.default_rng(seed))
+    rng = np.random.default_rng([*seed, *job.frames])
     half = np.repeat([np.deg2rad(job.option("start_deg")), job.option("start_m")], 3)
     return se3.exp(rng.uniform(-1, 1, 6) * half) @ T
 
 
 def trial(cache: WorkerCache, job: EvaluationJob) -> Answer:
-    """One calibration from `wrong_start`; see `calibrated`."""
-    return calibrated(cache, job, wrong_start(cache.reference(job.scene, job.frames[0]), job))
-
-
-def calibrated(cache: WorkerCache, job: EvaluationJob, start: Matrix) -> Answer:
-    """One calibration from a start (4, 4), searched as far as the job's start_deg and start_m. A method that fails gives an
+    """One calibration from `wrong_start`, searched as far as the job's start_deg and start_m. A method that fails gives an
     answer with the reason; NOT_THE_METHODS is raised."""
     reference = cache.reference(job.scene, job.frames[0])
+    start = wrong_start(reference, job)
     answer: Answer = {"status": "done", "reason": "", "start": off(start, reference)}
     answer["start_rotation_deg"], answer["start_translation_m"] = _error(start, reference)
     answer |= _end(start, reference)

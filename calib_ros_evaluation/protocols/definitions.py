@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.results import Trial
 
 Matrix = NDArray[np.float64]
 COUNTS = (1, 3, 5, 10)  # frames per trial, unless said otherwise
@@ -17,8 +17,7 @@ DETECTION_COUNTS = (1, 3, 5)  # the same, of MISCALIBRATION
 TRIALS = 100  # per cell, unless said otherwise
 
 
-@dataclass(frozen=True)
-class Size:
+class Size(NamedTuple):
     """Of a start error, per axis of the camera: a rotation vector in +-deg and a shift in +-m."""
 
     deg: float
@@ -44,14 +43,6 @@ class Protocol:
     limit_deg: float
     limit_m: float
     amplitude: bool = False
-
-    def succeeded(self, trial: Trial) -> bool:
-        """Done, and within both limits. A refused trial hands back its start, which is no success even where it is near."""
-        return trial.status == "done" and trial.rotation_deg < self.limit_deg and trial.translation_m < self.limit_m
-
-    def wrong(self, trial: Trial) -> bool:
-        """Accepted, and not within both limits."""
-        return trial.status == "done" and not self.succeeded(trial)
 
     def start(self, T: Matrix, size: Size, rng: np.random.Generator) -> Matrix:
         """T_camera_lidar (4, 4) of a trial: a left perturbation, in the camera's frame, of T (4, 4)."""

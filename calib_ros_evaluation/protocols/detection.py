@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -17,137 +18,120 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.checker import Checker
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict, Tolerance
-from calib_ros_evaluation.csv_files import read_rows
-from calib_ros_evaluation.experiments.answers import read_answer
+from calib_ros_evaluation.csv_files import numbers, read_table
+from calib_ros_evaluation.evaluate import StudyReport
+from calib_ros_evaluation.experiments.answers import Answers, read_answers
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
-from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, worker_cache
+from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, WorkerCache, worker_cache
 from calib_ros_evaluation.protocols.definitions import MISCALIBRATION
+from calib_ros_evaluation.protocols.published import ACCURACIES, protocol_report
+from calib_ros_evaluation.report.statistics import median
+from calib_ros_evaluation.report.table import NONE, Rows, Table, interval, percent, plural
 
 Matrix = NDArray[np.float64]
 RIGHT_SET = "pos"  # holds right extrinsics, all others wrong ones
 DOUBLED = 2.0  # the published code turns by twice the degrees of its table, and so do the published figures
 TOLERANCE = Tolerance(1.0, 0.05)  # what the set of right ones lies within: up to 1.0 deg and 3.5 cm
 ADVICE = "give the table of published perturbations by --table"
-COLUMNS = ("set", "frame", "x_m", "y_m", "z_m", "rx_deg", "ry_deg", "rz_deg")
-LARGEST = {"m": se3.MAX_TRANSLATION_M, "deg": 360.0}
+SHIFT, ROTATION = ("x_m", "y_m", "z_m"), ("rx_deg", "ry_deg", "rz_deg")
+COLUMNS = ("set", "frame", *SHIFT, *ROTATION)
+LARGEST = dict.fromkeys(SHIFT, se3.MAX_TRANSLATION_M) | dict.fromkeys(ROTATION, 360.0)
 RIGHT, WRONG, INCONCLUSIVE = "right", "wrong", "inconclusive"
 
 
-@dataclass(frozen=True)
-class Perturbed:
-    """A row of the published table. shift: m. rotation_deg: as printed, before it is doubled."""
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """A Study: a check of every row of the published table whose frame the source has, with every number of frames in `counts`:
+    its own and those that follow in the source, the first after the last."""
 
-    set_name: str
-    frame: str
-    shift: tuple[float, ...]
-    rotation_deg: tuple[float, ...]
-
-    @property
-    def D(self) -> Matrix:
-        """(4, 4) that the right extrinsic is multiplied with from the right, T_camera_lidar D: a rotation vector of DOUBLED the
-        printed degrees, and the shift."""
-        turn = DOUBLED * np.deg2rad(self.rotation_deg)
-        return se3.from_parts(Rotation.from_rotvec(turn).as_matrix(), self.shift)
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What the check said about a row. count: of frames. error_deg, error_m: of the extrinsic that was checked (eq. 2.19)."""
-
-    set_name: str
-    frame: str
-    count: int
-    error_deg: float
-    error_m: float
-    verdict: CheckVerdict
-    reason: str
-    cpu_s: float
+    rows: pd.DataFrame
+    counts: tuple[int, ...]
 
     @property
-    def kind(self) -> str:
-        """RIGHT, WRONG or INCONCLUSIVE."""
-        if self.verdict is CheckVerdict.INCONCLUSIVE:
-            return INCONCLUSIVE
-        return RIGHT if self.verdict is (CheckVerdict.PASS if self.set_name == RIGHT_SET else CheckVerdict.FAIL) else WRONG
+    def about(self) -> Mapping[str, str]:
+        """See Study."""
+        return {"protocol": MISCALIBRATION}
+
+    def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
+        """See Study. BadInputError for several sources, or for one without a frame of the table."""
+        if len(summaries) != 1:
+            raise BadInputError(f"--protocol {MISCALIBRATION} takes one source, the folder of KITTI odometry sequence 00")
+        (source,), cache = summaries, WorkerCache(setup)
+        names = {cache.frame(source.label, position).name: position for position in source.frames}
+        return detection_jobs(self.rows, names, source, self.counts)
+
+    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
+        """See Study: a check that cannot use its frames does not tell."""
+        return [_checked(setup, one) for one in todo]
+
+    def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
+        """See Study. Decisions by set and in all, beside the published accuracies."""
+        found = pd.DataFrame(read_answers(decision_of, planned, answers))
+        cpu = [f"{median(own.cpu_s):.1f} s with {count}" for count, own in found.groupby("frames")]
+        notes = [f"CPU: median of a check, features included, {', '.join(cpu)}."]
+        made = protocol_report(MISCALIBRATION, [sets_table(found), accuracy_table(found)], notes, "decisions.csv", found)
+        said = []
+        for one in found[found.kind != RIGHT].itertuples():
+            off = f"{one.error_deg:.2f} deg, {100 * one.error_m:.1f} cm off"
+            said.append(f"{one.set} {one.frame}, {plural(one.frames)} ({off}) is {one.kind}: {one.reason}.")
+        used = {one.option("row") for one in planned}
+        missing = [frame for number, frame in enumerate(self.rows.frame) if number not in used]
+        text = f"{len(missing)} of {len(self.rows)} rows are of frames that the source does not have, such as {[*missing, ''][0]}"
+        return replace(made, sections=[replace(made.sections[0], sentences=said)], notes=[text] if missing else [])
 
 
-def read_table(path: Path) -> list[Perturbed]:
-    """Rows of a CSV file with COLUMNS. BadInputError, with the line, for a file that cannot be read or is none of these, or
-    without rows."""
-    rows = []
-    for where, row in read_rows(path, COLUMNS, ADVICE):
-        values = tuple(_value(row[name], name, where) for name in COLUMNS[2:])
-        rows.append(Perturbed(row["set"], row["frame"], values[:3], values[3:]))
-    if not rows:
+def read_perturbations(path: Path) -> pd.DataFrame:
+    """Rows of a CSV file with COLUMNS: m, and deg as printed. BadInputError for a file that cannot be read or is none of these,
+    or without rows."""
+    table = read_table(path, COLUMNS, ADVICE)
+    if table.empty:
         raise BadInputError(f"{path} has no rows; {ADVICE}")
-    return rows
-
-
-def _value(text: str | None, name: str, where: str) -> float:
-    """A number of the table, m or deg."""
-    most = LARGEST[name.rpartition("_")[2]]
-    try:
-        value = float(text) if text else math.nan
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= most:  # NaN neither
-        raise BadInputError(f"{where}: {name} is {text or 'missing'}; give a number of at most {most:g}")
-    return value
-
-
-def positions_of(rows: Sequence[Perturbed], names: Mapping[str, int]) -> dict[str, int]:
-    """Positions of the frames of the rows, by their names in the table; those are left out that the source has not.
-
-    names: of the source's frames, and their positions. Leading zeros of a number, which spreadsheets drop, do not count.
-    """
-    numbers = {int(name): position for name, position in names.items() if name.isdecimal()}
-    found = {}
-    for frame in dict.fromkeys(row.frame for row in rows):
-        position = names.get(frame, numbers.get(int(frame)) if frame.isdecimal() else None)
-        if position is not None:
-            found[frame] = position
-    return found
+    for name, most in LARGEST.items():
+        table[name] = numbers(table, name, float, path, ADVICE)
+        if not (table[name].abs() <= most).all():  # NaN neither
+            raise BadInputError(f"{path}, column {name}: give numbers of at most {most:g}")
+    return table
 
 
 def detection_jobs(
-    rows: Sequence[Perturbed], names: Mapping[str, int], source: SourceSummary, counts: Sequence[int]
+    rows: pd.DataFrame, names: Mapping[str, int], source: SourceSummary, counts: Sequence[int]
 ) -> list[EvaluationJob]:
-    """A check of every row whose frame the source has, with every number of frames: its own and those that follow in the source,
-    the first after the last. names: of the source's frames, and their positions.
-
-    BadInputError if there is no such row, or for more frames than the source has.
-    """
-    positions = positions_of(rows, names)
-    known = [(number, row) for number, row in enumerate(rows) if row.frame in positions]
+    """See Detection. names: of the source's frames, and their positions. Leading zeros of a number, which spreadsheets drop, do
+    not count. BadInputError if there is no such row, or for more frames than the source has."""
+    by_number = {int(name): position for name, position in names.items() if name.isdecimal()}
+    known = []
+    for number, row in enumerate(rows[list(COLUMNS)].to_dict("records")):
+        frame = row["frame"]
+        position = names.get(frame, by_number.get(int(frame)) if frame.isdecimal() else None)
+        known += [] if position is None else [(source.frames.index(position), {"row": number, **row})]
     if not known:
         raise BadInputError(
-            f"{source.label} has no frame {rows[0].frame}, nor any other of the table's {len({row.frame for row in rows})}; its "
+            f"{source.label} has no frame {rows.frame[0]}, nor any other of the table's {rows.frame.nunique()}; its "
             f"frames are {', '.join(list(names)[:3])}, ...; give the folder of KITTI odometry sequence 00 (sequences/00)"
         )
-    out = []
-    for count in counts:
-        if count > len(source.frames):
-            raise BadInputError(
-                f"--frames-per-trial {count}: {source.label} has only {len(source.frames)} frames; give fewer, or another source"
-            )
-        for number, row in known:
-            first = source.frames.index(positions[row.frame])
-            frames = [source.frames[(first + k) % len(source.frames)] for k in range(count)]
-            values: dict[str, float | int | str] = {"row": number, "set": row.set_name, "frame": row.frame}
-            values |= dict(zip(COLUMNS[2:], (*row.shift, *row.rotation_deg), strict=True))
-            out.append(job(MISCALIBRATION, "check", source.label, frames, values))
-    return out
+    n = len(source.frames)
+    if max(counts) > n:
+        raise BadInputError(
+            f"--frames-per-trial {max(counts)}: {source.label} has only {n} frames; give fewer, or another source"
+        )
+    return [
+        job(MISCALIBRATION, "check", source.label, [source.frames[(first + k) % n] for k in range(count)], values)
+        for count in counts
+        for first, values in known
+    ]
 
 
-def run_checks(setup: Setup, jobs: Sequence[EvaluationJob]) -> list[Answer]:
-    """The answers, in order: a check that cannot use its frames does not tell."""
-    return [_checked(setup, one) for one in jobs]
+def displacement(values: Mapping[str, Any]) -> Matrix:
+    """(4, 4) that the right extrinsic is multiplied with from the right, T_camera_lidar D: a rotation vector of DOUBLED the
+    printed degrees, and the shift."""
+    shift, turn = ([float(values[name]) for name in names] for names in (SHIFT, ROTATION))
+    return se3.from_parts(Rotation.from_rotvec(DOUBLED * np.deg2rad(turn)).as_matrix(), shift)
 
 
 def _checked(setup: Setup, one: EvaluationJob) -> Answer:
-    cache, row = worker_cache(setup), _row(one)
+    cache = worker_cache(setup)
     reference = cache.reference(one.scene, one.frames[0])
-    T = reference @ row.D
+    T = reference @ displacement(dict(one.options))
     answer = {"error_deg": se3.rotation_error_deg(reference, T), "error_m": se3.translation_error_m(reference, T)}
     try:
         result = _checker(setup, one.scene).check([cache.frame(one.scene, k) for k in one.frames], T, TOLERANCE)
@@ -164,16 +148,45 @@ def _checker(setup: Setup, label: str) -> Checker:
     return Checker(worker_cache(setup).source(label).camera, setup.config)
 
 
-def _row(one: EvaluationJob) -> Perturbed:
-    shift, rotation = (tuple(float(one.option(name)) for name in names) for names in (COLUMNS[2:5], COLUMNS[5:]))
-    return Perturbed(str(one.option("set")), str(one.option("frame")), shift, rotation)
+def decision_of(one: EvaluationJob, answer: Answer) -> dict[str, Any]:
+    """What the check said about a row. frames: how many. error_deg, error_m: of the extrinsic that was checked (eq. 2.19)."""
+    verdict, name = CheckVerdict(answer["verdict"]), one.option("set")
+    told = {"set": name, "frame": one.option("frame"), "frames": len(one.frames)}
+    told |= {key: float(answer[key]) for key in ("error_deg", "error_m")}
+    told |= {"verdict": verdict.value, "kind": kind_of(name, verdict), "reason": answer["reason"]}
+    return told | {"cpu_s": float(answer["cpu_s"])}
 
 
-def decisions(jobs: Sequence[EvaluationJob], answers: Mapping[str, Answer]) -> list[Decision]:
-    """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
-    return [read_answer(_decision, one, answers[one.key]) for one in jobs if one.key in answers]
+def kind_of(set_name: str, verdict: CheckVerdict) -> str:
+    """RIGHT, WRONG or INCONCLUSIVE."""
+    if verdict is CheckVerdict.INCONCLUSIVE:
+        return INCONCLUSIVE
+    return RIGHT if verdict is (CheckVerdict.PASS if set_name == RIGHT_SET else CheckVerdict.FAIL) else WRONG
 
 
-def _decision(one: EvaluationJob, answer: Answer) -> Decision:
-    row, values = _row(one), (float(answer["error_deg"]), float(answer["error_m"]), CheckVerdict(answer["verdict"]))
-    return Decision(row.set_name, row.frame, len(one.frames), *values, answer["reason"], float(answer["cpu_s"]))
+def sets_table(found: pd.DataFrame) -> Table:
+    """A row for each set and one for all: decisions that are right, wrong, inconclusive, for each number of frames."""
+    counts = sorted(found.frames.unique())
+    rows: Rows = []
+    for name in (*found.set.unique(), "all"):
+        own = [found[(found.frames == count) & ((found.set == name) | (name == "all"))].kind for count in counts]
+        cells = [", ".join(str((kind == which).sum()) for which in (RIGHT, WRONG, INCONCLUSIVE)) for kind in own]
+        rows.append([name, str(len(own[0])), *cells])
+    header = ["set", "decisions", *(f"{plural(count)}: right, wrong, inconclusive" for count in counts)]
+    return Table("Decisions by set", header, rows)
+
+
+def accuracy_table(found: pd.DataFrame) -> Table:
+    """Shares of right decisions beside the published ones. An inconclusive decision is not right."""
+    rows: Rows = []
+    for system, published in ACCURACIES.items():
+        # With the digits that are published: 99.97 % is not 100.0 %.
+        whole, rot_hard, trans_easy = (f"{share:.4g} %" for share in published)
+        rows.append([system, "1", NONE, whole, NONE, rot_hard, trans_easy, NONE])
+    for count, own in found.groupby("frames"):
+        right, alarms = own.kind == RIGHT, own[own.set == RIGHT_SET]
+        shares = [percent(part.mean(), 1) for part in (right, right[own.set == "rot_hard"], right[own.set == "trans_easy"])]
+        shares.insert(1, f"{interval(right.sum(), len(own))} %")
+        rows.append(["this project", str(count), str(len(own)), *shares, f"{(alarms.kind == WRONG).sum()} of {len(alarms)}"])
+    header = ("system", "frames", "decisions", "all", "95 %", "rot_hard", "trans_easy", "false alarms")
+    return Table("Share of right decisions", header, rows)

@@ -4,36 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
+import pandas as pd
+
+from calib_ros_evaluation.evaluate import StudyReport
 from calib_ros_evaluation.protocols.definitions import BORER, MISCALIBRATION, SINGLE_FRAME, UNICALIB, Size
-
-
-@dataclass(frozen=True)
-class Published:
-    """A published row. size: of the start error. frames: per trial. success: share, 0..1. rotation_deg, translation_m: mean
-    errors of all trials. NaN = not published."""
-
-    protocol: str
-    size: Size
-    system: str
-    learned: bool
-    data: str
-    frames: int
-    success: float = math.nan
-    rotation_deg: float = math.nan
-    translation_m: float = math.nan
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """Published shares of right decisions, 0..1, over all sets, of rot_hard and of trans_easy."""
-
-    system: str
-    all_sets: float
-    rot_hard: float
-    trans_easy: float
-
+from calib_ros_evaluation.report.sections import Section
+from calib_ros_evaluation.report.table import Table
 
 TITLES = {
     SINGLE_FRAME.name: "One harness for learned and classical systems (ProjFusion)",
@@ -81,41 +59,46 @@ CAVEATS = {
 }
 
 _SIZES = (Size(15, 0.15), Size(10, 0.25), Size(10, 0.5))
-# System, learned, data; then success in %, mean rotation error in deg and mean translation error in cm for each of _SIZES.
+# System, data; then success in %, mean rotation error in deg and mean translation error in cm for each of _SIZES.
 _HARNESS = (
-    ("DirectCalib", False, "KITTI", (1.5, 13.1, 195), (1.8, 13.1, 147), (0.8, 12.7, 223)),
-    ("CalibAnything", False, "KITTI", (1.9, 18.3, 27.3), (12.4, 5.32, 28.2), (8.6, 6.02, 49.9)),
-    ("LCCNet", True, "KITTI", (31.7, 2.10, 6.12), (27.8, 2.50, 6.08), (25.6, 2.55, 6.72)),
-    ("LCCRAFT", True, "KITTI", (44.1, 0.53, 6.03), (42.4, 0.59, 6.27), (39.1, 0.95, 6.48)),
-    ("CalibDepth", True, "KITTI", (56.9, 1.06, 4.57), (39.2, 1.99, 5.44), (41.8, 1.77, 5.28)),
-    ("NativeCross", True, "KITTI", (96.6, 0.43, 2.20), (92.6, 0.65, 2.59), (87.7, 0.76, 2.75)),
-    ("DirectCalib", False, "nuScenes", (0.2, 14.9, 452), (0.2, 13.3, 268), (0.3, 12.7, 359)),
-    ("CalibAnything", False, "nuScenes", (3.3, 7.51, 7.24), (5.7, 4.73, 11.9), (3.5, 4.73, 23.9)),
-    ("LCCNet", True, "nuScenes", (41.9, 2.34, 5.59), (41.5, 2.41, 5.86), (29.4, 2.83, 7.56)),
-    ("LCCRAFT", True, "nuScenes", (57.5, 0.71, 5.57), (55.0, 0.64, 5.63), (40.1, 0.94, 7.41)),
-    ("CalibDepth", True, "nuScenes", (79.1, 0.30, 3.33), (74.1, 0.39, 3.78), (54.4, 0.36, 5.71)),
-    ("NativeCross", True, "nuScenes", (99.9, 0.37, 0.51), (99.7, 0.39, 0.53), (99.2, 0.60, 0.77)),
+    ("DirectCalib (classical)", "KITTI", (1.5, 13.1, 195), (1.8, 13.1, 147), (0.8, 12.7, 223)),
+    ("CalibAnything (classical)", "KITTI", (1.9, 18.3, 27.3), (12.4, 5.32, 28.2), (8.6, 6.02, 49.9)),
+    ("LCCNet (learned)", "KITTI", (31.7, 2.10, 6.12), (27.8, 2.50, 6.08), (25.6, 2.55, 6.72)),
+    ("LCCRAFT (learned)", "KITTI", (44.1, 0.53, 6.03), (42.4, 0.59, 6.27), (39.1, 0.95, 6.48)),
+    ("CalibDepth (learned)", "KITTI", (56.9, 1.06, 4.57), (39.2, 1.99, 5.44), (41.8, 1.77, 5.28)),
+    ("NativeCross (learned)", "KITTI", (96.6, 0.43, 2.20), (92.6, 0.65, 2.59), (87.7, 0.76, 2.75)),
+    ("DirectCalib (classical)", "nuScenes", (0.2, 14.9, 452), (0.2, 13.3, 268), (0.3, 12.7, 359)),
+    ("CalibAnything (classical)", "nuScenes", (3.3, 7.51, 7.24), (5.7, 4.73, 11.9), (3.5, 4.73, 23.9)),
+    ("LCCNet (learned)", "nuScenes", (41.9, 2.34, 5.59), (41.5, 2.41, 5.86), (29.4, 2.83, 7.56)),
+    ("LCCRAFT (learned)", "nuScenes", (57.5, 0.71, 5.57), (55.0, 0.64, 5.63), (40.1, 0.94, 7.41)),
+    ("CalibDepth (learned)", "nuScenes", (79.1, 0.30, 3.33), (74.1, 0.39, 3.78), (54.4, 0.36, 5.71)),
+    ("NativeCross (learned)", "nuScenes", (99.9, 0.37, 0.51), (99.7, 0.39, 0.53), (99.2, 0.60, 0.77)),
 )
-ROWS = (
-    *(
-        Published(SINGLE_FRAME.name, size, system, learned, data, 1, success / 100, deg, cm / 100)
-        for system, learned, data, *figures in _HARNESS
-        for size, (success, deg, cm) in zip(_SIZES, figures, strict=True)
-    ),
-    Published(BORER.name, Size(10, 0), "Borer et al.", False, "KITTI", 25, 0.965),
-    Published(BORER.name, Size(10, 0), "Borer et al.", False, "KITTI-360", 25, 1.0),
-    Published(BORER.name, Size(0.5, 0.5), "Borer et al.", False, "KITTI", 25, 0.88),
-    Published(BORER.name, Size(0.5, 0.5), "Borer et al.", False, "KITTI-360", 25, 0.765),
-    Published(UNICALIB.name, Size(5, 0.1), "UniCalib", True, "KITTI odometry", 0, math.nan, 0.044, 0.0055),
-    Published(UNICALIB.name, Size(10, 0.25), "UniCalib", True, "KITTI raw", 0, math.nan, 0.084, 0.0237),
+BY_BORER, BY_UNICALIB = "Borer et al. (classical)", "UniCalib (learned)"
+# A row for each published one. frames: per trial, 0 = not known. NaN = not published.
+PUBLISHED = pd.DataFrame(
+    [
+        *(
+            (SINGLE_FRAME.name, *size, system, data, 1, *figures)
+            for system, data, *of_sizes in _HARNESS
+            for size, figures in zip(_SIZES, of_sizes, strict=True)
+        ),
+        (BORER.name, 10, 0, BY_BORER, "KITTI", 25, 96.5, math.nan, math.nan),
+        (BORER.name, 10, 0, BY_BORER, "KITTI-360", 25, 100.0, math.nan, math.nan),
+        (BORER.name, 0.5, 0.5, BY_BORER, "KITTI", 25, 88.0, math.nan, math.nan),
+        (BORER.name, 0.5, 0.5, BY_BORER, "KITTI-360", 25, 76.5, math.nan, math.nan),
+        (UNICALIB.name, 5, 0.1, BY_UNICALIB, "KITTI odometry", 0, math.nan, 0.044, 0.55),
+        (UNICALIB.name, 10, 0.25, BY_UNICALIB, "KITTI raw", 0, math.nan, 0.084, 2.37),
+    ],
+    columns=["protocol", "start_deg", "start_m", "system", "data", "frames", "success_percent", "deg", "cm"],
 )
-ACCURACIES = (
-    Accuracy("TUM detector", 0.991, 0.990, 0.9997),
-    Accuracy("rival 1", 0.951, 0.863, 0.921),
-    Accuracy("rival 2", 0.909, 0.865, 0.904),
-)
+# Shares of right decisions in %, over all sets, of rot_hard and of trans_easy.
+ACCURACIES = {"TUM detector": (99.1, 99.0, 99.97), "rival 1": (95.1, 86.3, 92.1), "rival 2": (90.9, 86.5, 90.4)}
 
 
-def rows_of(protocol: str, size: Size) -> Sequence[Published]:
-    """What is published by a protocol for a size of start errors."""
-    return [row for row in ROWS if row.protocol == protocol and row.size == size]
+def protocol_report(name: str, tables: Sequence[Table], notes: Sequence[str], file: str, rows: pd.DataFrame) -> StudyReport:
+    """The report of a protocol: one section, whose caveats and notes stand below its last table."""
+    tables = [*tables[:-1], replace(tables[-1], notes=(*CAVEATS[name], *notes))]
+    section = Section(name, TITLES[name], INTRODUCTIONS[name], tables=tables)
+    said = [line for one in tables for line in (one.title, one.text(), "")]
+    return StudyReport(f"Published protocol: {section.heading}", [section], said, file, rows)

@@ -9,12 +9,10 @@ from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros_check.page import page_template
 from calib_ros_evaluation.rendering import empty_figure
-from calib_ros_evaluation.report.sections import Section, sections
-from calib_ros_evaluation.report.table import as_markdown, escaped
-from calib_ros_evaluation.results import Results
+from calib_ros_evaluation.report.sections import Section
+from calib_ros_evaluation.report.table import escaped
 
 PAGE, TEXT, PLOTS = "report.html", "report.md", "plots"
-TITLE = "Camera-LiDAR calibration: methods compared"
 
 # The parts of the page that differ from that of the steps.
 TEMPLATE = """\
@@ -102,17 +100,12 @@ def check_report(folder: Path) -> None:
         raise BadInputError(f"{folder / PLOTS} is a file, where plots are to be; choose another --out")
 
 
-def write_report(folder: Path, results: Results, facts: Mapping[str, str], configuration: str) -> list[Path]:
-    """Write report.html, report.md and plots/*.png; returns them, the page first. The same results give the same bytes.
+def write_report(folder: Path, title: str, facts: Mapping[str, str], configuration: str, made: Sequence[Section]) -> list[Path]:
+    """Write report.html, report.md and plots/*.png; returns them, the page first. The same sections give the same bytes.
 
     facts: the page's head. configuration: as YAML. Nothing is written if anything
     cannot be drawn: MissingDependencyError without Jinja2 or matplotlib, BadInputError if the folder cannot be written.
     """
-    return write_sections(folder, TITLE, facts, configuration, sections(results))
-
-
-def write_sections(folder: Path, title: str, facts: Mapping[str, str], configuration: str, made: Sequence[Section]) -> list[Path]:
-    """`write_report` of sections that are made already, whatever they are about."""
     template = page_template(TEMPLATE)
     page = template.render(command="evaluate", title=title, facts=facts, configuration=configuration, sections=made)
     text = document(title, facts, made, PLOTS)
@@ -131,6 +124,6 @@ def document(title: str, facts: Mapping[str, str], sections: Sequence[Section], 
         listed = [f"- {escaped(sentence)}" for sentence in section.sentences]
         listed += [f"- **{escaped(name)}**: {escaped(what)}" for name, what, _ in section.methods]
         parts += ["\n".join(listed)] if listed else []
-        parts += [as_markdown(one) for one in section.tables]
+        parts += [one.markdown() for one in section.tables]
         parts += [f"![{escaped(plot.title)}]({folder}/{plot.name}.png)\n\n{escaped(plot.caption)}" for plot in section.plots]
     return "\n\n".join(part for part in parts if part) + "\n"

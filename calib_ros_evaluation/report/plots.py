@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from calib_ros.frame import SemanticClass
 from calib_ros_evaluation.curves import AXES, Curves
-from calib_ros_evaluation.rendering import COLORS, empty_figure, six_axes
-from calib_ros_evaluation.report.statistics import OURS, axis_errors, errors, quantile, start_sizes, wilson
-from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, Similarity, Trial
+from calib_ros_evaluation.rendering import COLORS, Style, above, draw_curves, empty_figure, pixels
+from calib_ros_evaluation.report.statistics import OURS, axis_errors, groups, quantile, wilson
+from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, Similarity
 
 Matrix = NDArray[np.float64]
+Styles = Mapping[str, Style]
 # Okabe and Ito: distinct for colour-blind eyes too. Their yellow cannot be seen on white, brown stands for it.
 OUR_COLOR, BAD, GOOD = COLORS
 OTHERS = ("#e69f00", "#56b4e9", GOOD, "#cc79a7", BAD, "#333333", "#8c510a")
@@ -42,40 +45,19 @@ class Plot:
     size: tuple[int, int]
 
 
-@dataclass(frozen=True)
-class LineStyle:
-    """How lines of a method are drawn. layer: higher ones cover lower ones."""
-
-    color: str
-    dash: Any
-    marker: str
-    width: float
-    layer: float
-
-    @property
-    def line(self) -> dict[str, Any]:
-        """Options of matplotlib for a line without markers."""
-        return {"color": self.color, "linestyle": self.dash, "linewidth": self.width, "zorder": self.layer}
-
-
-def method_styles(names: Sequence[str]) -> dict[str, LineStyle]:
+def method_styles(names: Sequence[str]) -> dict[str, Style]:
     """By the order of all methods, so that a method has one style in every plot; this project's own is thick and in front."""
-    out, k = {}, 0
-    for name in names:
-        if name == OURS:
-            out[name] = LineStyle(OUR_COLOR, "-", "o", 2.8, 5)
-        else:
-            out[name] = LineStyle(OTHERS[k % len(OTHERS)], DASHES[k % len(DASHES)], MARKERS[k % len(MARKERS)], 1.6, 3)
-            k += 1
-    return out
+    others = cycle(zip(OTHERS, DASHES, MARKERS, strict=True))
+    out = {name: (1.6, 3, *next(others)) for name in names if name != OURS}
+    out |= {OURS: (2.8, 5, OUR_COLOR, "-", "o")} if OURS in names else {}
+    return {name: dict(zip(("linewidth", "zorder", "color", "linestyle", "marker"), out[name], strict=True)) for name in names}
 
 
 def finished(figure: Any, name: str, title: str, caption: str) -> Plot:
     """The figure as a file; the same figure gives the same bytes."""
     from PIL import Image  # comes with matplotlib, which writes its own files by it
 
-    figure.canvas.draw()
-    picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+    picture = Image.fromarray(pixels(figure)).convert("RGB")
     stream = io.BytesIO()
     # 256 colours are enough to the eye, and the file is a third as large.
     picture.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
@@ -88,25 +70,23 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def method_legend(figure: Any, own: Mapping[str, LineStyle]) -> None:
+def method_legend(figure: Any, methods: Mapping[str, Any], styles: Styles) -> None:
     """Names, lines and marks of methods above all axes."""
     from matplotlib.lines import Line2D
 
-    lines = [Line2D([], [], label=plain(name), marker=style.marker, markersize=6, **style.line) for name, style in own.items()]
-    figure.legend(handles=lines, loc="outside upper center", ncols=min(len(lines), 8), frameon=False, fontsize=11)
+    lines = [Line2D([], [], label=plain(name), markersize=6, **styles[name]) for name in methods]
+    above(figure, lines, min(len(lines), 8))
 
 
-def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], styles: Mapping[str, LineStyle]) -> Plot:
+def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], styles: Styles) -> Plot:
     """Method -> curves, each from 0 to 1, with a mark at its peak."""
-    figure = empty_figure(13, 6.8)
-    own = {method: styles[method] for method in curves}
-    for axis, axes in enumerate(six_axes(figure, "score, scaled")):
-        for method, found in curves.items():
-            style = own[method]
-            axes.plot(found.offsets[axis], found.scaled()[axis], **style.line)
-            if np.isfinite(found.values[axis]).all():
-                axes.plot(found.peaks[axis], 1, style.marker, color=style.color, markersize=7, zorder=style.layer, clip_on=False)
-    method_legend(figure, own)
+    figure, lines = empty_figure(13, 6.8), []
+    for method, found in curves.items():
+        style = styles[method]
+        mark = {key: style[key] for key in ("marker", "color", "zorder")} | {"markersize": 7, "clip_on": False}
+        lines.append((found, style | {"marker": ""}, mark))
+    draw_curves(figure, lines, "score, scaled")
+    method_legend(figure, curves, styles)
     return finished(figure, name, title, caption)
 
 
@@ -121,20 +101,17 @@ def mean_curves(curves: Sequence[Curves]) -> Curves:
 def averaging(name: str, one: Averaging) -> Plot:
     """Three frames: their curves and averages (figure 4.16), and how many of their pixels are of each class (4.5, 4.8, 4.11)."""
     figure = empty_figure(13, 9.8)
-    above, below = figure.subfigures(2, 1, height_ratios=(2.3, 1))
+    top, below = figure.subfigures(2, 1, height_ratios=(2.3, 1))
     places, bars = np.arange(len(SemanticClass)), below.add_subplot()
-    lines = list[tuple[Curves, dict[str, Any]]]()
+    curves = list[tuple[Curves, Style, Style]]()
     for n, (k, color) in enumerate(zip(one.shown, SCENES, strict=True)):
         label = plain(f"{one.names[k]}, w = {one.weights[k]:.3f}")
-        lines.append((one.single[k], {"color": color, "linewidth": 1.3, "label": label}))
+        curves.append((one.single[k], {"color": color, "linewidth": 1.3, "label": label}, {}))
         bars.bar(places + 0.27 * (n - 1), 100 * one.shares[k], 0.25, color=color)
     for label, weighted, dash in (("weighted average", True, "-"), ("unweighted average", False, DASHES[0])):
         style = {"color": OUR_COLOR, "linewidth": 2.4, "linestyle": dash, "label": label}
-        lines.append((one.average(one.shown, weighted), style))
-    for axis, axes in enumerate(six_axes(above, "score, scaled")):
-        for found, style in lines:
-            axes.plot(found.offsets[axis], found.scaled()[axis], **style)
-    above.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False, fontsize=11)
+        curves.append((one.average(one.shown, weighted), style, {}))
+    above(top, draw_curves(top, curves, "score, scaled"), 5)
     bars.set_xticks(places, [own.name.lower() for own in SemanticClass])
     bars.set(title="classes", ylabel="pixels, %")
     caption = f"w: share of main classes among pixels with a class, {one.classes_of}. Every curve is scaled to 0..1."
@@ -165,7 +142,7 @@ def similarity(name: str, one: Similarity) -> Plot:
     return finished(figure, name, f"Histogram similarity and keyframes, {one.scene}", caption)
 
 
-def boxes(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
+def boxes(trials: Mapping[str, pd.DataFrame], styles: Styles) -> Plot:
     """Errors per axis as figures 4.14 and 4.15 have them; what lies outside the drawn range is counted. Each method needs a trial
     with a finite end."""
     figure = empty_figure(13, 7.2)
@@ -176,7 +153,7 @@ def boxes(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]
         half = _half_range(columns, LIMITS[axis // 3])
         drawn = axes.boxplot(columns, patch_artist=True, widths=0.6, flierprops={"marker": ".", "markersize": 4, "alpha": 0.5})
         for part, median, method in zip(drawn["boxes"], drawn["medians"], own, strict=True):
-            part.set(facecolor=styles[method].color, alpha=0.75, linewidth=1.6 if method == OURS else 0.9)
+            part.set(facecolor=styles[method]["color"], alpha=0.75, linewidth=1.6 if method == OURS else 0.9)
             median.set(color="black", linewidth=1.6)
         for k, values in enumerate(columns, start=1):
             outside = int((np.abs(values) > half).sum())
@@ -205,67 +182,68 @@ def _half_range(columns: Sequence[Matrix], limit: float) -> float:
     return max(1.15 * float(np.median(ends)), 2 * limit)
 
 
-def starts(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
+def starts(trials: dict[str, pd.DataFrame], styles: Styles) -> Plot:
     """Success against the size of the start error."""
     figure = empty_figure(13, 5.2)
     axes = figure.add_subplot()
-    sizes = start_sizes(t for own in trials.values() for t in own)
-    places = np.arange(len(sizes), dtype=float)
-    for place, (method, own) in zip(_dodged(places, len(trials)), trials.items(), strict=True):
-        found = [[t.success for t in own if (t.start_deg, t.start_m) == size] for size in sizes]
-        kept = [k for k, good in enumerate(found) if good]
-        share = np.array([np.mean(found[k]) for k in kept])
-        ends = np.array([wilson(sum(found[k]), len(found[k])) for k in kept]).reshape(-1, 2)
-        _with_bars(axes, place[kept], 100 * share, 100 * ends.T, styles[method])
-    axes.set_xticks(places, [f"±{deg:g} deg\n±{100 * m:g} cm" for deg, m in sizes])
+    sizes, by_size = groups(trials, "size")
+    found = {
+        method: [_share(own.success) if len(own) else (np.nan,) * 3 for own in groups.values()]
+        for method, groups in by_size.items()
+    }
+    _side_by_side(axes, found, styles, [f"±{deg:g} deg\n±{100 * m:g} cm" for deg, m in sizes])
     axes.set(xlabel="start error per axis", ylabel="success, %", ylim=(-3, 103), yticks=range(0, 101, 20))
-    axes.grid(axis="y", color="0.9")
-    method_legend(figure, {method: styles[method] for method in trials})
+    method_legend(figure, trials, styles)
     caption = "Bars: 95 % intervals (Wilson). Methods stand side by side only so that their bars can be seen."
     return finished(figure, "starts", "Success by size of the start error", caption)
 
 
-def frames(trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
+def _share(success: pd.Series) -> tuple[float, float, float]:
+    """In %, between the ends of its interval."""
+    low, high = wilson(success.sum(), len(success))
+    return 100 * low, 100 * success.mean(), 100 * high
+
+
+def frames(trials: dict[str, pd.DataFrame], styles: Styles) -> Plot:
     """Errors against the number of frames."""
     figure = empty_figure(13, 5.2)
-    numbers = sorted({len(t.frames) for own in trials.values() for t in own})
-    places = np.arange(len(numbers), dtype=float)
-    for k, (label, limit) in enumerate(zip(("rotation error, deg", "translation error, cm"), LIMITS, strict=True)):
+    numbers, by_number = groups(trials, "n")
+    labels = {"rotation_deg": "rotation error, deg", "cm": "translation error, cm"}
+    for k, (column, limit) in enumerate(zip(labels, LIMITS, strict=True)):
         axes = figure.add_subplot(1, 2, k + 1)
-        drawn = []
-        for place, (method, own) in zip(_dodged(places, len(trials)), trials.items(), strict=True):
-            groups = [errors([t for t in own if len(t.frames) == n])[k] for n in numbers]
-            found = np.array([[quantile(g, share) for share in (0.25, 0.5, 0.75)] for g in groups])
-            kept = np.isfinite(found[:, 1])
-            drawn.append(found)
-            # A quartile of infinity, more than a quarter without an end, is drawn beyond the axis.
-            _with_bars(axes, place[kept], found[kept, 1], np.nan_to_num(found[kept][:, [0, 2]].T, posinf=1e6), styles[method])
+        found = {
+            method: [[quantile(own[column], share) for share in (0.25, 0.5, 0.75)] for own in groups.values()]
+            for method, groups in by_number.items()
+        }
         axes.axhline(limit, color="0.5", linewidth=1, linestyle=(0, (2, 3)), zorder=1)
+        _side_by_side(axes, found, styles, [str(n) for n in numbers])
         axes.set_yscale("log")
         decimal(axes.yaxis)
-        axes.set_ylim(*_seen(drawn, limit))
-        axes.set_xticks(places, [str(n) for n in numbers])
-        axes.set(xlabel="frames", ylabel=f"{label} (logarithmic)")
-        axes.grid(axis="y", color="0.9")
-    method_legend(figure, {method: styles[method] for method in trials})
+        axes.set_ylim(*_seen(found.values(), limit))
+        axes.set(xlabel="frames", ylabel=f"{labels[column]} (logarithmic)")
+    method_legend(figure, trials, styles)
     caption = "Median over all trials, bars from quartile to quartile; dotted: the limit of success."
     return finished(figure, "frames", "Errors by number of frames", caption)
 
 
-def _with_bars(axes: Any, x: Matrix, y: Matrix, ends: Matrix, style: LineStyle) -> None:
-    """Line through (x, y), bars between ends (2, n)."""
-    off = np.maximum(np.stack([y - ends[0], ends[1] - y]), 0)
-    axes.errorbar(x, y, off, marker=style.marker, markersize=6, elinewidth=1, capsize=2.5, **style.line)
+def _side_by_side(axes: Any, found: Mapping[str, Sequence[Sequence[float]]], styles: Styles, labels: Sequence[str]) -> None:
+    """A line for each method through its middle values, bars from the low to the high ones: (low, middle, high) for every label,
+    NaN where there is none."""
+    places = np.arange(len(labels), dtype=float)
+    for k, (method, own) in enumerate(found.items()):
+        # A quartile of infinity, more than a quarter without an end, is drawn beyond the axis.
+        low, y, high = np.nan_to_num(np.array(own), nan=np.nan, posinf=1e6).T
+        kept = np.isfinite(np.array(own)[:, 1])
+        off = np.maximum(np.stack([y - low, high - y]), 0)[:, kept]
+        place = places + DODGE * ((k + 0.5) / len(found) - 0.5)
+        axes.errorbar(place[kept], y[kept], off, markersize=6, elinewidth=1, capsize=2.5, **styles[method])
+    axes.set_xticks(places, labels)
+    axes.grid(axis="y", color="0.9")
 
 
-def _dodged(places: Matrix, n: int) -> list[Matrix]:
-    """Places of n methods side by side."""
-    return [places + DODGE * ((k + 0.5) / n - 0.5) for k in range(n)]
-
-
-def _seen(drawn: Sequence[Matrix], limit: float) -> tuple[float, float]:
+def _seen(drawn: Iterable[Sequence[Sequence[float]]], limit: float) -> tuple[float, float]:
     """Range of a logarithmic axis that shows all that is drawn, and the limit of success."""
-    kept = np.concatenate([limit * np.ones(1), *(values.ravel() for values in drawn)])
+    kept = np.concatenate([limit * np.ones(1), *(np.ravel(values) for values in drawn)])
     kept = kept[np.isfinite(kept) & (kept > 0)]
     return float(max(kept.min() / 1.3, 1e-4)), float(1.3 * kept.max())
 

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from calib_ros_evaluation.report import plots, tables
-from calib_ros_evaluation.report.plots import LineStyle, Plot, method_styles
-from calib_ros_evaluation.report.statistics import (
-    all_methods,
-    axis_errors,
-    curves_of_methods,
-    curves_of_scenes,
-    trials_of,
-)
+from calib_ros_evaluation.report.plots import Plot, Styles, method_styles
+from calib_ros_evaluation.report.statistics import all_methods, axis_errors, curves_of_methods, curves_of_scenes, trials_of
 from calib_ros_evaluation.report.table import Table
 from calib_ros_evaluation.results import Results
 
-Styles = Mapping[str, LineStyle]
 MOST_SCENES = 4  # drawn one by one; the tables and the mean have all
 # How to read each section.
 SUMMARY = (
@@ -67,47 +60,45 @@ class Section:
     key: str
     heading: str
     introduction: str
-    sentences: tuple[str, ...] = ()
-    methods: tuple[tuple[str, str, str], ...] = ()
-    tables: tuple[Table, ...] = ()
-    plots: tuple[Plot, ...] = ()
+    sentences: Sequence[str] = ()
+    methods: Sequence[tuple[str, str, str]] = ()
+    tables: Sequence[Table] = ()
+    plots: Sequence[Plot] = ()
 
 
 def sections(results: Results) -> list[Section]:
     """Sections with content; the last one says what failed."""
     styles = method_styles(all_methods(results))
-    titles = tuple((name, results.titles.get(name, ""), styles[name].color) for name in styles)
-    whole, by_scene = tables.summary(results), tables.scenes(results)
+    titles = [(name, results.titles.get(name, ""), styles[name]["color"]) for name in styles]
+    summary = tables.summary(results)
     one, starts, frames = (trials_of(results, name) for name in ("single", "starts", "frames"))
-    of_one = (tables.axes(results), tables.single(results), *(() if by_scene is None else (by_scene,))) if one else ()
+    of_one = [tables.axes(results), tables.single(results), *tables.scenes(results)] if one else []
     ended = {name: own for name, own in one.items() if len(axis_errors(own))}
-    boxes = (plots.boxes(ended, styles),) if ended else ()
-    trusts, costs = results.trusts, results.costs
-    averages = tuple(plots.averaging(f"averaging_{k}", own) for k, own in enumerate(results.averagings, start=1))
-    similar = tuple(plots.similarity(f"similarity_{k}", own) for k, own in enumerate(results.similarities, start=1))
+    averages = [plots.averaging(f"averaging_{k}", own) for k, own in enumerate(results.averagings, start=1)]
+    similar = [plots.similarity(f"similarity_{k}", own) for k, own in enumerate(results.similarities, start=1)]
     made = [
-        Section("summary", "Summary", SUMMARY, methods=titles, tables=(whole,) if whole.rows else ()),
+        Section("summary", "Summary", SUMMARY, methods=titles, tables=[summary] if summary.rows else []),
         _loss_curves(results, styles),
-        Section("single", "Errors of single frames", SINGLE, tables=of_one, plots=boxes),
+        Section("single", "Errors of single frames", SINGLE, tables=of_one, plots=[plots.boxes(ended, styles)] if ended else []),
         Section(
             "starts",
             "Size of the start error",
             STARTS,
-            tables=(tables.starts(results),) if starts else (),
-            plots=(plots.starts(starts, styles),) if starts else (),
+            tables=[tables.starts(results)] if starts else [],
+            plots=[plots.starts(starts, styles)] if starts else [],
         ),
         Section(
             "frames",
             "Number of frames",
             FRAMES,
-            tables=tuple(tables.frames(results)) if frames else (),
-            plots=(plots.frames(frames, styles),) if frames else (),
+            tables=tables.frames(results) if frames else [],
+            plots=[plots.frames(frames, styles)] if frames else [],
         ),
         Section("averaging", "Weighted averaging", AVERAGING, tables=tables.averaging(results), plots=averages),
         Section("similarity", "Similarity and keyframes", SIMILARITY, tables=tables.keyframes(results), plots=similar),
-        Section("trust", "Is a calibration right?", TRUST, tables=(tables.detection(trusts),) if trusts else ()),
-        Section("cost", "Cost", COST, tables=(tables.cost(results),) if costs else ()),
-        Section("troubles", "What was refused or failed", TROUBLES, tables=tuple(tables.troubles(results))),
+        Section("trust", "Is a calibration right?", TRUST, tables=[tables.detection(results.trusts)] if results.trusts else []),
+        Section("cost", "Cost", COST, tables=[tables.cost(results)] if results.costs else []),
+        Section("troubles", "What was refused or failed", TROUBLES, tables=tables.troubles(results)),
     ]
     return [section for section in made if section.tables or section.plots]
 
@@ -124,5 +115,5 @@ def _loss_curves(results: Results, styles: Styles) -> Section:
         means = {name: plots.mean_curves(own) for name, own in curves_of_methods(results).items()}
         caption = f"Mean of the scaled curves of {len(scenes)} scenes, scaled to 0..1 again. Marks: peaks of the means."
         drawn.append(plots.loss_curves("curves_mean", "Mean of all scenes", caption, means, styles))
-    made = (tables.peaks(results), tables.basin(results)) if scenes else ()
-    return Section("curves", "Loss curves over six axes", CURVES, tables=made, plots=tuple(drawn))
+    made = [tables.peaks(results), tables.basin(results)] if scenes else []
+    return Section("curves", "Loss curves over six axes", CURVES, tables=made, plots=drawn)

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import binomtest, mannwhitneyu
 
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.methods.levinson import fitted, probability_right
-from calib_ros_evaluation.results import Results, Trial, Trust
+from calib_ros_evaluation.results import END, SUCCESS_DEG, SUCCESS_M, Results, Trust
 
 Matrix = NDArray[np.float64]
 OURS = "ours"  # name of this project's method
-Z_95 = 1.959964  # of the normal distribution, both sides
 FALSE_ALARMS = 0.05  # of detections by the share of worse neighbours
 RISE = 0.01  # of a curve's span; what falls less between two samples still counts as rising
 
 
 def wilson(successes: int, n: int) -> tuple[float, float]:
-    """95 % interval of a share, 0..1 (Wilson 1927); unlike the textbook's it stays within 0..1 and is right for few trials. NaN
-    without trials."""
-    if n == 0:
-        return math.nan, math.nan
-    p, z2 = successes / n, Z_95 * Z_95 / n
-    middle, half = p + z2 / 2, Z_95 * math.sqrt(p * (1 - p) / n + z2 / (4 * n))
-    return max((middle - half) / (1 + z2), 0.0), min((middle + half) / (1 + z2), 1.0)
+    """95 % interval of a share, 0..1; unlike the textbook's it stays within 0..1 and is right for few trials."""
+    found = binomtest(int(successes), int(n)).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def quantile(values: ArrayLike, share: float) -> float:
@@ -51,14 +49,9 @@ def mean(values: Iterable[float]) -> float:
     return float(np.mean(kept)) if kept else math.nan
 
 
-def errors(trials: Sequence[Trial]) -> tuple[Matrix, Matrix]:
-    """Rotation (n,) in deg and translation (n,) in cm at the end."""
-    return np.array([t.rotation_deg for t in trials], float), 100 * np.array([t.translation_m for t in trials], float)
-
-
-def axis_errors(trials: Sequence[Trial]) -> Matrix:
+def axis_errors(trials: pd.DataFrame) -> Matrix:
     """(n, 6) signed errors at the end, deg and cm; trials without a finite end are left out."""
-    ends = np.array([t.end for t in trials], float).reshape(-1, 6)
+    ends = trials[END].to_numpy(float)
     return np.asarray(ends[np.isfinite(ends).all(axis=1)] * ([1] * 3 + [100] * 3))
 
 
@@ -95,27 +88,24 @@ def _falling(y: Matrix, tolerance: float) -> int:
     return int(rises[0]) if len(rises) else len(y) - 1
 
 
-def area(right: ArrayLike, wrong: ArrayLike) -> float:
+def area(right: Matrix, wrong: Matrix) -> float:
     """Probability that a wrong one has the lower share, ties counted half."""
-    R, W = np.asarray(right, float), np.asarray(wrong, float)
-    return float(np.mean((R[:, None] > W) + 0.5 * (R[:, None] == W)))
+    return float(mannwhitneyu(right, wrong, method="asymptotic").statistic / (len(right) * len(wrong)))
 
 
-def hits(right: ArrayLike, wrong: ArrayLike) -> float:
+def hits(right: Matrix, wrong: Matrix) -> float:
     """Share of wrong ones below the threshold that FALSE_ALARMS of the right ones are below."""
-    R, W = np.asarray(right, float), np.asarray(wrong, float)
-    alarms = int(np.floor(FALSE_ALARMS * len(R)))
-    return float(np.mean(np.sort(R)[alarms] > W))
+    return float(np.mean(np.sort(right)[int(FALSE_ALARMS * len(right))] > wrong))
 
 
 def called_right(trusts: Sequence[Trust], size: tuple[float, float] | None) -> float:
     """Share of frames, at an error of this size (None = no error), that are classified as right; each by distributions fitted to
     all others. NaN for fewer than three frames."""
     if len(trusts) < 3:
-        return float("nan")
+        return math.nan
     said: list[bool] = []
     for k, own in enumerate(trusts):
-        others = [t for n, t in enumerate(trusts) if n != k]
+        others = [*trusts[:k], *trusts[k + 1 :]]
         R, W = fitted([t.right for t in others]), fitted([share for t in others for _, _, share in t.wrong])
         shares = [own.right] if size is None else [share for deg, m, share in own.wrong if (deg, m) == size]
         said += [probability_right([share], R, W) > 0.5 for share in shares]
@@ -130,27 +120,32 @@ def in_order(results: Results, found: Iterable[str]) -> list[str]:
 
 def all_methods(results: Results) -> list[str]:
     """Every method that has a title or a result."""
-    parts = (results.trials, results.curves, results.costs)
-    return in_order(results, [*results.titles, *(item.method for part in parts for item in part)])
+    others = (item.method for part in (results.curves, results.costs) for item in part)
+    return in_order(results, [*results.titles, *results.trials.method, *others])
 
 
-def trials_of(results: Results, experiment: str) -> dict[str, list[Trial]]:
+def trials_of(results: Results, experiment: str) -> dict[str, pd.DataFrame]:
     """Method -> its trials of an experiment; methods without any are left out."""
-    found: dict[str, list[Trial]] = {}
-    for trial in results.trials:
-        if trial.experiment == experiment:
-            found.setdefault(trial.method, []).append(trial)
-    return {name: found[name] for name in in_order(results, found)}
+    own = extended(results.trials[results.trials.experiment == experiment])
+    return {name: own[own.method == name] for name in in_order(results, own.method)}
 
 
-def accepted(trials: Sequence[Trial]) -> list[Trial]:
-    """Those whose end the method itself trusts."""
-    return [t for t in trials if t.status == "done"]
+def extended(trials: pd.DataFrame) -> pd.DataFrame:
+    """With size: (start_deg, start_m), n: number of frames, cm: translation_m in cm, start_success: the start is within the
+    limits of success already."""
+    near = (trials.start_rotation_deg < SUCCESS_DEG) & (trials.start_translation_m < SUCCESS_M)
+    n = trials.frames.map(lambda text: len(text.split()))
+    sizes = pd.Series(list(zip(trials.start_deg, trials.start_m, strict=True)), trials.index, object)
+    return trials.assign(size=sizes, n=n, cm=100 * trials.translation_m, start_success=near)
 
 
-def start_sizes(trials: Iterable[Trial]) -> list[tuple[float, float]]:
-    """The sizes of start errors, deg and m, ascending."""
-    return sorted({(t.start_deg, t.start_m) for t in trials})
+def groups(trials: dict[str, pd.DataFrame], key: str) -> tuple[list[Any], dict[str, dict[Any, pd.DataFrame]]]:
+    """The values of a column, numbers ascending, and for each method its trials by each of them, which may be none."""
+    values = list(dict.fromkeys(value for own in trials.values() for value in own[key]))
+    values = values if key == "scene" else sorted(values)
+    return values, {
+        name: {value: own[[own_value == value for own_value in own[key]]] for value in values} for name, own in trials.items()
+    }
 
 
 def curves_of_scenes(results: Results) -> dict[str, dict[str, Curves]]:
@@ -163,6 +158,5 @@ def curves_of_scenes(results: Results) -> dict[str, dict[str, Curves]]:
 
 def curves_of_methods(results: Results) -> dict[str, list[Curves]]:
     """Method -> curves of all its scenes."""
-    scenes = curves_of_scenes(results)
-    names = in_order(results, (name for own in scenes.values() for name in own))
-    return {name: [own[name] for own in scenes.values() if name in own] for name in names}
+    names = in_order(results, (one.method for one in results.curves))
+    return {name: [one.curves for one in results.curves if one.method == name] for name in names}

@@ -7,8 +7,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from calib_ros_evaluation.report.statistics import wilson
+
 NONE = "–"
 INFINITE = "∞"
+Rows = list[list[str]]
 
 
 @dataclass(frozen=True)
@@ -16,26 +19,28 @@ class Table:
     """rows: as many cells each as the header. notes: sentences below."""
 
     title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...] = ()
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    notes: Sequence[str] = ()
 
     def text(self) -> str:
         """For a terminal, in columns."""
-        lines = [self.header, *self.rows]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
-        left = [self.words(k) for k in range(len(widths))]
-        return "\n".join(
-            "  ".join(cell.ljust(w) if own else cell.rjust(w) for cell, w, own in zip(line, widths, left, strict=True)).rstrip()
-            for line in lines
-        )
+        columns = []
+        for k, cells in enumerate(zip(self.header, *self.rows, strict=True)):
+            width = max(map(len, cells))
+            columns.append([cell.ljust(width) if self.words(k) else cell.rjust(width) for cell in cells])
+        return "\n".join("  ".join(line).rstrip() for line in zip(*columns, strict=True))
 
     def words(self, column: int) -> bool:
         """Whether a column holds words, and so stands to the left."""
         return any(own[column][:1].isalpha() for own in self.rows)
 
-
-Rows = list[list[str]]
+    def markdown(self) -> str:
+        """A pipe table with its title above and its notes below."""
+        lines = [[escaped(cell) for cell in row] for row in (self.header, *self.rows)]
+        lines.insert(1, ["---"] * len(self.header))
+        piped = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        return "\n\n".join([f"### {escaped(self.title)}", piped, *map(escaped, self.notes)])
 
 
 def number(value: float, digits: int) -> str:
@@ -58,6 +63,12 @@ def percent(value: float, digits: int = 0) -> str:
     return _text(value, f"{100 * value:.{digits}f} %")
 
 
+def interval(successes: int, n: int) -> str:
+    """95 % interval of a share."""
+    low, high = wilson(successes, n)
+    return f"{100 * low:.0f} to {100 * high:.0f}"
+
+
 def figures(value: float) -> str:
     """Three significant figures, for what spans orders of magnitude."""
     if not math.isfinite(value) or value == 0:
@@ -66,9 +77,9 @@ def figures(value: float) -> str:
     return f"{value:.{digits}f}" if digits <= 6 else f"{value:.2e}"
 
 
-def table(title: str, header: Sequence[str], rows: Rows, notes: Sequence[str] = ()) -> Table:
-    """A table of such rows."""
-    return Table(title, tuple(header), tuple(map(tuple, rows)), tuple(notes))
+def plural(n: int, what: str = "frame") -> str:
+    """So many of them."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def _text(value: float, text: str) -> str:
@@ -77,17 +88,6 @@ def _text(value: float, text: str) -> str:
     return text if math.isfinite(value) else INFINITE
 
 
-def as_markdown(one: Table) -> str:
-    """A pipe table with its title above and its notes below."""
-    lines = [_line([escaped(cell) for cell in one.header]), _line(["---"] * len(one.header))]
-    lines += [_line([escaped(cell) for cell in row]) for row in one.rows]
-    return "\n\n".join([f"### {escaped(one.title)}", "\n".join(lines), *(escaped(note) for note in one.notes)])
-
-
 def escaped(text: str) -> str:
     """Text as it is, in one line."""
     return re.sub(r"([\\`*_\[\]<>|])", r"\\\1", " ".join(text.split()))
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"

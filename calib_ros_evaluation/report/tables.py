@@ -4,32 +4,42 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 
 import numpy as np
+import pandas as pd
 
+from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.report.statistics import (
-    accepted,
+    Matrix,
     all_methods,
     area,
     axis_errors,
     basins,
     called_right,
     curves_of_methods,
-    errors,
+    groups,
     hits,
     mean,
     median,
     peak_distances,
     quantile,
-    start_sizes,
     trials_of,
-    wilson,
 )
-from calib_ros_evaluation.report.table import NONE, Rows, Table, centimetres, degrees, figures, number, percent, table
-from calib_ros_evaluation.results import SET, SUCCESS_DEG, SUCCESS_M, THESIS_THRESHOLD, Results, Trial, Trust
+from calib_ros_evaluation.report.table import (
+    NONE,
+    Rows,
+    Table,
+    centimetres,
+    degrees,
+    figures,
+    interval,
+    number,
+    percent,
+    plural,
+)
+from calib_ros_evaluation.results import SET, SUCCESS_DEG, SUCCESS_M, THESIS_THRESHOLD, Results, Trust
 
 AXIS_HEADER = ("r_x deg", "r_y deg", "r_z deg", "t_x cm", "t_y cm", "t_z cm")
 # Table 4.4 of the thesis, rad and m, as printed.
@@ -58,25 +68,14 @@ def summary(results: Results) -> Table:
     trials, curves = trials_of(results, "single"), curves_of_methods(results)
     rows: Rows = []
     for name in all_methods(results):
-        own = trials.get(name, [])
-        rotation, translation = errors(own)
-        n = len(own) or math.nan
+        own = trials.get(name, results.trials.iloc[:0].assign(cm=0.0))
         peaks = np.array([peak_distances(c) for c in curves.get(name, [])]).reshape(-1, 6)
-        if own or len(peaks):
-            rows.append(
-                [
-                    name,
-                    percent(sum(t.success for t in own) / n),
-                    degrees(median(rotation)),
-                    centimetres(median(translation)),
-                    percent(sum(t.status == "refused" for t in own) / n),
-                    figures(median([t.cpu_s + t.features_cpu_s for t in own])),
-                    degrees(mean(peaks[:, :3].ravel())),
-                    centimetres(mean(peaks[:, 3:].ravel())),
-                ]
-            )
+        if len(own) or len(peaks):
+            trial_cells = [percent(own.success.mean()), degrees(median(own.rotation_deg)), centimetres(median(own.cm))]
+            trial_cells += [percent((own.status == "refused").mean()), figures(median(own.cpu_s + own.features_cpu_s))]
+            rows.append([name, *trial_cells, degrees(mean(peaks[:, :3].ravel())), centimetres(mean(peaks[:, 3:].ravel()))])
     header = ("success", "rotation, median deg", "translation, median cm", "refused", "CPU s", "peaks off, deg", "peaks off, cm")
-    return table("All methods", ["method", *header], rows, SUMMARY_NOTES)
+    return Table("All methods", ["method", *header], rows, SUMMARY_NOTES)
 
 
 def axis_cells(values: Iterable[float]) -> list[str]:
@@ -89,7 +88,8 @@ def axes(results: Results) -> Table:
     scale = np.array([np.rad2deg(1)] * 3 + [100] * 3)
     rows: Rows = [[PRINTED_NAME, name, "100", *axis_cells(scale * values)] for name, values in PRINTED.items()]
     for name, own in trials_of(results, "single").items():
-        kinds = {name: own} | ({f"{name}, accepted": accepted(own)} if len(accepted(own)) < len(own) else {})
+        done = own[own.status == "done"]
+        kinds = {name: own} | ({f"{name}, accepted": done} if len(done) < len(own) else {})
         for label, kind in kinds.items():
             E = axis_errors(kind)
             some = E if len(E) else np.full((1, 6), np.nan)
@@ -101,7 +101,7 @@ def axes(results: Results) -> Table:
         "Mean and median have signs, so errors of both signs cancel out; the mean of sizes does not. A refused or failed trial "
         'ends where it began; "accepted" leaves it out.',
     )
-    return table("Errors per axis", ["method", "statistic", "trials", *AXIS_HEADER], rows, notes)
+    return Table("Errors per axis", ["method", "statistic", "trials", *AXIS_HEADER], rows, notes)
 
 
 def single(results: Results) -> Table:
@@ -109,79 +109,68 @@ def single(results: Results) -> Table:
     header = ("method", "trials", "success", "95 % interval", "rotation median deg", "90 %", "translation median cm", "90 %")
     rows: Rows = []
     for name, own in trials_of(results, "single").items():
-        trusted = accepted(own)
-        wrong = sum(not t.success for t in trusted)
-        shares = [sum(t.status == status for t in own) / len(own) for status in ("refused", "failed")]
-        rows.append([name, *_quality(own), *(percent(s) for s in shares), percent(wrong / len(own))])
-        if 0 < len(trusted) < len(own):
-            rows.append([f"{name}, accepted", *_quality(trusted), "", "", percent(wrong / len(trusted))])
+        done = own[own.status == "done"]
+        wrong = int((done.success == 0).sum())
+        shares = [percent((own.status == status).mean()) for status in ("refused", "failed")]
+        rows.append([name, *_quality(own), *shares, percent(wrong / len(own))])
+        if 0 < len(done) < len(own):
+            rows.append([f"{name}, accepted", *_quality(done), "", "", percent(wrong / len(done))])
     notes = (
         f"Success: nearer than {SUCCESS_DEG:g} deg and {100 * SUCCESS_M:g} cm to the reference. Accepted but wrong: the method "
         f"trusts its end, and is not that near; the worst that can happen.",
         'Rows "accepted" leave refused and failed trials out: a method that refuses chooses its trials.',
     )
-    return table("Success and errors", [*header, "refused", "failed", "accepted but wrong"], rows, notes)
+    return Table("Success and errors", [*header, "refused", "failed", "accepted but wrong"], rows, notes)
 
 
-def scenes(results: Results) -> Table | None:
-    """Success per scene; None if there is one only."""
-    trials = trials_of(results, "single")
-    labels = list(dict.fromkeys(t.scene for own in trials.values() for t in own))
-    if len(labels) < 2:
-        return None
-    rows: Rows = [[name, *(_success([t for t in own if t.scene == label]) for label in labels)] for name, own in trials.items()]
-    return table("Success per scene", ["method", *labels], rows, [SHARES])
+def scenes(results: Results) -> list[Table]:
+    """Success per scene; none if there is one only."""
+    labels, by_scene = groups(trials_of(results, "single"), "scene")
+    rows = [[name, *map(_success, own.values())] for name, own in by_scene.items()]
+    return [Table("Success per scene", ["method", *labels], rows, [SHARES])] if len(labels) > 1 else []
 
 
 def starts(results: Results) -> Table:
     """Success against the size of the start error, of which there are trials."""
-    trials = trials_of(results, "starts")
-    sizes = start_sizes(t for own in trials.values() for t in own)
-    rows: Rows = [
-        [name, *(_success([t for t in own if (t.start_deg, t.start_m) == s]) for s in sizes)] for name, own in trials.items()
-    ]
-    one = next(iter(trials.values()))  # all methods have the same starts
-    near = [[t.start_success for t in one if (t.start_deg, t.start_m) == s] for s in sizes]
-    rows.append(["doing nothing", *(percent(sum(x) / len(x)) if x else NONE for x in near)])
-    counts = Counter((t.method, t.start_deg, t.start_m) for own in trials.values() for t in own)
+    sizes, by_size = groups(trials_of(results, "starts"), "size")
+    rows = [[name, *map(_success, own.values())] for name, own in by_size.items()]
+    near = [own.start_success.mean() for own in next(iter(by_size.values())).values()]  # all methods have the same starts
+    rows.append(["doing nothing", *map(percent, near)])
     notes = (
-        f"{SHARES} Trials per cell: {_range(counts.values())}.",
+        f"{SHARES} Trials per cell: {_counts(by_size)}.",
         '"Doing nothing": the share of starts that are near enough already.',
     )
     header = ["method", *(f"±{deg:g} deg, ±{100 * m:g} cm" for deg, m in sizes)]
-    return table("Success by size of the start error", header, rows, notes)
+    return Table("Success by size of the start error", header, rows, notes)
 
 
 def frames(results: Results) -> list[Table]:
     """Errors and success against the number of frames."""
     quartiles = "Median, and quartiles in brackets, over all trials."
-    kinds: dict[str, tuple[str, Callable[[Sequence[Trial]], str]]] = {
-        "Rotation error by number of frames, deg": (quartiles, lambda own: _spread(errors(own)[0], degrees)),
-        "Translation error by number of frames, cm": (quartiles, lambda own: _spread(errors(own)[1], centimetres)),
+    kinds: dict[str, tuple[str, Callable[[pd.DataFrame], str]]] = {
+        "Rotation error by number of frames, deg": (quartiles, lambda own: _spread(own.rotation_deg, degrees)),
+        "Translation error by number of frames, cm": (quartiles, lambda own: _spread(own.cm, centimetres)),
         "Success by number of frames": (SHARES, _success),
     }
-    trials = trials_of(results, "frames")
-    numbers = sorted({len(t.frames) for own in trials.values() for t in own})
-    counts = _range(Counter((t.method, len(t.frames)) for own in trials.values() for t in own).values())
-    header = ["method", *(f"{n} frame{'s' if n > 1 else ''}" for n in numbers)]
+    numbers, by_number = groups(trials_of(results, "frames"), "n")
+    header = ["method", *map(plural, numbers)]
     out = []
     for title, (note, cell) in kinds.items():
-        rows: Rows = [[name, *(cell([t for t in own if len(t.frames) == n]) for n in numbers)] for name, own in trials.items()]
-        out.append(table(title, header, rows, [f"{note} Trials per cell: {counts}."]))
+        rows = [[name, *map(cell, own.values())] for name, own in by_number.items()]
+        out.append(Table(title, header, rows, [f"{note} Trials per cell: {_counts(by_number)}."]))
     return out
 
 
 def troubles(results: Results) -> list[Table]:
     """Why trials were refused or failed, and which other work failed."""
-    wrong = [t for t in results.trials if t.status != "done"]
+    wrong = results.trials[results.trials.status != "done"]
     # Reasons that differ in their figures only count as one; the first of them is shown.
-    kinds_of = [(t.experiment, t.method, t.status, NUMBER.sub("#", t.reason)) for t in wrong]
-    first = dict(zip(reversed(kinds_of), (t.reason for t in reversed(wrong)), strict=True))
-    counted: Rows = [[str(n), *kind[:3], first[kind]] for kind, n in Counter(kinds_of).most_common()]
-    failures: Rows = [list(failure) for failure in results.failures]
+    kind = [wrong.experiment, wrong.method, wrong.status, wrong.reason.map(lambda text: NUMBER.sub("#", text))]
+    found = [(len(own), *own.iloc[0][["experiment", "method", "status", "reason"]]) for _, own in wrong.groupby(kind, sort=False)]
+    counted = [[str(n), *said] for n, *said in sorted(found, key=lambda own: -own[0])]
     kinds = {
         "Trials refused or failed": (("trials", "experiment", "method", "status", "reason"), counted),
-        "Other work that failed": (("what", "why"), failures),
+        "Other work that failed": (("what", "why"), results.failures),
     }
     out = []
     for title, (header, rows) in kinds.items():
@@ -189,74 +178,62 @@ def troubles(results: Results) -> list[Table]:
         notes = ["Of reasons that differ in their figures only, one is shown."] if rows is counted else []
         notes += [f"{left} more are not shown."] if left > 0 else []
         if rows:
-            out.append(table(title, header, rows[:MOST_REASONS], notes))
+            out.append(Table(title, header, rows[:MOST_REASONS], notes))
     return out
 
 
-def _quality(own: Sequence[Trial]) -> list[str]:
+def _quality(own: pd.DataFrame) -> list[str]:
     """Cells of single() from the number of trials to the errors."""
-    good = sum(t.success for t in own)
-    low, high = wilson(good, len(own))
-    r, t = errors(own)
-    return [
-        str(len(own)),
-        percent(good / len(own)),
-        f"{100 * low:.0f} to {100 * high:.0f} %",
-        *(degrees(quantile(r, share)) for share in (0.5, 0.9)),
-        *(centimetres(quantile(t, share)) for share in (0.5, 0.9)),
-    ]
+    errors = [degrees(quantile(own.rotation_deg, share)) for share in (0.5, 0.9)]
+    errors += [centimetres(quantile(own.cm, share)) for share in (0.5, 0.9)]
+    return [str(len(own)), percent(own.success.mean()), f"{interval(own.success.sum(), len(own))} %", *errors]
 
 
-def _success(own: Sequence[Trial]) -> str:
-    if not own:
-        return NONE
-    good = sum(t.success for t in own)
-    low, high = wilson(good, len(own))
-    return f"{percent(good / len(own))} ({100 * low:.0f} to {100 * high:.0f})"
+def _success(own: pd.DataFrame) -> str:
+    return f"{percent(own.success.mean())} ({interval(own.success.sum(), len(own))})" if len(own) else NONE
 
 
-def _spread(values: np.ndarray, form: Callable[[float], str]) -> str:
-    middle = median(values)
-    if math.isnan(middle):
-        return NONE
-    return f"{form(middle)} ({form(quantile(values, 0.25))} to {form(quantile(values, 0.75))})"
+def _spread(values: pd.Series, form: Callable[[float], str]) -> str:
+    low, middle, high = (quantile(values, share) for share in (0.25, 0.5, 0.75))
+    return NONE if math.isnan(middle) else f"{form(middle)} ({form(low)} to {form(high)})"
 
 
-def _range(counts: Iterable[int]) -> str:
-    low, high = min(counts := list(counts)), max(counts)
-    return str(low) if low == high else f"{low} to {high}"
+def _counts(grouped: dict[str, dict[object, pd.DataFrame]]) -> str:
+    """How many trials a cell has."""
+    counts = [len(own) for groups in grouped.values() for own in groups.values() if len(own)]
+    return " to ".join(map(str, sorted({min(counts), max(counts)})))
+
+
+def _of_curves(results: Results, measure: Callable[[Curves], Matrix], statistics: Sequence[str]) -> tuple[list[str], Rows]:
+    """Header, and rows of a measure per axis (6,) over the curves of each method."""
+    rows: Rows = []
+    for name, own in curves_of_methods(results).items():
+        columns = np.array([measure(curves) for curves in own]).T
+        cells = {"mean": map(mean, columns), "median": (median(column[np.isfinite(column)]) for column in columns)}
+        rows += [[name, statistic, str(len(own)), *axis_cells(cells[statistic])] for statistic in statistics]
+    return ["method", "statistic", "scenes", *AXIS_HEADER], rows
 
 
 def peaks(results: Results) -> Table:
     """How far the loss curves' peaks lie from the reference."""
-    rows: Rows = []
-    for name, own in curves_of_methods(results).items():
-        D = np.array([peak_distances(curves) for curves in own])
-        rows.append([name, "mean", str(len(own)), *axis_cells(mean(column) for column in D.T)])
-        rows.append([name, "median", str(len(own)), *axis_cells(median(column[np.isfinite(column)]) for column in D.T)])
-    header = ["method", "statistic", "scenes", *AXIS_HEADER]
     notes = ["Distance of each curve's peak from the reference, without sign."]
-    return table("How far the peaks lie from the reference", header, rows, notes)
+    title = "How far the peaks lie from the reference"
+    return Table(title, *_of_curves(results, peak_distances, ("mean", "median")), notes)
 
 
 def basin(results: Results) -> Table:
     """From how far away each curve rises towards its peak."""
-    rows: Rows = []
-    for name, own in curves_of_methods(results).items():
-        B = np.array([basins(curves) for curves in own])
-        rows.append([name, "mean", str(len(own)), *axis_cells(mean(column) for column in B.T)])
-    reach = [curves.offsets.max(axis=1) for own in curves_of_methods(results).values() for curves in own]
+    reach = [one.curves.offsets.max(axis=1) for one in results.curves]
     notes = [
         "Mean distance from the reference, over both sides and all scenes, up to which a curve rises towards its peak, where "
         "steps back of 1 % of its span do not count. A peak beyond the reference leaves that side 0.",
         f"The curves reach {max(r[0] for r in reach):g} deg and {max(r[3] for r in reach):g} cm to either side: more cannot "
         f"stand here.",
     ]
-    header = ["method", "statistic", "scenes", *AXIS_HEADER]
-    return table("From how far away the curves rise", header, rows, notes)
+    return Table("From how far away the curves rise", *_of_curves(results, basins, ("mean",)), notes)
 
 
-def averaging(results: Results) -> tuple[Table, ...]:
+def averaging(results: Results) -> list[Table]:
     """How far the peaks of single frames and of their averages lie from the reference."""
     rows: Rows = []
     for one in results.averagings:
@@ -268,10 +245,10 @@ def averaging(results: Results) -> tuple[Table, ...]:
             rows.append([one.scene, one.method, name, *axis_cells(map(mean, np.transpose([peak_distances(c) for c in found])))])
     notes = [f"Mean distance of the peaks from the reference, without sign, over frames and over all sets of {SET} of them."]
     header = ["scene", "method", "curves", *AXIS_HEADER]
-    return (table("How far the peaks of averages lie from the reference", header, rows, notes),) if rows else ()
+    return [Table("How far the peaks of averages lie from the reference", header, rows, notes)] if rows else []
 
 
-def keyframes(results: Results) -> tuple[Table, ...]:
+def keyframes(results: Results) -> list[Table]:
     """Which frames algorithm 6 selects, by threshold."""
     rows: Rows = []
     for one in results.similarities:
@@ -279,47 +256,42 @@ def keyframes(results: Results) -> tuple[Table, ...]:
             which = "frames " + ", ".join(str(one.frames[k]) for k in own)
             rows.append([one.scene, f"{threshold:g}", f"{len(own)} of {len(one.frames)}", which])
     notes = [f"The thesis's threshold is {THESIS_THRESHOLD:g}; the node uses the configured one, and limits of time besides."]
-    return (table("Keyframes of algorithm 6", ["scene", "threshold", "keyframes", "which"], rows, notes),) if rows else ()
+    return [Table("Keyframes of algorithm 6", ["scene", "threshold", "keyframes", "which"], rows, notes)] if rows else []
 
 
 def cost(results: Results) -> Table:
     """CPU time and memory of a method; the whole estimate from the trials."""
     single = trials_of(results, "single")
     rows: Rows = []
-    for one in results.costs:
-        own = single.get(one.method, [])
-        values = one.features_ms_per_frame, one.evaluation_ms, one.memory_mb
-        whole = [t.cpu_s + t.features_cpu_s for t in own], [float(t.evaluations) for t in own]
-        rows.append([one.method, str(one.frames), *map(figures, values), *(figures(median(v)) for v in whole)])
+    for method, count, *values in results.costs:
+        own = single.get(method, results.trials.iloc[:0])
+        whole = median(own.cpu_s + own.features_cpu_s), median(own.evaluations)
+        rows.append([method, str(count), *map(figures, (*values, *whole))])
     header = ["method", "frames", "features ms per frame", "evaluation ms", "memory MB", "CPU s of an estimate", "evaluations"]
     notes = [
         "CPU time of one core. Features are made once per frame, an evaluation is one value of the score over so many frames; "
         "memory is the most that arrays took meanwhile.",
         'CPU s and evaluations of an estimate: medians of the experiment "single", features included.',
     ]
-    return table("Cost", header, rows, notes)
+    return Table("Cost", header, rows, notes)
 
 
 def detection(trusts: Sequence[Trust]) -> Table:
     """For each size of error: how well F_C of one frame, and its mean over several, separate it from no error."""
     right = np.array([t.right for t in trusts])
     sizes = list(dict.fromkeys((deg, m) for t in trusts for deg, m, _ in t.wrong))
-    rows: Rows = []
+    rows: Rows = [["none", number(float(right.mean()), 3), *["–"] * 4, percent(called_right(trusts, None))]]
     for deg, m in sizes:
         wrong = np.array([[share for d, x, share in t.wrong if (d, x) == (deg, m)] for t in trusts])
-        one = area(right, wrong.ravel()), hits(right, wrong.ravel())
         rng = np.random.default_rng(0)
         sets = [rng.choice(len(trusts), min(TOGETHER, len(trusts)), replace=False) for _ in range(DRAWS)]
         ways = rng.integers(wrong.shape[1], size=DRAWS)
         of_right = np.array([right[s].mean() for s in sets])
         of_wrong = np.array([wrong[s, way].mean() for s, way in zip(sets, ways, strict=True)])
-        several = area(of_right, of_wrong), hits(of_right, of_wrong)
-        size = f"{deg:g} deg" if deg else f"{100 * m:g} cm"
-        cells = [size, number(float(wrong.mean()), 3)]
-        cells += [f(x) for x, f in zip((*one, *several), (_auc, percent, _auc, percent), strict=True)]
+        cells = [f"{deg:g} deg" if deg else f"{100 * m:g} cm", number(float(wrong.mean()), 3)]
+        for pair in ((right, wrong.ravel()), (of_right, of_wrong)):
+            cells += [number(area(*pair), 2), percent(hits(*pair))]
         rows.append([*cells, percent(called_right(trusts, (deg, m)))])
-    never = percent(called_right(trusts, None))
-    rows.insert(0, ["none", number(float(right.mean()), 3), *["–"] * 4, never])
     title = f"Detection by the share of worse neighbours, {len(trusts)} frames"
     header = ["error", "mean F_C", "AUC, 1 frame", "hits", f"AUC, {TOGETHER} frames", "hits", "called right"]
     notes = [
@@ -329,8 +301,4 @@ def detection(trusts: Sequence[Trust]) -> Table:
         "Called right: share of frames whose probability to be right exceeds one half, both distributions learned from all other "
         "frames and all errors together.",
     ]
-    return table(title, header, rows, notes)
-
-
-def _auc(value: float) -> str:
-    return number(value, 2)
+    return Table(title, header, rows, notes)

@@ -21,7 +21,7 @@ from calib_ros.overlay import BAR, put, text_width
 from calib_ros.registration.classes import OF_CLASSES, OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.rendering import COLORS, empty_figure, six_axes
+from calib_ros_evaluation.rendering import COLORS, above, draw_curves, empty_figure, pixels
 from calib_ros_semantics.class_pictures import BACKGROUND, sizes
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures, semantic_share
@@ -264,8 +264,7 @@ def busiest(interest: NDArray[np.float32], height: int, width: int) -> tuple[sli
 
 
 def _picture(figure: Any) -> Image:
-    figure.canvas.draw()
-    return np.ascontiguousarray(np.asarray(figure.canvas.buffer_rgba(), np.uint8)[:, :, 2::-1])
+    return np.ascontiguousarray(pixels(figure)[:, :, 2::-1])
 
 
 def histograms(images: Mapping[str, Image]) -> Image:
@@ -298,16 +297,9 @@ def class_histogram(pixels: Mapping[str, int], main: Collection[str]) -> Image:
 
 def loss_curves(all_curves: Mapping[str, Curves]) -> Image:
     """Name -> curves over the six axes, each from 0 to 1, with a dot at its peak."""
-    figure = empty_figure(13, 6.6)
-    lines: list[Any] = []
-    for axis, axes in enumerate(six_axes(figure)):
-        for k, (label, curves) in enumerate(all_curves.items()):
-            style: Sequence[str] = ("--", "-", "-")
-            (line,) = axes.plot(
-                curves.offsets[axis], curves.scaled()[axis], style[k], color=COLORS[k], linewidth=1.8, label=label
-            )
-            axes.plot(curves.peaks[axis], 1, "o", color=COLORS[k], markersize=7 - k)
-            if axis == 0:
-                lines.append(line)
-    figure.legend(handles=lines, loc="outside upper center", ncols=len(lines), frameon=False, fontsize=11)
+    figure, curves = empty_figure(13, 6.6), []
+    for k, ((label, found), dash, color) in enumerate(zip(all_curves.items(), ("--", "-", "-"), COLORS, strict=False)):
+        line = {"linestyle": dash, "color": color, "linewidth": 1.8, "label": label}
+        curves.append((found, line, {"marker": "o", "color": color, "markersize": 7 - k}))
+    above(figure, draw_curves(figure, curves), len(curves))
     return _picture(figure)

@@ -188,7 +188,8 @@ class Consensus:
         """Gradient (6,) and Gauss-Newton scale (6, 6), every object kept with its best pair."""
         ratio, off, precision = self._ratio(T[None])
         _, rates = self._evidence(ratio)
-        best = self._best(ratio[0])
+        order = np.lexsort((-ratio[0], self.of_image))
+        best = order[np.unique(self.of_image[order], return_index=True)[1]]  # pair of every image's object
         ratio, rate = ratio[0, best], rates[0, self.cls[best]]
         weight = rate * ratio / (1 - rate + rate * ratio)
         p = self.point[best] @ T[:3, :3].T + T[:3, 3]
@@ -207,11 +208,6 @@ class Consensus:
         """How many objects of the images meet one of the cloud at T (4, 4)."""
         _, off, _ = self._ratio(T[None])
         return len(np.unique(self.of_image[(np.abs(np.stack(off)[:, 0]) < 2 * self.core + 1).all(axis=0)]))
-
-    def _best(self, ratio: Matrix) -> NDArray[np.intp]:
-        """The best pair (m,) of every image's object."""
-        order = np.lexsort((-ratio, self.of_image))
-        return np.asarray(order[np.unique(self.of_image[order], return_index=True)[1]])
 
     @cached_property
     def _axes(self) -> tuple[Matrix, Matrix]:

@@ -1,4 +1,4 @@
-"""The image that a segmentation network takes, and its output: which one holds classes, in which layout, and reading it."""
+"""The output of a segmentation network: which output holds classes, in which layout, and reading it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import ModelError
 from calib_ros.frame import SemanticClass
 from calib_ros_semantics.models.labels import Classes, Names, resized, table_of
-from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, Tensor
+from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel
 
 Size = tuple[int, int]
 MAX_STRIDE = 64  # pixels of the input per cell of the output; 32 is the deepest stride in use
@@ -111,33 +111,6 @@ class ClassOutput:
     def meaning(self) -> Classes:
         """SemanticClass (count,) of each score."""
         return self._table.classes(np.arange(self.count or 0))
-
-
-class InputImage(NamedTuple):
-    """The input of a network that takes an image: its tensor, axis of the channels, and their number."""
-
-    tensor: Tensor
-    axis: int
-    channels: int
-
-    @staticmethod
-    def of(tensors: Sequence[Tensor], counts: Sequence[int]) -> InputImage | None:
-        """The only one of the tensors that takes one image of so many channels, first or last; None if there is no such one."""
-        found = []
-        for tensor in tensors:
-            shape, first = tensor.shape, len(tensor.shape) - 3
-            if not shape:  # unknown rank: the usual layout
-                found.append(InputImage(tensor, 1, counts[0]))
-            elif len(shape) == 3 or (len(shape) == 4 and shape[0] in (None, 1)):
-                axis = next((axis for axis in (first, len(shape) - 1) if shape[axis] in counts), first)
-                if shape[axis] in (*counts, None):
-                    found.append(InputImage(tensor, axis, shape[axis] or counts[0]))
-        return found[0] if len(found) == 1 else None
-
-    def arranged(self, image: NDArray[Any]) -> Array:
-        """An image (h, w, channels) as the network takes it."""
-        batch = image if len(self.tensor.shape) == 3 else image[None]
-        return np.ascontiguousarray(np.moveaxis(batch, -1, self.axis), self.tensor.dtype)
 
 
 class ClassMapLayout(NamedTuple):

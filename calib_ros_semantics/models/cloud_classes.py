@@ -14,9 +14,9 @@ from calib_ros.frame import UNLABELLED, Frame, PointCloud
 from calib_ros.lidar.range_image import reflectivity
 from calib_ros.lidar.rings import azimuth_step, ring_of_points
 from calib_ros_semantics.models import labels
-from calib_ros_semantics.models.class_output import ClassOutput, InputImage
+from calib_ros_semantics.models.class_output import ClassOutput
 from calib_ros_semantics.models.labels import SQUEEZESEG, Classes
-from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, SegmentationModel, Tensor
+from calib_ros_semantics.models.onnx_model import Array, Deadline, InputImage, OnnxModel, SegmentationModel, Tensor
 
 Statistics = Mapping[str, tuple[float, float]]  # mean and standard deviation of each channel
 CONVENTIONS = (
@@ -135,8 +135,9 @@ class CloudNetwork(SegmentationModel):
         """Inputs by name, their range image, and notes on what does not fit, for a cloud of finite points."""
         turn = self.model.sidecar.azimuth_deg
         distance = np.linalg.norm(cloud.xyz, axis=1)
+        azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
         elevation = np.arctan2(cloud.xyz[:, 2], np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1]))
-        density = _columns_per_turn(cloud, elevation)
+        density = 2 * np.pi / azimuth_step(ring_of_points(cloud, azimuth, elevation), azimuth)  # measurements of a ring per turn
         columns = self._columns or _nearest_width(density * turn / 360)
         light = reflectivity(cloud.intensity)
         notes = self._notes(columns * 360 / turn, density, elevation, light is not None)
@@ -186,12 +187,6 @@ def _is_mask(tensor: Tensor) -> bool:
 
 def _nearest_width(columns: float) -> int:
     return min(WIDTHS, key=lambda width: abs(np.log(width / columns)))
-
-
-def _columns_per_turn(cloud: PointCloud, elevation: NDArray[np.floating]) -> float:
-    """Measurements of a ring per revolution, estimated from the points."""
-    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
-    return 2 * np.pi / azimuth_step(ring_of_points(cloud, azimuth, elevation), azimuth)
 
 
 def _family(model: OnnxModel, classes: int | None, has_mask: bool) -> str:

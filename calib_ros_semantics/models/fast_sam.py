@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.frame import Frame
 from calib_ros_semantics.models.masks import NMS_IOU, Mask, MaskModel, found_mask, sample_logits, without_duplicates
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel
-from calib_ros_semantics.models.segment_anything import DEFAULT_SIDE, declared_family, to_rgb
+from calib_ros_semantics.models.onnx_model import Array, Deadline, InputImage, Normalisation, OnnxModel, to_rgb
+from calib_ros_semantics.models.segment_anything import DEFAULT_SIDE, declared_family
 
 Floats = NDArray[np.float32]
 BORDER_GREY = 114.0  # grey level around the letterboxed image
@@ -31,18 +31,20 @@ class FastSam(MaskModel):
 
     def __init__(self, model: OnnxModel) -> None:
         self.model, self.fallback = model, model.fallback
-        shapes = [t.shape for t in model.inputs]
+        found = InputImage.of(model.inputs, (3,))
         detections, maps = ([t.name for t in model.outputs if len(t.shape) == rank] for rank in (3, 4))
-        if len(shapes) != 1 or len(shapes[0]) != 4 or not detections or not maps:
+        if found is None or len(model.inputs) != 1 or not detections or not maps:
             raise model.error("this is no FastSAM, which takes pictures 1x3xHxW and gives detections 1xCxN, prototypes 1xPxhxw")
         declared = model.sidecar.output
         if declared and declared not in detections:
             raise model.error(f"'{declared}', which 'output:' of the YAML beside it names, is no output with detections 1xCxN")
-        if _says_nms(model.metadata):
+        told = [model.metadata.get(key, "").lower() == "true" for key in ("nms", "end2end")]
+        if any(told) or re.search(r"'nms':\s*True", model.metadata.get("args", "")):
             raise model.error(NMS_INSIDE)
         self._outputs = [declared or detections[0], *maps]
         self._normalised = Normalisation.of(model, Normalisation(1 / 255))
-        self._size = model.sidecar.size or (shapes[0][2] or DEFAULT_SIDE, shapes[0][3] or DEFAULT_SIDE)
+        height, width = model.size_of(found.tensor, found.axis)
+        self._input, self._size = found, (height or DEFAULT_SIDE, width or DEFAULT_SIDE)
 
     def describe(self) -> str:
         height, width = self._size
@@ -51,7 +53,7 @@ class FastSam(MaskModel):
     def masks(self, frame: Frame, deadline: Deadline) -> list[Mask]:
         size = frame.image.shape[0], frame.image.shape[1]
         tensor, factor, corner = self._letterboxed(frame.image)
-        found, *maps = (array[0] for array in self.model.run({self.model.inputs[0].name: tensor}, deadline, self._outputs))
+        found, *maps = (array[0] for array in self.model.run({self._input.tensor.name: tensor}, deadline, self._outputs))
         prototypes = self._prototypes(found, maps)
         boxes, score, coefficients = self._detections(found.astype(np.float32), len(prototypes))
         boxes -= np.tile(corner, 2)
@@ -67,7 +69,7 @@ class FastSam(MaskModel):
             masks += found_mask(sampled > 0, size, place, float(score[k]))
         return without_duplicates(masks, NMS_IOU)
 
-    def _letterboxed(self, image: NDArray[np.uint8]) -> tuple[Floats, Floats, Floats]:
+    def _letterboxed(self, image: NDArray[np.uint8]) -> tuple[Array, Floats, Floats]:
         """The input (1, 3, H, W), and the place of the image in it: scale (2,) and corner (2,), x and y."""
         size = image.shape[:2]
         factor = min(self._size[0] / size[0], self._size[1] / size[1])
@@ -76,7 +78,7 @@ class FastSam(MaskModel):
         picture = np.full((*self._size, 3), BORDER_GREY, np.float32)
         picture[top : top + height, left : left + width] = to_rgb(image, (height, width), self.model.sidecar.channels == "bgr")
         scale = np.array([width / size[1], height / size[0]], np.float32)
-        return self._normalised(picture).transpose(2, 0, 1)[None], scale, np.array([left, top], np.float32)
+        return self._input.arranged(self._normalised(picture)), scale, np.array([left, top], np.float32)
 
     def _prototypes(self, found: Array, maps: Sequence[Array]) -> Floats:
         """Prototypes (p, h, w) among the maps: the last for which the detections have enough coefficients."""
@@ -117,9 +119,3 @@ def _suppress_boxes(boxes: Floats, score: Floats) -> list[int]:
         common = np.clip(high - low, 0, None).prod(axis=1)
         left = left[common <= MAX_BOX_IOU * (area[left] + area[best] - common)]
     return kept
-
-
-def _says_nms(metadata: Mapping[str, str]) -> bool:
-    """Whether the metadata declares NMS or an end-to-end head: keys nms, end2end, or within args."""
-    keys = (metadata.get(key, "").lower() == "true" for key in ("nms", "end2end"))
-    return any(keys) or re.search(r"'nms':\s*True", metadata.get("args", "")) is not None

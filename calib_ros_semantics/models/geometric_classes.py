@@ -147,7 +147,13 @@ def heights(xyz: Floats, seed: int = 0) -> Floats | None:
         return None
     flat = np.asarray(xyz @ _levelling_rotation(plane).T.astype(np.float32), np.float32)
     flat[:, 2] -= np.float32(plane.offset)
-    flat[:, 2] -= _ground_at(_ground(flat), flat)
+    ground = _ground(flat)  # bilinear between the centres of its cells
+    place = np.clip((flat[:, :2] + GROUND_REACH) / GROUND_CELL - 0.5, 0, len(ground) - 1.001)
+    column, row = np.floor(place).astype(np.intp).T
+    u, v = (place - np.floor(place)).T
+    upper = (1 - u) * ground[row, column] + u * ground[row, column + 1]
+    lower = (1 - u) * ground[row + 1, column] + u * ground[row + 1, column + 1]
+    flat[:, 2] -= np.asarray((1 - v) * upper + v * lower, np.float32)
     return flat
 
 
@@ -178,13 +184,3 @@ def _ground(flat: Floats) -> Floats:
         total = cv2.GaussianBlur(weight, (0, 0), reach / GROUND_CELL) + np.float32(PRIOR_WEIGHT)
         ground += cv2.GaussianBlur(residual * weight, (0, 0), reach / GROUND_CELL) / total
     return ground
-
-
-def _ground_at(ground: Floats, flat: Floats) -> Floats:
-    """The ground at points (n, 3), bilinear between the centres of the cells -> (n,)."""
-    place = np.clip((flat[:, :2] + GROUND_REACH) / GROUND_CELL - 0.5, 0, len(ground) - 1.001)
-    column, row = np.floor(place).astype(np.intp).T
-    u, v = (place - np.floor(place)).T
-    upper = (1 - u) * ground[row, column] + u * ground[row, column + 1]
-    lower = (1 - u) * ground[row + 1, column] + u * ground[row + 1, column + 1]
-    return np.asarray((1 - v) * upper + v * lower, np.float32)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +9,17 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.frame import Frame
 from calib_ros_semantics.models import labels
 from calib_ros_semantics.models.class_borders import PixelClasses, borders_of_classes, borders_of_scores
-from calib_ros_semantics.models.class_output import ClassOutput, InputImage
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, SegmentationModel, fitted
+from calib_ros_semantics.models.class_output import ClassOutput
+from calib_ros_semantics.models.onnx_model import (
+    Array,
+    Deadline,
+    InputImage,
+    Normalisation,
+    OnnxModel,
+    SegmentationModel,
+    fitted,
+    to_rgb,
+)
 from calib_ros_semantics.models.tiles import Tiling
 
 # Exports by the name that a YAML may give as 'family:' (lower case) and as shown.
@@ -26,7 +32,6 @@ CONVENTIONS = (
 )
 # Of RGB: nearly all networks of streets start from weights trained on it.
 IMAGENET = Normalisation(1 / 255, (0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
-GREY_IMAGENET = replace(IMAGENET, mean=(float(np.mean(IMAGENET.mean)),), std=(float(np.mean(IMAGENET.std)),))
 SIZE_MULTIPLE = 32  # px; deepest stride in use: other sizes do not fit together where a network adds its levels
 MAX_SIDE = 1024  # px; networks of streets are trained on crops of 1024, and twice that takes four times as long
 # Of the input: 19 scores for each pixel, as they are inside a network that gives class numbers, take 0.6 GB.
@@ -42,7 +47,7 @@ class ImageNetwork(SegmentationModel):
         family = model.sidecar.family
         if family and family.lower() not in FAMILIES:
             raise model.error(f"family '{family}' is unknown; known are {', '.join(FAMILIES)}")
-        found = InputImage.of(model.inputs, (3, 1))
+        found = InputImage.of(model.inputs, (3,))
         if found is None or len(model.inputs) != 1:
             raise model.error("a network for classes of pixels takes one picture as 1x3xHxW or 1xHxWx3")
         self._input, self._size = found, model.size_of(found.tensor, found.axis)
@@ -53,8 +58,7 @@ class ImageNetwork(SegmentationModel):
                 "million pixels are taken, such as 2048x4096: export it for a smaller size"
             )
         self._swap, self._as_it_is = model.sidecar.channels != "bgr", np.issubdtype(found.tensor.dtype, np.integer)
-        usual = Normalisation(1.0) if self._as_it_is else IMAGENET if found.channels == 3 else GREY_IMAGENET
-        self._normalised = Normalisation.of(model, usual, found.channels)
+        self._normalised = Normalisation.of(model, Normalisation(1.0) if self._as_it_is else IMAGENET)
         example = self.feed(np.zeros((*EXAMPLE_SIZE, 3), np.uint8)), self.size(*EXAMPLE_SIZE)
         self._output = ClassOutput(model, example, labels.OF_IMAGES, labels.NUMBERS_OF_IMAGES, CONVENTIONS)
 
@@ -86,7 +90,7 @@ class ImageNetwork(SegmentationModel):
         family = "PIDNet with auxiliary heads" if self._output.is_pidnet else "segmentation network"
         family = FAMILIES.get(self.model.sidecar.family.lower(), family)
         height, width = ("?" if n is None else n for n in self._size)
-        order = "grey" if self._input.channels == 1 else "RGB" if self._swap else "BGR"
+        order = "RGB" if self._swap else "BGR"
         free = f" (at most {MAX_SIDE} wide)" if None in self._size else " (pictures of another shape in tiles)"
         given = f"{width}x{height} {order}{free}, fed as {self._normalised.text}"
         return f"{family}: {given} -> {self._output.text}, on {self.model.provider}"
@@ -104,14 +108,8 @@ class ImageNetwork(SegmentationModel):
 
     def feed(self, image: NDArray[np.uint8]) -> dict[str, Array]:
         """The input by its name for an image (H, W) or (H, W, 3) BGR."""
-        channels, dtype = self._input.channels, self._input.tensor.dtype
-        if channels == 1 and image.ndim == 3:
-            image = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-        elif channels == 3 and image.ndim == 2:
-            image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-        size = self.size(*image.shape[:2])
-        picture = fitted(image, size).reshape(*size, channels)
-        values: Array = self._normalised((picture[..., ::-1] if self._swap else picture).astype(np.float32))
+        dtype = self._input.tensor.dtype
+        values: Array = self._normalised(to_rgb(image, self.size(*image.shape[:2]), bgr=not self._swap))
         if self._as_it_is:
             values = np.clip(np.rint(values), np.iinfo(dtype).min, np.iinfo(dtype).max)
         return {self._input.tensor.name: self._input.arranged(values)}

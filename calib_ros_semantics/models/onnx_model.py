@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -116,6 +116,33 @@ class Tensor:
         return f"{self.name} {np.dtype(self.dtype).name} {sizes}"
 
 
+class InputImage(NamedTuple):
+    """The input of a network that takes an image: its tensor, axis of the channels, and their number."""
+
+    tensor: Tensor
+    axis: int
+    channels: int
+
+    @staticmethod
+    def of(tensors: Sequence[Tensor], counts: Sequence[int]) -> InputImage | None:
+        """The only one of the tensors that takes one image of so many channels, first or last; None if there is no such one."""
+        found = []
+        for tensor in tensors:
+            shape, first = tensor.shape, len(tensor.shape) - 3
+            if not shape:  # unknown rank: the usual layout
+                found.append(InputImage(tensor, 1, counts[0]))
+            elif len(shape) == 3 or (len(shape) == 4 and shape[0] in (None, 1)):
+                axis = next((axis for axis in (first, len(shape) - 1) if shape[axis] in counts), first)
+                if shape[axis] in (*counts, None):
+                    found.append(InputImage(tensor, axis, shape[axis] or counts[0]))
+        return found[0] if len(found) == 1 else None
+
+    def arranged(self, image: NDArray[Any]) -> Array:
+        """An image (h, w, channels) as the network takes it."""
+        batch = image if len(self.tensor.shape) == 3 else image[None]
+        return np.ascontiguousarray(np.moveaxis(batch, -1, self.axis), self.tensor.dtype)
+
+
 @dataclass(frozen=True)
 class Normalisation:
     """(pixels * scale - mean) / std of grey levels 0..255. mean, std: one number, or one per channel. declared: by a YAML."""
@@ -126,14 +153,14 @@ class Normalisation:
     declared: bool = False
 
     @staticmethod
-    def of(model: OnnxModel, usual: Normalisation, channels: int = 3) -> Normalisation:
+    def of(model: OnnxModel, usual: Normalisation) -> Normalisation:
         """The normalisation of the YAML beside a model, else the usual one of RGB. ModelError if its numbers do not fit."""
         own = model.sidecar
         if not isinstance(own.channels, str):
             raise model.error("'channels:' of the YAML beside it must be rgb or bgr")
         for name, values in (("mean", own.mean), ("std", own.std)):
-            if len(values) not in (0, 1, channels):
-                raise model.error(f"'{name}:' of the YAML beside it must have 1 or {channels} numbers")
+            if len(values) not in (0, 1, 3):
+                raise model.error(f"'{name}:' of the YAML beside it must have 1 or 3 numbers")
         mean, std, scale = own.mean or (0.0,), own.std or (1.0,), own.scale
         if scale is None:
             if not own.mean and not own.std:
@@ -166,6 +193,12 @@ def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]
     shrinks = size[0] <= image.shape[0] and size[1] <= image.shape[1]
     how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, size[::-1], interpolation=how), np.uint8)
+
+
+def to_rgb(image: NDArray[np.uint8], size: tuple[int, int], bgr: bool = False) -> NDArray[np.float32]:
+    """Image (H, W) or (H, W, 3) BGR -> (h, w, 3) float32 RGB or BGR, 0..255, at another size."""
+    colour = fitted(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8) if image.ndim == 2 else image, size)
+    return np.asarray(colour if bgr else colour[:, :, ::-1], np.float32)
 
 
 class Deadline:

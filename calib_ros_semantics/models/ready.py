@@ -74,10 +74,7 @@ class ReadyClasses(SegmentationModel):
         path = folder / f"{frame.name}{self._suffix}"
         if not frame.name or Path(frame.name).name != frame.name:
             raise ModelError(f"frame name '{frame.name}' is no plain file name: {self._files} in {folder} are found by it")
-        try:
-            data = np.fromfile(path, np.uint8)
-        except OSError as error:
-            raise ModelError(f"{self._files[:-1]} {path} cannot be read ({error.strerror}); each frame needs one") from None
+        data = _data(path, self._files[:-1])
         numbers = _of_picture(path, data, frame) if self._kind == IMAGE else _of_scan(path, data, frame)
         try:
             classes = self._table.classes(numbers.astype(np.int32))
@@ -86,10 +83,21 @@ class ReadyClasses(SegmentationModel):
         return classes if self._kind == CLOUD else resized(classes, (frame.image.shape[0], frame.image.shape[1]))
 
 
+def _data(path: Path, what: str) -> NDArray[np.uint8]:
+    try:
+        return np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise ModelError(f"{what} {path} cannot be read ({error.strerror}); each frame needs one") from None
+
+
+def _pixels(path: Path, decoded: NDArray[Any] | None, what: str) -> NDArray[Any]:
+    if decoded is None:
+        raise ModelError(f"{what} {path} is not a complete PNG; make it again")
+    return decoded
+
+
 def _of_picture(path: Path, data: NDArray[np.uint8], frame: Frame) -> NDArray[Any]:
-    numbers, (height, width) = _numbers(data), frame.image.shape[:2]
-    if numbers is None:
-        raise ModelError(f"label picture {path} is not a complete PNG; make it again")
+    numbers, (height, width) = _pixels(path, _numbers(data), "label picture"), frame.image.shape[:2]
     if numbers.ndim != 2:
         raise ModelError(f"label picture {path} has colours; it must hold class numbers, as grey levels or with a palette")
     if abs(numbers.shape[1] * height / (numbers.shape[0] * width) - 1) > SAME_SHAPE:
@@ -149,24 +157,14 @@ class MaskFolder(MaskModel):
         if not paths:
             found_by = "as calib-ros replay prints it (the number of a KITTI frame, 000042)"
             raise ModelError(f"masks: there is no {own}/*.png; a frame's folder has its name, {found_by}")
-        masks = []
+        size, masks = (frame.image.shape[0], frame.image.shape[1]), []
         for path in paths:
             deadline.check()
-            masks += _read_mask(path, (frame.image.shape[0], frame.image.shape[1]))
+            picture = _pixels(path, decode_picture(_data(path, "mask")), "mask")
+            picture = picture[:, :, :3].max(axis=2) if picture.ndim == 3 else picture
+            if picture.shape != size:
+                sizes = f"{picture.shape[1]}x{picture.shape[0]}, but the image is {size[1]}x{size[0]}"
+                raise ModelError(f"mask {path} is {sizes}; make the masks of the image as recorded")
+            mask = Mask.of(picture > picture.max() // 2)  # masks may be of 0 and 1 or of 0 and 255
+            masks += [] if mask is None else found_mask(mask.inside, size, (mask.left, mask.top))
         return masks
-
-
-def _read_mask(path: Path, size: tuple[int, int]) -> list[Mask]:
-    try:
-        picture = decode_picture(np.fromfile(path, np.uint8))
-    except OSError as error:
-        raise ModelError(f"mask {path} cannot be read: {error.strerror}") from None
-    if picture is None:
-        raise ModelError(f"mask {path} is not a complete PNG; write it again")
-    if picture.ndim == 3:
-        picture = picture[:, :, :3].max(axis=2)
-    if picture.shape != size:
-        sizes = f"{picture.shape[1]}x{picture.shape[0]}, but the image is {size[1]}x{size[0]}"
-        raise ModelError(f"mask {path} is {sizes}; make the masks of the image as recorded")
-    mask = Mask.of(picture > picture.max() // 2)  # masks may be of 0 and 1 or of 0 and 255
-    return [] if mask is None else found_mask(mask.inside, size, (mask.left, mask.top))

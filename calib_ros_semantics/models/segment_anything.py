@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from calib_ros_semantics.models.masks import (
     accepted_masks,
     without_duplicates,
 )
-from calib_ros_semantics.models.onnx_model import Array, Deadline, Normalisation, OnnxModel, Tensor, fitted
+from calib_ros_semantics.models.onnx_model import Array, Deadline, InputImage, Normalisation, OnnxModel, Tensor, to_rgb
 
 Points = NDArray[np.float64]
 DEFAULT_SIDE = 1024  # px; size the models were trained at, and the default of graphs of dynamic size
@@ -70,59 +69,6 @@ class Embedded(NamedTuple):
     frame: tuple[float, float]
     content: tuple[float, float]
     own_pixels: bool
-
-
-class Encoder:
-    """An ONNX graph from an image to an embedding. Raises ModelError if its tensors are not those of an encoder."""
-
-    def __init__(self, model: OnnxModel, efficient: bool) -> None:
-        """efficient: whether the decoder is that of EfficientSAM."""
-        self.model = model
-        features = sum(len(t.shape) == 4 for t in model.outputs)
-        if len(model.inputs) != 1 or not _is_picture(model.inputs[0]) or not features:
-            raise model.error("this is no encoder, which takes a picture and gives an embedding")
-        self.input = model.inputs[0]
-        self._channels_last = self.input.shape[-1] == 3 and self.input.shape[-3] != 3
-        self.family = declared_family(model)
-        if self.family and self.family not in FAMILIES:
-            raise model.error(f"family '{self.family}' in its YAML is unknown; known are {', '.join(FAMILIES)}, fastsam")
-        if not self.family:
-            self.family = "samexporter" if self._channels_last or np.issubdtype(self.input.dtype, np.integer) else "sam"
-            if efficient or self.input.name.startswith("batched"):
-                self.family = "efficientsam"
-            elif features >= 3:
-                self.family = "sam2"
-        usual, self._padded, self._own_pixels = FAMILIES[self.family]
-        self.normalised = Normalisation.of(model, usual)
-
-    def __call__(self, image: NDArray[np.uint8], deadline: Deadline) -> Embedded:
-        """Embedding of an image (H, W) or (H, W, 3) BGR uint8 of any size. Raises ModelError, BudgetError."""
-        height, width = image.shape[:2]
-        size = self._input_size(height, width)
-        inner = _scaled((height, width), min(size[0] / height, size[1] / width)) if self._padded else size
-        whole = np.zeros((*size, 3), np.float32)
-        whole[: inner[0], : inner[1]] = self.normalised(to_rgb(image, inner, self.model.sidecar.channels == "bgr"))
-        tensor = whole if self._channels_last else whole.transpose(2, 0, 1)
-        outputs = self.model.run({self.input.name: tensor if len(self.input.shape) == 3 else tensor[None]}, deadline)
-        features = dict(zip((t.name for t in self.model.outputs), outputs, strict=True))
-        coarsest = min((a.shape[-2:] for a in outputs if a.ndim == 4), key=lambda s: s[0] * s[1])
-        frame = float(CELL_PX * coarsest[0]), float(CELL_PX * coarsest[1])
-        factor = max(frame) / max(size)
-        content = (inner[0] * factor, inner[1] * factor) if self._padded else frame
-        return Embedded(features, (height, width), frame, content, self._own_pixels)
-
-    def _input_size(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width of the input for an image of this size."""
-        if self.model.sidecar.size:
-            return self.model.sidecar.size
-        rows, columns = self.input.shape[-3:-1] if self._channels_last else self.input.shape[-2:]
-        if rows and columns:
-            return rows, columns
-        if self._own_pixels:
-            return height, width
-        if self._channels_last:  # the graph pads by itself
-            return _scaled((height, width), DEFAULT_SIDE / max(height, width))
-        return rows or DEFAULT_SIDE, columns or DEFAULT_SIDE
 
 
 class Decoder:
@@ -221,31 +167,73 @@ class Decoder:
 
 
 class SegmentAnything(MaskModel):
-    """Encoder and decoder, prompted on a grid over the image. ModelError if the two do not fit each other."""
+    """Encoder, a graph from an image to an embedding, and decoder, prompted on a grid over the image. ModelError if the encoder is
+    none, or the two do not fit each other."""
 
     needed = f"a predicted IoU of {MIN_IOU:g} and a stability of {MIN_STABILITY:g}"
 
     def __init__(self, encoder: OnnxModel, decoder: OnnxModel, along: int) -> None:
         """along: prompts along the longer side of the image."""
-        self.along = along
+        self.model, self.along = encoder, along
         self.fallback = "; ".join(model.fallback for model in (encoder, decoder) if model.fallback)
         self.decoder = Decoder(decoder, encoder)
-        self.encoder = Encoder(encoder, self.decoder.is_efficient)
+        features = sum(len(t.shape) == 4 for t in encoder.outputs)
+        found = InputImage.of(encoder.inputs, (3,))
+        if found is None or len(encoder.inputs) != 1 or not features:
+            raise encoder.error("this is no encoder, which takes a picture and gives an embedding")
+        self._input, self._size = found, encoder.size_of(found.tensor, found.axis)
+        self._channels_last = found.axis == len(found.tensor.shape) - 1
+        self.family = declared_family(encoder)
+        if self.family and self.family not in FAMILIES:
+            raise encoder.error(f"family '{self.family}' in its YAML is unknown; known are {', '.join(FAMILIES)}, fastsam")
+        if not self.family:
+            self.family = "samexporter" if self._channels_last or np.issubdtype(found.tensor.dtype, np.integer) else "sam"
+            if self.decoder.is_efficient or found.tensor.name.startswith("batched"):
+                self.family = "efficientsam"
+            elif features >= 3:
+                self.family = "sam2"
+        usual, self._padded, self._own_pixels = FAMILIES[self.family]
+        self._normalised = Normalisation.of(encoder, usual)
 
     def describe(self) -> str:
-        encoder, decoder = self.encoder.model, self.decoder.model
+        decoder = self.decoder.model
         return (
-            f"Segment Anything ({self.encoder.family}), {self.along} prompts along the longer side, {self.decoder.batch} in a "
-            f"run, fed as {self.encoder.normalised.text}, on {decoder.provider}; encoder: {encoder.tensors}; decoder: "
-            f"{decoder.tensors}"
+            f"Segment Anything ({self.family}), {self.along} prompts along the longer side, {self.decoder.batch} in a run, fed "
+            f"as {self._normalised.text}, on {decoder.provider}; encoder: {self.model.tensors}; decoder: {decoder.tensors}"
         )
 
     def masks(self, frame: Frame, deadline: Deadline) -> list[Mask]:
         """Of everything in the frame's image."""
-        embedded, decoder = self.encoder(frame.image, deadline), self.decoder
+        embedded, decoder = self.embedded(frame.image, deadline), self.decoder
         return everything(
             lambda points: decoder(embedded, points, deadline), embedded.size, lambda: decoder.batch, self.along, deadline
         )
+
+    def embedded(self, image: NDArray[np.uint8], deadline: Deadline) -> Embedded:
+        """Embedding of an image (H, W) or (H, W, 3) BGR uint8 of any size. Raises ModelError, BudgetError."""
+        height, width = image.shape[:2]
+        size = self._input_size(height, width)
+        inner = _scaled((height, width), min(size[0] / height, size[1] / width)) if self._padded else size
+        whole = np.zeros((*size, 3), np.float32)
+        whole[: inner[0], : inner[1]] = self._normalised(to_rgb(image, inner, self.model.sidecar.channels == "bgr"))
+        outputs = self.model.run({self._input.tensor.name: self._input.arranged(whole)}, deadline)
+        features = dict(zip((t.name for t in self.model.outputs), outputs, strict=True))
+        coarsest = min((a.shape[-2:] for a in outputs if a.ndim == 4), key=lambda s: s[0] * s[1])
+        frame = float(CELL_PX * coarsest[0]), float(CELL_PX * coarsest[1])
+        factor = max(frame) / max(size)
+        content = (inner[0] * factor, inner[1] * factor) if self._padded else frame
+        return Embedded(features, (height, width), frame, content, self._own_pixels)
+
+    def _input_size(self, height: int, width: int) -> tuple[int, int]:
+        """Height and width of the input for an image of this size."""
+        rows, columns = self._size
+        if rows and columns:
+            return rows, columns
+        if self._own_pixels:
+            return height, width
+        if self._channels_last:  # the graph pads by itself
+            return _scaled((height, width), DEFAULT_SIDE / max(height, width))
+        return rows or DEFAULT_SIDE, columns or DEFAULT_SIDE
 
 
 def everything(
@@ -344,12 +332,6 @@ def _mismatch(decoder: OnnxModel, encoder: OnnxModel, problem: str) -> ModelErro
     )
 
 
-def to_rgb(image: NDArray[np.uint8], size: tuple[int, int], bgr: bool = False) -> NDArray[np.float32]:
-    """Image (H, W) or (H, W, 3) BGR -> (h, w, 3) float32 RGB or BGR, 0..255, at another size."""
-    colour = fitted(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8) if image.ndim == 2 else image, size)
-    return np.asarray(colour if bgr else colour[:, :, ::-1], np.float32)
-
-
 def declared_family(model: OnnxModel) -> str:
     """The family in the YAML beside a model, lower case, without underscores and hyphens; empty if it is not given."""
     return model.sidecar.family.lower().replace("_", "").replace("-", "")
@@ -358,12 +340,6 @@ def declared_family(model: OnnxModel) -> str:
 def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
     height, width = (max(int(n * factor + 0.5), 1) for n in size)
     return height, width
-
-
-def _is_picture(tensor: Tensor) -> bool:
-    shape = tensor.shape
-    channels = shape[-3::2] if len(shape) in (3, 4) else ()  # first or last after the batch
-    return 3 in channels or (len(shape) == 4 and shape[1] is None)
 
 
 def _coarse(size: tuple[float, float]) -> tuple[int, int]:

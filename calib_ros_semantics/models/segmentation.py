@@ -178,7 +178,13 @@ class SegmentationModels:
                 answer = model(frame, deadline, borders)
         except Exception as error:  # whatever a user's model does with an image, the calibration continues
             if not cancelled():
-                problems.append(self._record_failure(slot, frame, error))
+                slot.failures += 1
+                advice = ADVICE[slot.kind] if isinstance(error, BudgetError) else ""
+                line = f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {error_line(error)}{advice}"
+                if slot.failures == MAX_FAILURES:
+                    slot.off = line
+                    line += f"; off from now on after {MAX_FAILURES} failures in a row"
+                problems.append(line)
             return None
         slot.failures = 0
         # No evidence, but no failure either: a covered lens has no ground, and is not covered for ever.
@@ -188,15 +194,6 @@ class SegmentationModels:
                 problems.append(f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {text}{after}")
         slot.remarks = doubt, little
         return None if doubt else answer
-
-    def _record_failure(self, slot: ModelSlot, frame: Frame, error: Exception) -> str:
-        slot.failures += 1
-        advice = ADVICE[slot.kind] if isinstance(error, BudgetError) else ""
-        line = f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {error_line(error)}{advice}"
-        if slot.failures < MAX_FAILURES:
-            return line
-        slot.off = line
-        return f"{line}; off from now on after {MAX_FAILURES} failures in a row"
 
     def _loaded(self, slot: ModelSlot) -> SegmentationModel:
         if slot.model is None:

@@ -61,14 +61,12 @@ class Tiling(NamedTuple):
         Where tiles overlap, the one counts more in which a pixel lies farther from the border.
         """
         whole, shape = self._merged_sizes()
-        merged = np.zeros((len(tiles[0]), *whole), np.float32)
+        merged, weight = np.zeros((len(tiles[0]), *whole), np.float32), _towards_middle(shape)
         total = np.full(whole, SMALLEST, np.float32)
-        weight = _towards_middle(shape)
-        for corner, own in zip(self.corners, tiles, strict=True):
+        for (place, part), own in zip(self._overlaps(whole, shape), tiles, strict=True):
             planes = np.stack([_resized(np.asarray(plane, np.float32), shape) for plane in own])
             if not is_softmax(planes):
                 softmax(planes)
-            place, part = self._overlap(corner, whole, shape)
             for sums, plane in zip(merged, planes, strict=True):
                 sums[place] += plane[part] * weight[part]
             total[place] += weight[part]
@@ -79,12 +77,10 @@ class Tiling(NamedTuple):
         """Class numbers (h, w) of the whole picture from those (rows, columns) of its tiles: of the tile in which a pixel lies
         farthest from the border."""
         whole, shape = self._merged_sizes()
-        merged = np.zeros(whole, tiles[0].dtype)
+        merged, weight = np.zeros(whole, tiles[0].dtype), _towards_middle(shape)
         best = np.zeros(whole, np.float32)
-        weight = _towards_middle(shape)
-        for corner, own in zip(self.corners, tiles, strict=True):
+        for (place, part), own in zip(self._overlaps(whole, shape), tiles, strict=True):
             rows, columns = ((np.arange(n) * m) // n for n, m in zip(shape, own.shape, strict=True))
-            place, part = self._overlap(corner, whole, shape)
             better = weight[part] > best[place]
             merged[place][better] = own[np.ix_(rows, columns)][part][better]
             best[place] = np.maximum(best[place], weight[part])
@@ -99,14 +95,13 @@ class Tiling(NamedTuple):
     def _share(self) -> float:
         return min(1.0, MAX_MERGED / max(self.size))
 
-    def _overlap(self, corner: tuple[int, int], whole: Size, shape: Size) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Rows and columns of the picture that a tile covers, and the same in the tile, in cells."""
-        place, part = [], []
-        for start, end, own in zip((round(n * self._share) for n in corner), whole, shape, strict=True):
-            first, last = max(start, 0), min(start + own, end)
-            place.append(slice(first, last))
-            part.append(slice(first - start, last - start))
-        return (place[0], place[1]), (part[0], part[1])
+    def _overlaps(self, whole: Size, shape: Size) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
+        """Rows and columns of the picture that each tile covers, and the same in the tile, in cells."""
+        for corner in self.corners:
+            starts = [round(n * self._share) for n in corner]
+            ends = [(max(start, 0), min(start + own, end)) for start, end, own in zip(starts, whole, shape, strict=True)]
+            part = tuple(slice(first - start, last - start) for (first, last), start in zip(ends, starts, strict=True))
+            yield tuple(slice(*both) for both in ends), part
 
 
 def is_softmax(scores: NDArray[np.generic]) -> bool:
@@ -132,9 +127,11 @@ def _starts(whole: int, part: int) -> list[int]:
 
 
 def _resized(plane: Floats, size: Size) -> Floats:
-    if plane.shape == size:
-        return plane
-    return np.asarray(cv2.resize(np.ascontiguousarray(plane), size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+    return (
+        plane
+        if plane.shape == size
+        else np.asarray(cv2.resize(np.ascontiguousarray(plane), size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+    )
 
 
 def _towards_middle(size: Size) -> Floats:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+from trial_rows import row, table
 
 from calib_ros import se3
 from calib_ros.cli import main
@@ -16,27 +19,28 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.csv_files import read_trials
+from calib_ros_evaluation.experiments.answers import read_answers, run_jobs, trial_of
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, SourceSummary
-from calib_ros_evaluation.protocols.definitions import BORER, NAMES, PROTOCOLS, SINGLE_FRAME, UNICALIB, Size
+from calib_ros_evaluation.protocols.definitions import BORER, NAMES, PROTOCOLS, SINGLE_FRAME, UNICALIB, Protocol, Size
 from calib_ros_evaluation.protocols.detection import (
     COLUMNS,
     INCONCLUSIVE,
     RIGHT,
     WRONG,
-    Decision,
-    Perturbed,
-    decisions,
+    Detection,
+    accuracy_table,
     detection_jobs,
-    read_table,
-    run_checks,
+    displacement,
+    kind_of,
+    read_perturbations,
+    sets_table,
 )
-from calib_ros_evaluation.protocols.evaluate import collected, drawn, run_trials, trial_jobs
-from calib_ros_evaluation.protocols.published import rows_of
-from calib_ros_evaluation.protocols.tables import accuracy_table, sets_table, size_table, trial_section
-from calib_ros_evaluation.results import Trial
+from calib_ros_evaluation.protocols.trials import Calibrations, drawn, size_table
+from calib_ros_evaluation.results import trials_table
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
+SETUP = Setup((SourceSpec("drive", DRIVE),), Config())
 
 
 def summary(frames: int, *groups: tuple[int, ...]) -> SourceSummary:
@@ -44,19 +48,19 @@ def summary(frames: int, *groups: tuple[int, ...]) -> SourceSummary:
     return SourceSummary("drive", whole, groups or (whole,), tuple("0" for _ in whole))
 
 
-def ended(deg: float, m: float, status: str = "done", count: int = 1, size: Size = SINGLE_FRAME.sizes[0]) -> Trial:
-    """A trial that ended so far off."""
-    zero = (0.0,) * 6
-    start = (size.deg, size.m, 0, status, "", deg, m, 8.0, 0.2)
-    return Trial("projfusion", "ours", "drive", tuple(range(count)), *start, zero, zero, 0.0, 0.0, 0.0, 1, 1.0, 1.0)
+def ended(protocol: Protocol, *ends: tuple[float, float], size: Size | None = None, **changes: Any) -> pd.DataFrame:
+    """Trials that ended so far off."""
+    deg, m = size or protocol.sizes[0]
+    known = {"experiment": protocol.name, "start_deg": deg, "start_m": m} | changes
+    rows = [row(**known | {"rotation_deg": r, "translation_m": t}) for r, t in ends]
+    return table(*rows, limit_deg=protocol.limit_deg, limit_m=protocol.limit_m)
 
 
 # --- starts and frames
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda own: own.name)
-def test_starts_are_left_perturbations_within_the_size(protocol: object) -> None:
-    assert protocol in (SINGLE_FRAME, BORER, UNICALIB)
+def test_starts_are_left_perturbations_within_the_size(protocol: Protocol) -> None:
     T = se3.from_parts(se3.rotation_from_euler(0.3, -0.2, 1.0), [0.1, -0.4, 0.3])
     for size in protocol.sizes:
         xs = []
@@ -84,7 +88,7 @@ def test_frames_are_drawn_of_all_alike_and_of_one_calibration() -> None:
 
 def test_trials_are_those_of_their_seed() -> None:
     def jobs(trials: int, seed: int) -> list[str]:
-        return [one.key for one in trial_jobs(UNICALIB, [summary(6)], (1, 3), trials, seed)]
+        return [one.key for one in Calibrations(UNICALIB, (1, 3), trials, seed).jobs(SETUP, [summary(6)])]
 
     assert jobs(4, 0) == jobs(4, 0)
     assert set(jobs(2, 0)) < set(jobs(4, 0))  # more trials go on
@@ -96,33 +100,29 @@ def test_trials_are_those_of_their_seed() -> None:
 
 
 def test_success_is_below_both_limits() -> None:
-    assert SINGLE_FRAME.succeeded(ended(1.99, 0.0499))
-    assert not SINGLE_FRAME.succeeded(ended(2.0, 0.01))
-    assert not SINGLE_FRAME.succeeded(ended(0.1, 0.05))
-    assert BORER.succeeded(ended(0.49, 0.199))
-    assert not BORER.succeeded(ended(0.5, 0.01))
-    assert not BORER.succeeded(ended(0.1, 0.2))
+    assert ended(SINGLE_FRAME, (1.99, 0.0499), (2.0, 0.01), (0.1, 0.05)).success.tolist() == [1, 0, 0]
+    assert ended(BORER, (0.49, 0.199), (0.5, 0.01), (0.1, 0.2)).success.tolist() == [1, 0, 0]
+    assert ended(BORER, (0.1, 0.01), status="refused").success.tolist() == [0]
 
 
 def test_table_shows_refused_and_wrong_beside_success() -> None:
-    trials = [ended(0.2, 0.01), ended(0.4, 0.03), ended(3.0, 0.02), ended(8.0, 0.2, "refused"), ended(1.0, 0.01, count=3)]
-    table = size_table(SINGLE_FRAME, SINGLE_FRAME.sizes[0], trials)
-    first, second = (dict(zip(table.header[:8], row, strict=False)) for row in table.rows[-2:])
+    parts = ended(SINGLE_FRAME, (0.2, 0.01), (0.4, 0.03), (3.0, 0.02)), ended(SINGLE_FRAME, (8.0, 0.2), status="refused")
+    trials = pd.concat([*parts, ended(SINGLE_FRAME, (1.0, 0.01), frames="0 1 2")])
+    found = size_table(SINGLE_FRAME, SINGLE_FRAME.sizes[0], trials)
+    first, second = (dict(zip(found.header[:8], row, strict=False)) for row in found.rows[-2:])
     assert (first["trials"], first["success"], first["refused"], first["wrong"]) == ("4", "50.0 %", "1", "1")
     assert first["95 %"] == "15 to 85 %"  # Wilson
-    assert table.rows[-2][8:] == ("1.200", "2.00", "2.900", "6.50")  # of the accepted; of all, the refused at its start
+    assert found.rows[-2][8:] == ["1.200", "2.00", "2.900", "6.50"]  # of the accepted; of all, the refused at its start
     assert (second["frames"], second["trials"], second["success"]) == ("3", "1", "100.0 %")
 
 
 def test_published_rows_stand_beside_ours() -> None:
-    section = trial_section(SINGLE_FRAME, [ended(0.2, 0.01, size=size) for size in SINGLE_FRAME.sizes])
-    assert len(section.tables) == 3
-    table = next(one for one in section.tables if one.title == "From 10 deg, 25 cm")
-    shares = {(row[0], row[1]): row[4] for row in table.rows}
+    cases = [(own, size) for own in PROTOCOLS.values() for size in own.sizes]
+    found = {(own.name, size): size_table(own, size, ended(own, (0.2, 0.01), size=size)) for own, size in cases}
+    assert all(len(one.rows) > 1 for one in found.values())
+    shares = {(row[0], row[1]): row[4] for row in found["projfusion", Size(10, 0.25)].rows}
     assert shares["NativeCross (learned)", "KITTI"] == "92.6 %"
     assert shares["DirectCalib (classical)", "nuScenes"] == "0.2 %"
-    assert "arXiv:2603.29414" in " ".join(section.tables[-1].notes)
-    assert all(rows_of(own.name, size) for own in PROTOCOLS.values() for size in own.sizes)
 
 
 # --- detection
@@ -135,64 +135,60 @@ def table_file(folder: Path, *rows: str) -> Path:
 
 
 def test_rotations_of_the_table_are_doubled() -> None:
-    D = Perturbed("neg", "000000", (0.1, -0.2, 0.3), (0.0, 3.0, 4.0)).D
+    D = displacement(dict(zip(COLUMNS[2:], (0.1, -0.2, 0.3, 0.0, 3.0, 4.0), strict=True)))
     assert se3.rotation_error_deg(np.eye(4), D) == pytest.approx(10.0)
     assert D[:3, 3].tolist() == [0.1, -0.2, 0.3]
     assert np.rad2deg(se3.log(D)[:3]) == pytest.approx([0, 6, 8])
 
 
-def test_decisions_are_right_wrong_or_inconclusive() -> None:
-    def kind(name: str, verdict: CheckVerdict) -> str:
-        return Decision(name, "0", 1, 0.0, 0.0, verdict, "", 1.0).kind
-
-    assert [kind("pos", v) for v in CheckVerdict] == [RIGHT, WRONG, INCONCLUSIVE]
-    assert [kind("rot_hard", v) for v in CheckVerdict] == [WRONG, RIGHT, INCONCLUSIVE]
-
-
 def test_inconclusive_decisions_are_not_right() -> None:
-    said = [
-        *(("pos", CheckVerdict.PASS), ("pos", CheckVerdict.FAIL)),
-        *(("rot_hard", CheckVerdict.FAIL), ("rot_hard", CheckVerdict.INCONCLUSIVE)),
-    ]
-    found = [Decision(name, "0", 1, 0.0, 0.0, verdict, "", 1.0) for name, verdict in said]
-    assert sets_table(found, [1]).rows == (("pos", "2", "1, 1, 0"), ("rot_hard", "2", "1, 0, 1"), ("all", "4", "2, 1, 1"))
-    assert "99.97 %" in accuracy_table(found, [1]).rows[0]  # as published
-    row = accuracy_table(found, [1]).rows[-1]
-    assert (row[3], row[5], row[6], row[7]) == ("50.0 %", "50.0 %", "–", "1 of 2")
+    assert [kind_of("pos", v) for v in CheckVerdict] == [RIGHT, WRONG, INCONCLUSIVE]
+    assert [kind_of("rot_hard", v) for v in CheckVerdict] == [WRONG, RIGHT, INCONCLUSIVE]
+    said = [("pos", RIGHT), ("pos", WRONG), ("rot_hard", RIGHT), ("rot_hard", INCONCLUSIVE)]
+    found = pd.DataFrame(said, columns=["set", "kind"]).assign(frames=1)
+    assert sets_table(found).rows == [["pos", "2", "1, 1, 0"], ["rot_hard", "2", "1, 0, 1"], ["all", "4", "2, 1, 1"]]
+    assert "99.97 %" in accuracy_table(found).rows[0]  # as published
+    last = accuracy_table(found).rows[-1]
+    assert (last[3], last[5], last[6], last[7]) == ("50.0 %", "50.0 %", "–", "1 of 2")
 
 
-def test_frames_of_a_check_follow_its_own() -> None:
-    row = Perturbed("neg", "c", (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+def test_frames_of_a_check_follow_its_own(tmp_path: Path) -> None:
+    rows = read_perturbations(table_file(tmp_path, "neg,c,0,0,0,0,1,0"))
     names = {name: k for k, name in enumerate("abc")}
-    assert [one.frames for one in detection_jobs([row], names, summary(3), (1, 3))] == [(2,), (2, 0, 1)]
+    assert [one.frames for one in detection_jobs(rows, names, summary(3), (1, 3))] == [(2,), (2, 0, 1)]
     with pytest.raises(BadInputError, match=r"drive has no frame c, .*; its frames are x, .*sequences/00"):
-        detection_jobs([row], {"x": 0}, summary(3), (1,))
+        detection_jobs(rows, {"x": 0}, summary(3), (1,))
     with pytest.raises(BadInputError, match="--frames-per-trial 4: drive has only 3 frames"):
-        detection_jobs([row], names, summary(3), (1, 4))
+        detection_jobs(rows, names, summary(3), (1, 4))
 
 
 def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> None:
     """1.6 deg as printed are 3.2 deg, on real code."""
     name = open_dataset(DRIVE)[0].name
-    rows = read_table(table_file(tmp_path, f"pos,{name},0,0,0,0,0,0", f"rot_hard,{name},0,0,0,0,1.6,0"))
-    setup = Setup((SourceSpec("drive", DRIVE),), Config(search=SearchConfig(rounds=1, starts=64)))
-    jobs = detection_jobs(rows, {name: 0}, summary(3), (3,))
-    found = decisions(jobs, {one.key: answer for one, answer in zip(jobs, run_checks(setup, jobs), strict=True)})
-    assert [one.error_deg for one in found] == pytest.approx([0, 3.2], abs=1e-6)
-    assert [one.error_m for one in found] == pytest.approx([0, 0], abs=1e-9)  # T D: turned about the LiDAR, not the camera
-    assert [one.verdict for one in found] == [CheckVerdict.PASS, CheckVerdict.FAIL]
-    assert {one.kind for one in found} == {RIGHT}
+    lines = f"pos,{name},0,0,0,0,0,0", f"rot_hard,{name},0,0,0,0,1.6,0", "neg,no,0,0,0,0,1,0"
+    rows = read_perturbations(table_file(tmp_path, *lines))
+    setup = Setup(SETUP.scenes, Config(search=SearchConfig(rounds=1, starts=64)))
+    study = Detection(rows, (3,))
+    jobs = study.jobs(setup, [summary(3)])
+    answers = {one.key: answer for one, answer in zip(jobs, study.work(setup, jobs), strict=True)}
+    report = study.report(setup, jobs, answers)
+    found = report.table
+    assert found.error_deg.tolist() == pytest.approx([0, 3.2], abs=1e-6)
+    assert found.error_m.tolist() == pytest.approx([0, 0], abs=1e-9)  # T D: turned about the LiDAR, not the camera
+    assert found.verdict.tolist() == ["pass", "fail"]
+    assert set(found.kind) == {RIGHT}
+    assert report.notes == ["1 of 3 rows are of frames that the source does not have, such as no"]
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("set,frame\npos,0\n", "no column x_m"),
-        (",".join(COLUMNS) + "\npos,0,0,0,zero,0,0,0\n", "line 2: z_m is zero; give a number of at most 30"),
-        (",".join(COLUMNS) + "\npos,0,0,0\n", "line 2: 4 values in 8 columns; the line is cut off"),
-        (",".join(COLUMNS) + "\npos,0,0,,0,0,0,0\n", "line 2: y_m is missing; give a number"),
-        (",".join(COLUMNS) + "\npos,0,0,0,0,0,0,nan\n", "line 2: rz_deg is nan; give a number of at most 360"),
-        (",".join(COLUMNS) + "\npos,0,1e300,0,0,0,0,0\n", "line 2: x_m is 1e300; give a number of at most 30"),
+        (",".join(COLUMNS) + "\npos,0,0,0,zero,0,0,0\n", "column z_m: .*'zero'; give the table"),
+        (",".join(COLUMNS) + "\npos,0,0,0\n", "column z_m: .*''; give the table"),
+        (",".join(COLUMNS) + "\npos,0,0,,0,0,0,0\n", "column y_m: .*''; give the table"),
+        (",".join(COLUMNS) + "\npos,0,0,0,0,0,0,nan\n", "column rz_deg: give numbers of at most 360"),
+        (",".join(COLUMNS) + "\npos,0,1e300,0,0,0,0,0\n", "column x_m: give numbers of at most 30"),
         (",".join(COLUMNS) + "\n", "has no rows; give the table"),
     ],
 )
@@ -200,21 +196,19 @@ def test_damaged_tables_are_refused(tmp_path: Path, text: str, words: str) -> No
     path = tmp_path / "table.csv"
     path.write_text(text)
     with pytest.raises(BadInputError, match=words):
-        read_table(path)
+        read_perturbations(path)
 
 
 # --- the whole
 
 
 def test_calibrations_are_deterministic_and_find_the_reference() -> None:
-    setup = Setup((SourceSpec("drive", DRIVE),), Config())
-    jobs = [one for one in trial_jobs(BORER, [summary(3)], (3,), 1, 7) if one.option("start_deg") == 10]
-    first, again = (run_trials(setup, jobs) for _ in range(2))
-    (one,), (other,) = (collected(jobs, {jobs[0].key: answers[0]}) for answers in (first, again))
-    assert one.end == other.end
-    assert one.start_translation_m < 0.2  # a rotation about the camera alone moves the translation by its lever
-    assert one.start_rotation_deg > 0.5
-    assert BORER.succeeded(one)
+    jobs = [one for one in Calibrations(BORER, (3,), 1, 7).jobs(SETUP, [summary(3)]) if one.option("start_deg") == 10]
+    one, other = (read_answers(trial_of, jobs, {jobs[0].key: run_jobs(SETUP, jobs)[0]})[0] for _ in range(2))
+    assert one["end_tx_m"] == other["end_tx_m"]
+    assert one["start_translation_m"] < 0.2  # a rotation about the camera alone moves the translation by its lever
+    assert one["start_rotation_deg"] > 0.5
+    assert trials_table([one], BORER.limit_deg, BORER.limit_m).success.tolist() == [1]
 
 
 def test_protocol_on_the_command_line_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -227,12 +221,13 @@ def test_protocol_on_the_command_line_goes_on(tmp_path: Path, capsys: pytest.Cap
     assert "UniCalib (learned)" in out
     assert "report.html" in out
     trials = read_trials(tmp_path / "trials.csv")
-    assert [trial.seed for trial in trials] == [0, 1, 0, 1]
+    assert trials.seed.tolist() == [0, 1, 0, 1]
     with (tmp_path / "trials.csv").open() as file:
         stated = [int(row["success"]) for row in csv.DictReader(file)]
     assert sum(stated) > 0
-    assert stated == [int(UNICALIB.succeeded(trial)) for trial in trials]
-    assert "this project" in (tmp_path / "report.md").read_text()
+    assert stated == trials_table(trials, UNICALIB.limit_deg, UNICALIB.limit_m).success.tolist()
+    assert "this project" in (text := (tmp_path / "report.md").read_text())
+    assert "How many frames a figure rests on" in text
     assert "UniCalib" in (tmp_path / "report.html").read_text()
 
 

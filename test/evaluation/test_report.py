@@ -7,11 +7,13 @@ import dataclasses
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from html_pages import Page
+from trial_rows import row, table
 
 from calib_ros.errors import MissingDependencyError
 from calib_ros_evaluation.curves import Curves
@@ -19,41 +21,17 @@ from calib_ros_evaluation.report import statistics, tables
 from calib_ros_evaluation.report.page import write_report
 from calib_ros_evaluation.report.sections import sections
 from calib_ros_evaluation.report.statistics import basins, median, peak_distances, quantile, wilson
-from calib_ros_evaluation.report.table import Table, as_markdown, escaped, figures
-from calib_ros_evaluation.results import Averaging, Cost, CurveResult, Results, Similarity, Trial, Trust, algorithm_6
+from calib_ros_evaluation.report.table import Table, escaped, figures
+from calib_ros_evaluation.results import Averaging, Cost, CurveResult, Results, Similarity, Trust, algorithm_6
 
 # Frame 1 is like 0; frame 2 is unlike 0, though like 1; frame 3 is like 2.
 ALIKE = np.array([[1, 0.8, 0.5, 0.1], [0.8, 1, 0.8, 0.2], [0.5, 0.8, 1, 0.9], [0.1, 0.2, 0.9, 1]])
 FACTS = {"Source": "drive & <odd> name", "Command": "calib-ros evaluate drive --out x"}
 
 
-def trial(method: str = "ours", end: tuple[float, ...] = (0, 0, 0, 0, 0, 0), **options) -> Trial:
+def trial(method: str = "ours", end: tuple[float, ...] = (0, 0, 0, 0, 0, 0), **options) -> dict[str, Any]:
     """A trial that ended at `end`, deg and m, with errors to match."""
-    r, t = float(np.linalg.norm(end[:3])), float(np.linalg.norm(end[3:]))
-    known = {
-        "experiment": "single",
-        "method": method,
-        "scene": "drive",
-        "frames": (0,),
-        "start_deg": 2.0,
-        "start_m": 0.2,
-        "seed": 0,
-        "status": "done",
-        "reason": "",
-        "rotation_deg": r,
-        "translation_m": t,
-        "start_rotation_deg": 2.0,
-        "start_translation_m": 0.2,
-        "end": end,
-        "start": (2.0, 0, 0, 0.2, 0, 0),
-        "score_start": 0.1,
-        "score_end": 0.2,
-        "score_reference": 0.2,
-        "evaluations": 100,
-        "cpu_s": 1.0,
-        "features_cpu_s": 0.5,
-    }
-    return Trial(**(known | options))
+    return row(end, method=method, **options)
 
 
 def bell(at: float = 0.0, width: float = 1.0, samples: int = 41) -> Curves:
@@ -66,28 +44,32 @@ def bell(at: float = 0.0, width: float = 1.0, samples: int = 41) -> Curves:
 def fake(methods: tuple[str, ...], n: int) -> Results:
     """Results of everything, drawn at random; not of any real method."""
     rng = np.random.default_rng(0)
-    trials: list[Trial] = []
-    for k, method in enumerate(methods):
 
-        def draw(experiment: str, number: int, start: float, frames: int, k: int = k, method: str = method) -> Trial:
-            end = rng.normal(0, 0.1 * (k + 1), 6) * [1, 0.5, 0.8, 0.1, 0.15, 0.1]
-            status, reason = ("refused", "too few starts agree") if method == "ours" and number == 3 else ("done", "")
-            size = {"start_deg": start, "start_m": 0.1 * start, "seed": number, "scene": ("drive 5", "drive 9")[number % 2]}
-            positions = (number,) if frames == 1 else tuple(range(frames))
-            return trial(method, tuple(end), experiment=experiment, frames=positions, status=status, reason=reason, **size)
+    def draw(k: int, method: str, experiment: str, number: int, start: float, frames: int) -> dict[str, Any]:
+        end = rng.normal(0, 0.1 * (k + 1), 6) * [1, 0.5, 0.8, 0.1, 0.15, 0.1]
+        status, reason = ("refused", "too few starts agree") if method == "ours" and number == 3 else ("done", "")
+        size = {"start_deg": start, "start_m": 0.1 * start, "seed": number, "scene": ("drive 5", "drive 9")[number % 2]}
+        positions = str(number) if frames == 1 else " ".join(map(str, range(frames)))
+        return trial(method, tuple(end), experiment=experiment, frames=positions, status=status, reason=reason, **size)
 
-        trials += [draw("single", i, 2.0, 1) for i in range(n)]
-        trials += [draw("starts", i, s, 1) for s in (0.5, 1.0, 2.0) for i in range(n // 2)]
-        trials += [draw("frames", i, 2.0, count) for count in (1, 2, 4) for i in range(n // 2)]
-    curves = [CurveResult("curves", method, f"drive {k}", bell(0.1 * k)) for method in methods for k in range(2)]
-    costs = [Cost(method, "drive 5", 1, 20.0 * (k + 1), 0.05, 5.0) for k, method in enumerate(methods)]
+    trials = []
+    for own in enumerate(methods):
+        trials += [draw(*own, "single", i, 2.0, 1) for i in range(n)]
+        trials += [draw(*own, "starts", i, s, 1) for s in (0.5, 1.0, 2.0) for i in range(n // 2)]
+        trials += [draw(*own, "frames", i, 2.0, count) for count in (1, 2, 4) for i in range(n // 2)]
+    curves = [CurveResult(method, f"drive {k}", bell(0.1 * k)) for method in methods for k in range(2)]
+    costs = [Cost(method, 1, 20.0 * (k + 1), 0.05, 5.0) for k, method in enumerate(methods)]
     titles = {method: f"{method.capitalize()} and others: edges of the one with edges of the other" for method in methods}
-    trusts = [Trust("drive 7", 0.99, ((0.5, 0.0, 0.6 + 0.02 * k), (0.0, 0.1, 0.8))) for k in range(4)]
+    trusts = [Trust(0.99, ((0.5, 0.0, 0.6 + 0.02 * k), (0.0, 0.1, 0.8))) for k in range(4)]
     shape = tuple("abc"), np.array([0.1, 0.3, 0.2]), np.full((3, 10), 0.1), (bell(0.1), bell(), bell(-0.1)), "by points"
     averagings = [Averaging(method, "drive 5", *shape) for method in methods if method in ("thesis", "ours")]
     similarities = [Similarity("drive 5", (0, 2, 4, 6), ALIKE, 0.95, {0: np.full((3, 64), 1 / 64), 6: np.eye(1, 64)})]
     failures = [("curves|nid|drive 7|3|", "nothing to see")]
-    return Results(titles, trials, curves, costs, failures, trusts, averagings, similarities)
+    return Results(titles, table(*trials), curves, costs, failures, trusts, averagings, similarities)
+
+
+def written(folder: Path, results: Results) -> list[Path]:
+    return write_report(folder, "methods compared", FACTS, "score: {a: 1 & 2}", sections(results))
 
 
 def column(table: Table, name: str, key: int = 0) -> dict[str, str]:
@@ -103,13 +85,12 @@ def results() -> Results:
 
 @pytest.fixture(scope="module")
 def report(results: Results, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return write_report(tmp_path_factory.mktemp("report"), results, FACTS, "score: {a: 1 & 2}")
+    return written(tmp_path_factory.mktemp("report"), results)
 
 
 def test_wilson_is_that_of_the_literature() -> None:
     assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
     assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
-    assert all(math.isnan(x) for x in wilson(0, 0))
 
 
 def test_nan_counts_as_infinite() -> None:
@@ -143,16 +124,15 @@ def test_a_curve_rises_up_to_its_first_step_back() -> None:
 def test_table_4_4_beside_the_printed_one() -> None:
     ends = [(0.1, 0, 0, 0.01, 0, 0), (-0.3, 0, 0, 0.03, 0, 0)]
     refused = trial(end=(2, 0, 0, 0, 0, 0), status="refused", reason="flat")
-    found = Results({"ours": "Ours"}, [*(trial(end=end) for end in ends), refused])
-    table = tables.axes(found)
-    rows = {row[:2]: row[2:] for row in table.rows}
+    whole = tables.axes(Results({"ours": "Ours"}, table(*(trial(end=end) for end in ends), refused)))
+    rows = {tuple(row[:2]): tuple(row[2:]) for row in whole.rows}
     assert rows["printed in the thesis", "mean"] == ("100", "-0.462", "0.390", "0.744", "-0.18", "-1.46", "-1.43")
     assert rows["printed in the thesis", "median"][5] == "-14.79"
     assert rows["ours", "mean"][:2] == ("3", "0.600")  # the refused trial ends where it began
     assert rows["ours", "median"][:5] == ("3", "0.100", "0.000", "0.000", "1.00")
     assert rows["ours, accepted", "mean"][:5] == ("2", "-0.100", "0.000", "0.000", "2.00")
     assert rows["ours, accepted", "mean of sizes"][1] == "0.200"
-    assert any("-0.014786" in note for note in table.notes)
+    assert any("-0.014786" in note for note in whole.notes)
 
 
 def test_success_and_errors() -> None:
@@ -162,15 +142,15 @@ def test_success_and_errors() -> None:
         trial(status="failed", rotation_deg=math.nan, translation_m=math.nan),
     ]
     baseline = [trial("nid", end=(0.4, 0, 0, 0.04, 0, 0)) for _ in range(10)]
-    table = tables.single(Results({"nid": "NID", "ours": "Ours"}, own + baseline))
-    assert column(table, "success") == {"nid": "100 %", "ours": "50 %", "ours, accepted": "62 %"}
-    assert column(table, "95 % interval")["ours"] == "24 to 76 %"
-    assert column(table, "rotation median deg") == {"nid": "0.400", "ours": "0.450", "ours, accepted": "0.350"}
-    assert column(table, "translation median cm")["ours"] == "4.5"
-    assert [row[5] for row in table.rows] == ["0.400", "∞", "0.630"]  # 90 %
-    assert column(table, "refused") == {"nid": "0 %", "ours": "10 %", "ours, accepted": ""}
-    assert column(table, "failed")["ours"] == "10 %"
-    assert column(table, "accepted but wrong") == {"nid": "0 %", "ours": "30 %", "ours, accepted": "38 %"}
+    found = tables.single(Results({"nid": "NID", "ours": "Ours"}, table(*own, *baseline)))
+    assert column(found, "success") == {"nid": "100 %", "ours": "50 %", "ours, accepted": "62 %"}
+    assert column(found, "95 % interval")["ours"] == "24 to 76 %"
+    assert column(found, "rotation median deg") == {"nid": "0.400", "ours": "0.450", "ours, accepted": "0.350"}
+    assert column(found, "translation median cm")["ours"] == "4.5"
+    assert [row[5] for row in found.rows] == ["0.400", "∞", "0.630"]  # 90 %
+    assert column(found, "refused") == {"nid": "0 %", "ours": "10 %", "ours, accepted": ""}
+    assert column(found, "failed")["ours"] == "10 %"
+    assert column(found, "accepted but wrong") == {"nid": "0 %", "ours": "30 %", "ours, accepted": "38 %"}
 
 
 def test_success_by_start_frames_and_scene() -> None:
@@ -178,31 +158,30 @@ def test_success_by_start_frames_and_scene() -> None:
     trials = [
         trial(end=end, experiment="starts", start_deg=d, start_m=0.1) for d, end in ((1, good), (1, good), (3, good), (3, bad))
     ]
-    trials += [trial(end=(e, 0, 0, 0, 0, 0), experiment="frames", frames=f) for f, e in (((0,), 1.0), ((1,), 3.0), ((0, 1), 0.4))]
+    trials += [trial(end=(e, 0, 0, 0, 0, 0), experiment="frames", frames=f) for f, e in (("0", 1.0), ("1", 3.0), ("0 1", 0.4))]
     trials += [trial(end=end, scene=scene) for scene, end in (("a", good), ("b", bad))]
-    found = Results({"ours": "Ours"}, trials)
+    found = Results({"ours": "Ours"}, table(*trials))
     starts = tables.starts(found)
-    assert starts.header == ("method", "±1 deg, ±10 cm", "±3 deg, ±10 cm")
-    assert starts.rows == (("ours", "100 % (34 to 100)", "50 % (9 to 91)"), ("doing nothing", "0 %", "0 %"))
+    assert starts.header == ["method", "±1 deg, ±10 cm", "±3 deg, ±10 cm"]
+    assert starts.rows == [["ours", "100 % (34 to 100)", "50 % (9 to 91)"], ["doing nothing", "0 %", "0 %"]]
     assert "Trials per cell: 2." in starts.notes[0]
     rotation, _, success = tables.frames(found)
-    assert rotation.rows == (("ours", "2.000 (1.500 to 2.500)", "0.400 (0.400 to 0.400)"),)
-    assert rotation.header == ("method", "1 frame", "2 frames")
+    assert rotation.rows == [["ours", "2.000 (1.500 to 2.500)", "0.400 (0.400 to 0.400)"]]
+    assert rotation.header == ["method", "1 frame", "2 frames"]
     assert success.rows[0][2].startswith("100 %")
-    scenes = tables.scenes(found)
-    assert scenes is not None
-    assert scenes.rows[0][1:] == ("100 % (21 to 100)", "0 % (0 to 79)")
+    (scenes,) = tables.scenes(found)
+    assert scenes.rows[0][1:] == ["100 % (21 to 100)", "0 % (0 to 79)"]
 
 
 def test_peaks_and_basins_of_curves() -> None:
-    curves = [CurveResult("curves", "ours", label, bell(at)) for label, at in (("a", 0.1), ("b", -0.2), ("c", 0.0))]
-    curves += [CurveResult("curves", "nid", "a", bell(0.15))]
+    curves = [CurveResult("ours", label, bell(at)) for label, at in (("a", 0.1), ("b", -0.2), ("c", 0.0))]
+    curves += [CurveResult("nid", "a", bell(0.15))]
     found = Results({"nid": "NID", "ours": "Ours"}, curves=curves)
-    rows = {row[:2]: row[2:] for row in tables.peaks(found).rows}
+    rows = {tuple(row[:2]): tuple(row[2:]) for row in tables.peaks(found).rows}
     assert rows["ours", "mean"] == ("3", "0.200", "0.200", "0.200", "3.00", "3.00", "3.00")
     assert rows["ours", "median"][:2] == ("3", "0.200")
     assert rows["nid", "mean"][:2] == ("1", "0.300")
-    assert tables.basin(found).rows[0][3:5] == ("2.000", "2.000")
+    assert tables.basin(found).rows[0][3:5] == ["2.000", "2.000"]
     assert "reach 2 deg and 30 cm" in tables.basin(found).notes[1]
 
 
@@ -218,8 +197,8 @@ def test_weighted_average_of_curves() -> None:
 
 
 def test_peaks_of_averages() -> None:
-    (table,) = tables.averaging(fake(("ours",), n=4))
-    kinds = column(table, "r_x deg", 2)
+    (found,) = tables.averaging(fake(("ours",), n=4))
+    kinds = column(found, "r_x deg", 2)
     assert kinds["3 single frames"] == "0.133"  # 0.2, 0 and 0.2
     assert abs(float(kinds["unweighted, 1 averages of 3"])) < 0.001
     assert float(kinds["weighted, 1 averages of 3"]) == pytest.approx(0.033, abs=0.002)  # (0.1 * 0.2 - 0.2 * 0.2) / 0.6
@@ -229,17 +208,17 @@ def test_algorithm_6_compares_with_the_last_keyframe() -> None:
     assert algorithm_6(ALIKE, 0.7) == [0, 2]
     assert algorithm_6(ALIKE, 0.95) == [0, 1, 2, 3]
     assert algorithm_6(ALIKE, 0.05) == [0]
-    (table,) = tables.keyframes(Results({}, similarities=[Similarity("a", (0, 2, 4, 6), ALIKE, 0.95, {})]))
-    assert table.rows == (("a", "0.7", "2 of 4", "frames 0, 4"), ("a", "0.95", "4 of 4", "frames 0, 2, 4, 6"))
+    (found,) = tables.keyframes(Results({}, similarities=[Similarity("a", (0, 2, 4, 6), ALIKE, 0.95, {})]))
+    assert found.rows == [["a", "0.7", "2 of 4", "frames 0, 4"], ["a", "0.95", "4 of 4", "frames 0, 2, 4, 6"]]
 
 
 def test_cost_of_features_and_of_a_whole_estimate() -> None:
-    costs = [Cost("nid", "a", 1, 5.0, 2.0, 9.0), Cost("ours", "a", 3, 20.0, 0.5, 10.0)]
-    table = tables.cost(Results({}, [trial(cpu_s=c) for c in (1.0, 2.0, 9.0)], costs=costs))
-    assert table.rows == (
-        ("nid", "1", "5.00", "2.00", "9.00", "–", "–"),
-        ("ours", "3", "20.0", "0.500", "10.0", "2.50", "100"),
-    )
+    costs = [Cost("nid", 1, 5.0, 2.0, 9.0), Cost("ours", 3, 20.0, 0.5, 10.0)]
+    found = tables.cost(Results({}, table(*(trial(cpu_s=c) for c in (1.0, 2.0, 9.0))), costs=costs))
+    assert found.rows == [
+        ["nid", "1", "5.00", "2.00", "9.00", "–", "–"],
+        ["ours", "3", "20.0", "0.500", "10.0", "2.50", "100"],
+    ]
 
 
 @pytest.mark.parametrize(("value", "text"), [(1234.5, "1234"), (12.34, "12.3"), (0.1, "0.100"), (0.00234, "0.00234"), (0, "0")])
@@ -249,7 +228,7 @@ def test_three_figures(value: float, text: str) -> None:
 
 def test_markdown_escapes_what_would_break_a_table() -> None:
     one = Table("T", ("method", "a|b"), (("x_1", "2*3"), ("<b>", "4")), ("note",))
-    assert as_markdown(one).splitlines() == [
+    assert one.markdown().splitlines() == [
         "### T",
         "",
         r"| method | a\|b |",
@@ -297,17 +276,17 @@ def test_the_report_is_one_page_and_its_parts(report: list[Path], results: Resul
     for path in report[1:-1]:
         assert cv2.imread(str(path)).shape[1] > 700
     for one in (tables.summary(results), tables.axes(results), *tables.averaging(results), *tables.keyframes(results)):
-        assert as_markdown(one) in text.read_text()
+        assert one.markdown() in text.read_text()
 
 
 def test_the_same_results_give_the_same_bytes(tmp_path: Path) -> None:
-    one, other = (write_report(tmp_path / name, fake(("ours",), n=4), FACTS, "a: 1") for name in ("a", "b"))
+    one, other = (written(tmp_path / name, fake(("ours",), n=4)) for name in ("a", "b"))
     assert [path.read_bytes() for path in one] == [path.read_bytes() for path in other]
 
 
 def test_empty_evaluation_reports_the_reason(tmp_path: Path) -> None:
     failures = [("cost|nid|drive|3|", "no <points> in sight")]
-    page, text = write_report(tmp_path, Results({"nid": "NID"}, failures=failures), {}, "")
+    page, text = written(tmp_path, Results({"nid": "NID"}, failures=failures))
     found = Page(page.read_text())
     assert found.ids == ["troubles"]
     assert "no <points> in sight" in found.text
@@ -316,17 +295,16 @@ def test_empty_evaluation_reports_the_reason(tmp_path: Path) -> None:
 
 
 def test_failed_trials_and_broken_scores_are_drawn_as_far_as_they_go() -> None:
-    nan = (math.nan,) * 6
-    lost = {"rotation_deg": math.nan, "translation_m": math.nan, "end": nan, "status": "failed", "reason": "<i>dark</i>"}
-    trials = [dataclasses.replace(trial(experiment=name), **lost) for name in ("single", "starts", "frames") for _ in range(3)]
+    lost = {"end": (math.nan,) * 6, "status": "failed", "reason": "<i>dark</i>"}
+    trials = [trial(experiment=name, **lost) for name in ("single", "starts", "frames") for _ in range(3)]
     broken = bell()
     broken.values[2] = math.nan
-    found = Results({"ours": "O"}, trials, [CurveResult("curves", "ours", "a", broken)])
+    found = Results({"ours": "O"}, table(*trials), [CurveResult("ours", "a", broken)])
     made = {section.key: section for section in sections(found)}
     assert list(made) == ["summary", "curves", "single", "starts", "frames", "troubles"]
-    assert made["summary"].tables[0].rows == (("ours", "0 %", "∞", "∞", "0 %", "1.50", "0.000", "0.0"),)
+    assert made["summary"].tables[0].rows == [["ours", "0 %", "∞", "∞", "0 %", "1.50", "0.000", "0.0"]]
     assert column(made["curves"].tables[0], "r_z deg", 1) == {"mean": "–", "median": "–"}
-    assert made["troubles"].tables[0].rows[0] == ("3", "single", "ours", "failed", "<i>dark</i>")
+    assert made["troubles"].tables[0].rows[0] == ["3", "single", "ours", "failed", "<i>dark</i>"]
 
 
 @pytest.mark.parametrize("missing", ["matplotlib", "jinja2"])
@@ -340,18 +318,18 @@ def test_without_a_library_nothing_is_written(missing: str, tmp_path: Path, monk
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingDependencyError, match=missing):
-        write_report(tmp_path / "out", Results({"ours": "O"}, [trial()]), FACTS, "")
+        written(tmp_path / "out", Results({"ours": "O"}, table(trial())))
     assert not (tmp_path / "out").exists()
 
 
 def test_reasons_that_differ_in_figures_are_one() -> None:
     said = ["1.65-fold, 1.96 is needed", "1.47-fold, 1.96 is needed", "the image is dark", "-0.2-fold, 1.96 is needed"]
-    found = Results({"ours": "Ours"}, [trial(status="refused", reason=reason) for reason in said])
-    (table,) = tables.troubles(found)
-    assert table.rows == (
-        ("3", "single", "ours", "refused", "1.65-fold, 1.96 is needed"),
-        ("1", "single", "ours", "refused", "the image is dark"),
-    )
+    trials = table(*(trial(status="refused", reason=reason) for reason in said))
+    (found,) = tables.troubles(Results({"ours": "Ours"}, trials))
+    assert found.rows == [
+        ["3", "single", "ours", "refused", "1.65-fold, 1.96 is needed"],
+        ["1", "single", "ours", "refused", "the image is dark"],
+    ]
 
 
 def test_report_of_the_share_of_worse_neighbours() -> None:
@@ -361,10 +339,10 @@ def test_report_of_the_share_of_worse_neighbours() -> None:
     # Of 40 right ones, two may be below the threshold at 5 % false alarms: it is the third lowest.
     right = np.linspace(0.61, 1.0, 40)
     assert statistics.hits(right, [0.625, 0.635]) == 0.5
-    trusts = [Trust("s", 0.95 + 0.01 * k, ((0.5, 0.0, 0.5 + 0.05 * k), (0.0, 0.1, 0.6))) for k in range(4)]
+    trusts = [Trust(0.95 + 0.01 * k, ((0.5, 0.0, 0.5 + 0.05 * k), (0.0, 0.1, 0.6))) for k in range(4)]
     assert statistics.called_right(trusts, None) == 1.0
     assert statistics.called_right(trusts, (0.5, 0.0)) == 0.0
-    table = tables.detection(trusts)
-    assert table.rows[0][:2] == ("none", "0.965")
-    assert table.rows[1] == ("0.5 deg", "0.575", "1.00", "100 %", "1.00", "100 %", "0 %")
+    found = tables.detection(trusts)
+    assert found.rows[0][:2] == ["none", "0.965"]
+    assert found.rows[1] == ["0.5 deg", "0.575", "1.00", "100 %", "1.00", "100 %", "0 %"]
     assert math.isnan(statistics.called_right(trusts[:2], None))

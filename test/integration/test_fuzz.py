@@ -7,13 +7,14 @@ import os
 import subprocess
 import sys
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from paths import ROOT, SUPPORT
 
 RUNNER = SUPPORT / "fuzz_runner.py"
 pytestmark = pytest.mark.usefixtures("ros_in_this_process")
+compression = pytest.mark.skipif(not (find_spec("av") and find_spec("DracoPy")), reason="PyAV or DracoPy is not installed")
 
 
 def fuzz(what: str, count: int) -> dict[str, Any]:
@@ -28,46 +29,43 @@ def fuzz(what: str, count: int) -> dict[str, Any]:
     return report
 
 
-class Fuzzed(NamedTuple):
-    """short, long: cases in `make test`, and instead at length in `make test-all`. kinds: of inputs, one in each case. least:
-    outcome -> of so many cases more than one has it: mutations that leave nothing to decode, or nothing to refuse, would show
-    nothing. mib: that a case may take at most."""
-
-    short: int
-    long: int
-    kinds: tuple[str, ...]
-    least: dict[str, int]
-    mib: float = float("inf")
+def total(report: dict[str, Any], *kinds: str) -> int:
+    return sum(count for name, count in report["outcomes"].items() if name.rpartition(" ")[0] in kinds)
 
 
-def both(share: int, *kinds: str) -> dict[str, int]:
-    return {f"{kind} {what}": share for kind in kinds for what in ("taken", "refused")}
+def cases(short: int, long: int) -> pytest.MarkDecorator:
+    """So many cases in `make test`, and instead at length in `make test-all`."""
+    return pytest.mark.parametrize(
+        "count", [pytest.param(short, marks=pytest.mark.short), pytest.param(long, marks=pytest.mark.slow)]
+    )
 
 
-MESSAGES, PACKED = ("cloud", "image", "compressed", "camera_info"), ("video", "compressed_cloud")
-TEXTS = ("config", "result", "state")
-FOLDERS = ("bag_mcap", "bag_sqlite3", "bag_ros1", "bag_compressed", "raw", "odometry", "object", "nuscenes", "plain")
-FUZZED = {
-    "messages": Fuzzed(300, 1500, MESSAGES, both(200, *MESSAGES, "scan in use", "camera in use"), mib=100),  # of at most 200 kB
-    "packed": Fuzzed(200, 1500, PACKED, both(10, *PACKED), mib=100),
-    "pipeline": Fuzzed(80, 300, ("pair",), {"pipeline says": 6, "extrinsics": 60}),
-    "texts": Fuzzed(180, 900, TEXTS, {f"{kind} taken": 180 for kind in TEXTS}),
-    "folders": Fuzzed(200, 600, (*FOLDERS, "plain_otherwise"), both(201, *FOLDERS, "plain_otherwise")),
-    "cli": Fuzzed(30, 150, ("code",), {"code 0": 16, "code 2": 16}),
-}
-NEED_CODECS = ("packed", "folders", "cli")
-HAS_CODECS = find_spec("av") and find_spec("DracoPy")
+@compression
+@cases(840, 4200)
+def test_mutated_messages(count):
+    report = fuzz("messages", count)
+    decoded = ("cloud", "image", "compressed", "camera_info", "video", "compressed_cloud")
+    assert total(report, *decoded) == count
+    assert report["most"][0] < 100, "MiB for a message of at most 200 kB"
+    # Mutations that leave nothing to decode, or nothing to refuse, would show nothing.
+    for kind in (*decoded, "scan in use"):
+        assert min(report["outcomes"][f"{kind} {what}"] for what in ("taken", "refused")) >= count // 210
 
 
-@pytest.mark.parametrize("length", [pytest.param("short", marks=pytest.mark.short), pytest.param("long", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("what", FUZZED)
-def test_mutated_inputs(what: str, length: str) -> None:
-    if what in NEED_CODECS and not HAS_CODECS:
-        pytest.skip("PyAV or DracoPy is not installed")
-    own = FUZZED[what]
-    count = getattr(own, length)
-    report = fuzz(what, count)
-    outcomes = report["outcomes"]
-    assert report["most"][0] < own.mib
-    assert sum(n for name, n in outcomes.items() if name.rpartition(" ")[0] in own.kinds) == count
-    assert {name: outcomes[name] for name, share in own.least.items() if outcomes[name] <= count // share} == {}
+@cases(180, 900)
+def test_mutated_texts(count):
+    report = fuzz("texts", count)
+    assert total(report, "config", "result", "state") == count
+    assert min(report["outcomes"][f"{kind} taken"] for kind in ("config", "result", "state")) > count // 180
+
+
+@compression
+@cases(100, 900)
+def test_mutated_files_through_the_command_line(count):
+    report = fuzz("commands", count)
+    kinds = ("bag_mcap", "bag_sqlite3", "bag_ros1", "bag_compressed", "raw", "odometry", "object", "nuscenes")
+    kinds += ("plain", "plain_otherwise")
+    codes = {kind: [report["outcomes"].get(f"{kind} code {code}", 0) for code in (0, 1, 2)] for kind in kinds}
+    assert sum(map(sum, codes.values())) == count
+    assert min(refused for *_, refused in codes.values()) > 0
+    assert sum(sum(taken) for *taken, _ in codes.values()) > count // 5

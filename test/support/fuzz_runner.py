@@ -1,6 +1,6 @@
 """The fuzzer's own process: its memory is limited, a hang ends it with a stack, and what it found goes to stdout as JSON.
 
-python -W error fuzz_runner.py messages|packed|pipeline|texts|folders|cli SEED COUNT
+python -W error fuzz_runner.py messages|texts|commands SEED COUNT
 """
 
 from __future__ import annotations
@@ -29,10 +29,9 @@ from sample_sources import originals
 
 from calib_ros import result, se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, SemanticsConfig, load_stages
-from calib_ros.datasets import open_dataset
-from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.config import Config, load_stages
+from calib_ros.errors import CalibrationError
+from calib_ros.frame import Frame, PointCloud
 from calib_ros.messages import (
     decode_camera_info,
     decode_cloud,
@@ -42,13 +41,10 @@ from calib_ros.messages import (
     stamp_ns,
 )
 from calib_ros.messages.video import VideoDecoder, packet_of, picture_of
-from calib_ros.online.events import ExtrinsicUpdated, Inputs, Problem
-from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import load_state
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.result import INITIAL, Result
-from calib_ros_semantics.models.segmentation import SegmentationModels
+from calib_ros.result import Result
 
 HANG_S = 120.0  # a hang does not end, while a busy machine takes its time
 SPARE = 1500 << 20  # bytes of address space beyond what the process has when it starts to fuzz
@@ -121,11 +117,6 @@ def families() -> list[str]:
     return ["rosbags", "rclpy"]
 
 
-def decode(image: Any, cloud: Any, camera: Camera) -> Frame:
-    pixels = decode_compressed_image(image) if hasattr(image, "format") else decode_image(image)
-    return Frame(pixels, decode_cloud(cloud), camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
-
-
 def good_frame(seed: int = 0) -> Frame:
     rng = np.random.default_rng(seed)
     columns = scan(rng)
@@ -137,49 +128,39 @@ def good_frame(seed: int = 0) -> Frame:
 def messages(run: Run, seed: int, count: int) -> None:
     """Every message is decoded; of those that can be, every third goes on to the features of a keyframe."""
     fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
-    good = good_frame()
-    recalibrator = Recalibrator(CAMERA, nominal(0.0))
+    first, good, recalibrator = fuzzers[0], good_frame(), Recalibrator(CAMERA, nominal(0.0))
 
     def ingest(frame: Frame) -> None:
         recalibrator.selector.reset()
         recalibrator.ingest(frame)
 
+    decoders = {"cloud": decode_cloud, "image": decode_image, "compressed": decode_compressed_image} | {
+        "camera_info": lambda message: decode_camera_info(message, bool(message.height % 5 == 0)),
+        "video": watch,
+        "compressed_cloud": decode_compressed_cloud,
+    }
+    for codec in ENCODERS:  # their libraries, before memory is limited
+        watch([video_message(first.make, FOXGLOVE, codec, first.make.header(), packet) for packet in first.packets_of(codec)])
+    decode_compressed_cloud(first.make.compressed_cloud(np.zeros(3, [(name, "<f4") for name in "xyz"]), "draco"))
     for _ in range(3):
         ingest(good)
     run.start()
     for k in range(count):
-        fuzzer = fuzzers[k % len(fuzzers)]
-        kind = ("cloud", "cloud", "image", "compressed", "camera_info")[k // 2 % 5]
-        message = getattr(fuzzer, kind)()
-        label = f"{kind} {k} of {fuzzer.make.family}"
+        kind = tuple(decoders)[k % len(decoders)]
+        fuzzer = (
+            first if kind in ("video", "compressed_cloud") else fuzzers[k // len(decoders) % len(fuzzers)]
+        )  # rclpy has neither
+        message, label = getattr(fuzzer, kind)(), f"{kind} {k} of {fuzzer.make.family}"
+        decoded = run.case(kind, label, lambda d=decoders[kind], m=message: d(m))
+        if decoded is None or k // len(decoders) % 3:
+            continue
         if kind == "camera_info":
-            rectified = fuzzer.chance(0.2)
-            camera = run.case(kind, label, lambda m=message, r=rectified: decode_camera_info(m, r))
-            if camera is not None and k % 2 == 0:
-                run.case("camera in use", label, lambda c=camera: in_use(c, good))
+            run.case("camera in use", label, lambda c=decoded: in_use(c, good))
         elif kind == "cloud":
-            cloud = run.case(kind, label, lambda m=message: decode_cloud(m))
-            if cloud is not None and k % 3 == 0:
-                stamp = stamp_ns(message.header.stamp)
-                run.case("scan in use", label, lambda c=cloud, s=stamp: ingest(Frame(good.image, c, CAMERA, STAMP, s)))
-        else:
-            decoder = decode_image if kind == "image" else decode_compressed_image
-            image = run.case(kind, label, lambda m=message, d=decoder: d(m))
-            if image is not None and k % 3 == 0:
-                run.case("picture in use", label, lambda i=image: ingest(Frame(i, good.cloud, CAMERA, STAMP, STAMP)))
-
-
-def packed(run: Run, seed: int, count: int) -> None:
-    """Video and compressed clouds, of which rclpy has no messages."""
-    fuzzer = MessageFuzzer(seed, "rosbags")
-    for codec in ENCODERS:  # their libraries, before memory is limited
-        watch([video_message(fuzzer.make, FOXGLOVE, codec, fuzzer.make.header(), one) for one in fuzzer.packets_of(codec)])
-    decode_compressed_cloud(fuzzer.make.compressed_cloud(np.zeros(3, [(name, "<f4") for name in "xyz"]), "draco"))
-    run.start()
-    for k in range(count):
-        kind, decoder = (("video", watch), ("compressed_cloud", decode_compressed_cloud))[k % 2]
-        message = getattr(fuzzer, kind)()
-        run.case(kind, f"{kind} {k}", lambda d=decoder, m=message: d(m))
+            stamp = stamp_ns(message.header.stamp)
+            run.case("scan in use", label, lambda c=decoded, s=stamp: ingest(Frame(good.image, c, CAMERA, STAMP, s)))
+        elif kind in ("image", "compressed"):
+            run.case("picture in use", label, lambda i=decoded: ingest(Frame(i, good.cloud, CAMERA, STAMP, STAMP)))
 
 
 def watch(messages: list[Any]) -> None:
@@ -195,44 +176,6 @@ def in_use(camera: Camera, good: Frame) -> None:
     recalibrator = Recalibrator(camera, nominal(0.0), EDGES_ONLY)
     recalibrator.ingest(Frame(good.image, good.cloud, camera, STAMP, STAMP))
     camera.project(good.cloud.xyz @ nominal(0.0)[:3, :3].T)
-
-
-def pipeline(run: Run, seed: int, count: int) -> None:
-    """Pairs of messages, one of them mutated, through the pipeline with both its threads."""
-    fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
-    events: list[Any] = []
-    inputs = Inputs(decode, lambda image, cloud: ("camera", "lidar"), lambda *_: Result(nominal(0.0), INITIAL))
-    few = {"starts": 64, "rounds": 1}
-    whole = Pipeline(Config.from_dict({"search": few, "online": {"similarity_threshold": 1.0}}), inputs, events.append)
-    whole.set_camera(CAMERA)
-    SegmentationModels(SemanticsConfig())(good_frame(seed))  # the first import of its libraries takes seconds
-    run.start()
-    for k in range(count):
-        fuzzer = fuzzers[k % len(fuzzers)]
-        stamp = STAMP + k * NANOSECONDS
-        if k % 10 == 9:
-            camera = run.case("camera", f"camera {k}", lambda f=fuzzer: decode_camera_info(f.camera_info()))
-            whole.set_camera(camera or CAMERA)
-        image, cloud = fuzzer.one((fuzzer.image, fuzzer.compressed, *2 * [fuzzer.good_image]))(), fuzzer.cloud(stamp)
-
-        def take_in(image: Any = image, cloud: Any = cloud, stamp: int = stamp) -> None:
-            whole.add_image(stamp, image)
-            whole.add_cloud(stamp, cloud)
-            if not whole.wait_idle(HANG_S):
-                raise TimeoutError("the pipeline hangs")
-
-        run.case("pair", f"pair {k} of {fuzzer.make.family}", take_in)
-        whole.set_camera(CAMERA)
-    if not whole.stop():
-        run.fail("the pipeline does not stop")
-    for line in (event.message for event in events if isinstance(event, Problem)):
-        run.outcomes["pipeline says"] += 1
-        if line.startswith("unexpected") or "\n" in line:
-            run.fail(line)
-    extrinsics = [event.extrinsic for event in events if isinstance(event, ExtrinsicUpdated)]
-    for extrinsic in extrinsics:
-        se3.as_transform(extrinsic.result.T_camera_lidar)
-    run.outcomes["extrinsics"] = len(extrinsics)
 
 
 # --- files ----------------------------------------------------------------------------------------------------------------
@@ -299,42 +242,7 @@ def results() -> list[tuple[str, str]]:
     return [("a.json", full.dumps()), ("a.yaml", full.dumps(True)), ("state.json", state), ("b.json", json.dumps(parts))]
 
 
-def folders(run: Run, seed: int, count: int) -> None:
-    """Bags and folders: opened, described and read, as the commands do."""
-    rng = np.random.default_rng(seed)
-    with tempfile.TemporaryDirectory() as name:
-        whole = originals(Path(name))
-        for path in whole:
-            read_through(path)
-        run.start()
-        for k in range(count):
-            source = whole[k % len(whole)]
-            broken = Path(name) / "broken" / source.name
-            shutil.copytree(source, broken)
-            damage_folder(rng, broken)
-            target = broken
-            if source.name.startswith("bag") and rng.random() < 0.5:
-                stores = [path for path in broken.iterdir() if path.is_file() and path.suffix in (".mcap", ".db3", ".bag")]
-                target = stores[0] if stores else broken
-            run.case(source.name, f"{source.name} {k}", lambda p=target: read_through(p))
-            shutil.rmtree(broken)
-
-
-def read_through(path: Path) -> None:
-    from calib_ros.cli.output import describe
-
-    source = open_dataset(path)
-    try:
-        describe(source)
-        for index in range(min(len(source), 3)):
-            source[index]
-    except OSError as error:  # the command line says these in one line, too
-        raise BadInputError(str(error)) from None
-    finally:
-        getattr(source, "close", lambda: None)()
-
-
-def cli(run: Run, seed: int, count: int) -> None:
+def commands(run: Run, seed: int, count: int) -> None:
     """Whole commands in this process: the exit code, and what a terminal shows."""
     from calib_ros.cli.main import main
 
@@ -349,20 +257,22 @@ def cli(run: Run, seed: int, count: int) -> None:
             source = whole[k % len(whole)]
             broken = Path(name) / "broken" / source.name
             shutil.copytree(source, broken)
-            if k % 2:
-                option = "--config" if k % 4 == 1 else "--initial"
-                argv = [("calibrate", "replay")[k // 4 % 2], str(broken), option, str(mutated(rng, texts_of[option], Path(name)))]
+            if rng.random() < 0.2:
+                option = ("--config", "--initial")[int(rng.integers(2))]
+                argv = ["replay", str(broken), option, str(mutated(rng, texts_of[option], Path(name)))]
             else:
                 damage_folder(rng, broken)
-                command = ("info", "replay", "convert", "info")[k // 2 % 4]
-                argv = [command, str(broken)] + ([str(Path(name) / "broken" / "converted")] if command == "convert" else [])
+                stores = [p for p in broken.iterdir() if p.suffix in (".mcap", ".db3", ".bag") and p.is_file()]
+                target = stores[0] if stores and rng.random() < 0.5 else broken
+                command = ("info", "replay", "convert")[int(rng.integers(3))]
+                argv = [command, str(target)] + ([str(Path(name) / "broken" / "converted")] if command == "convert" else [])
             os.ftruncate(terminal, 0)
             os.lseek(terminal, 0, os.SEEK_SET)
             os.dup2(terminal, 2)
             written = StringIO()
             try:
                 with open(os.dup(2), "w") as shown, redirect_stderr(shown), redirect_stdout(written):
-                    code = run.case(f"cli {argv[0]}", f"{' '.join(argv)} {k}", lambda a=argv: main(a))
+                    code = run.case(source.name, f"{' '.join(argv)} {k}", lambda a=argv: main(a))
             finally:
                 os.dup2(stderr, 2)
             said = os.pread(terminal, 100_000, 0).decode("utf-8", "replace")
@@ -371,7 +281,7 @@ def cli(run: Run, seed: int, count: int) -> None:
             if "Traceback" in said or (code == 2 and (said.count("\n") != 1 or not said.startswith("calib-ros: "))):
                 # A replay notes each frame that it leaves out.
                 run.fail(f"{argv}, code {code} says: {said[:1500]}")
-            run.outcomes[f"code {code}"] += 1
+            run.outcomes[f"{source.name} code {code}"] += 1
             shutil.rmtree(Path(name) / "broken")
 
 
@@ -380,7 +290,6 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore", FutureWarning)  # names of former versions, which a mutation may make
     what, first, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     this = Run()
-    work = {"messages": messages, "packed": packed, "pipeline": pipeline, "texts": texts, "folders": folders, "cli": cli}
-    work[what](this, first, number)
+    {"messages": messages, "texts": texts, "commands": commands}[what](this, first, number)
     sys.__stdout__.write(json.dumps(this.report()) + "\n")
     sys.__stdout__.flush()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +20,20 @@ from calib_ros.messages.image_encodings import ENCODINGS
 WIDTH, HEIGHT = 96, 64
 K = np.array([[70.0, 0, 48], [0, 70, 32], [0, 0, 1]])
 STAMP = 1_700_000_000_123_456_789
-# What 32 bits without a sign can hold, so that it can be published, too; and what a file or a program may hold.
-SIZES = (0, 1, 2, 3, 4, 7, 16, 63, 96, 255, 2**16, 10**6, 2**31 - 1, 2**31, 2**32 - 1)
-WILD_SIZES = (*SIZES, -1, -16, 2**63, 2**64)
+SIZES = (0, 1, 2, 3, 4, 7, 16, 63, 96, 255, 2**16, 10**6, 2**31 - 1, 2**31, 2**32 - 1, -1, 2**63, 2**64)
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-3, 1e-40, 1e-300, 1e6, 1e9, -1e9, 1e19, 1e38, -1e38, 1e150, 1e300, np.inf, -np.inf, np.nan)
-TEXTS = ("", "mono8", "BGR8 ", "rgb", "32FC1", "64FC4", "\N{SNOWMAN}", "8UC1\0", "a" * 3000)
-TEXTS += ("bayer_", "nv12", "jpeg", "x\ny", "{}")
-NAMES = ("x", "y", "z", "intensity", "ring", "time", "t", "timestamp", "", "rgb", " X ", "\N{SNOWMAN}", "line", "z" * 300)
+DISTORTIONS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4, "": 0, "omnidir": 5, "double_sphere": 2, "kb6": 6}
+PACKINGS = ("zlib", "zstd", "draco", "draco")
+FIELDS = ("x", "y", "z", "intensity", "ring", "time", "t", "timestamp", "", "rgb", " X ", "\N{SNOWMAN}", "line", "z" * 300)
+TEXTS = (*FIELDS, *ENCODINGS, *DISTORTIONS, *PACKINGS, *ENCODERS, "32FC1", "8UC1\0", "a" * 3000, "bayer_", "jpeg", "x\ny", "{}")
 VELODYNE = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]
 LAYOUTS: tuple[Any, ...] = (
     VELODYNE,
     [(name, kind.replace("<", ">")) for name, kind in VELODYNE],
-    VELODYNE[:3],
     [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "u1"), ("ring", "<i4"), ("timestamp", "<f8")],
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("pad", "u1", 4), ("reflectivity", "<f8"), ("ring", "<f8"), ("t", "<u4")],
     [("x", "<i2"), ("y", "<i2"), ("z", "<i2"), ("i", "<u2"), ("line", "i1"), ("time", "<i4")],
 )
-DISTORTIONS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4, "": 0}
-OTHER_DISTORTIONS = {"omnidir": 5, "double_sphere": 2, "eucm": 2, "ucm": 1, "fov": 1, "division": 2, "kb6": 6}
 
 
 def scan(rng: np.random.Generator, rings: int = 16, columns: int = 100) -> dict[str, np.ndarray]:
@@ -52,15 +50,12 @@ def scan(rng: np.random.Generator, rings: int = 16, columns: int = 100) -> dict[
 
 
 class MessageFuzzer:
-    """Mutated messages of one family ("rosbags" or "rclpy"); those of rosbags also as they cannot be sent over a network."""
+    """Messages of one family ("rosbags" or "rclpy"), of whose parts up to three hold something else."""
 
     def __init__(self, seed: int, family: str) -> None:
         self.rng = np.random.default_rng(seed)
         self.make = Messages(family)
         self.packets: dict[str, list[bytes]] = {}
-        self.sizes = WILD_SIZES if family == "rosbags" else SIZES
-
-    # ---- choices ------------------------------------------------------------------------------------------------------
 
     def chance(self, share: float) -> bool:
         return bool(self.rng.random() < share)
@@ -68,113 +63,72 @@ class MessageFuzzer:
     def one(self, choices: Any) -> Any:
         return choices[int(self.rng.integers(len(choices)))]
 
-    def number(self, near: int) -> int:
-        """An absurd number, or one beside what it should be."""
-        return int(self.one(self.sizes)) if self.chance(0.7) else max(near + int(self.rng.integers(-3, 4)), 0)
+    # ---- any message --------------------------------------------------------------------------------------------------
 
-    def some(self, values: np.ndarray) -> slice | np.ndarray:
-        """All of an array, a single one, or every few."""
-        return self.one((slice(None), slice(0, 1), slice(None, None, 3), self.rng.random(len(values)) < 0.5))
-
-    def damaged(self, data: bytes) -> bytes:
-        how = self.one(("empty", "shorter", "longer", "random", "flipped", "one byte"))
-        if how in ("empty", "one byte"):
-            return data[: int(how == "one byte")]
-        if how == "shorter":
-            return data[: int(self.rng.integers(0, len(data) + 1))]
-        if how == "longer":
-            return data + self.rng.bytes(int(self.rng.integers(1, 200)))
-        return self.rng.bytes(len(data)) if how == "random" else flipped(self.rng, data, int(self.rng.integers(1, 40)))
-
-    def stamp(self, message: Any) -> None:
-        time = message.header.stamp
-        time.sec = self.one((0, 1, -1, 2**31 - 1, -(2**31), 1_700_000_000))
-        time.nanosec = self.one((0, 999_999_999, 2**32 - 1, 10**9))
-        message.header.frame_id = self.one(("", "sensor", "/a", "\N{SNOWMAN}"))
-
-    # ---- clouds -------------------------------------------------------------------------------------------------------
-
-    def cloud(self, stamp: int = STAMP) -> Any:
-        dtype = np.dtype(self.one(LAYOUTS))
-        shape = (int(self.one((1, 4, 16, 16, 32))), int(self.one((1, 30, 60, 100))))
-        columns = scan(self.rng, *shape)
-        points = np.zeros(shape[0] * shape[1], dtype)
-        for name in dtype.names or ():
-            kind = dtype.fields[name][0].base if dtype.fields else dtype
-            points[name] = self._column(name, kind, columns).reshape(points[name].shape[:1] + (1,) * (points[name].ndim - 1))
-        organised = self.chance(0.4)
-        message = self.make.cloud(points.reshape(shape) if organised else points, padding=int(self.one((0, 0, 5))), stamp=stamp)
-        for _ in range(int(self.one((0, 0, 1, 1, 2, 3)))):
-            self.one((self._cloud_size, self._field, self._fields, self._cloud_data, self._cloud_data, self._order))(message)
-        if self.chance(0.1):
-            self.stamp(message)
+    def mutated(self, message: Any) -> Any:
+        """The same message, in up to three places another."""
+        for _ in range(int(self.one((0, 1, 1, 2, 3)))):
+            owner, name = self.one(list(_parts(message)))
+            with suppress(AssertionError, OverflowError, TypeError):  # rclpy's messages cannot hold everything
+                setattr(owner, name, self._another(getattr(owner, name)))
         return message
 
-    def _column(self, name: str, kind: np.dtype, columns: dict[str, np.ndarray]) -> np.ndarray:
-        count = len(columns["ring"])
-        known = {**dict(zip("xyz", columns["xyz"].T, strict=True)), "intensity": columns["intensity"], "ring": columns["ring"]}
-        known |= {"i": known["intensity"], "reflectivity": known["intensity"], "line": known["ring"], "pad": np.zeros(count)}
-        values = np.array(known.get(name, columns["time"]), float)
-        if name in ("t", "timestamp", "time"):
-            unit = self.one((1.0, 1e3, 1e6, 1e9, 1e12, 0.0, -1.0))
-            values = values * unit + self.one((0.0, 0.1 * unit, STAMP * 1e-9, STAMP * 1.0, -1e9))
-        if self.chance(0.25):
-            values[self.some(values)] = self.one(FLOATS)
-        if self.chance(0.1):
-            values = self.rng.normal(0, self.one((1e-3, 1.0, 1e3, 1e12)), count)
-        if kind.kind in "iu":
-            limits = np.iinfo(kind)
-            return np.clip(np.nan_to_num(values, posinf=limits.max, neginf=limits.min), limits.min, limits.max)
-        with np.errstate(all="ignore"):
-            return values.astype(kind)
+    def _another(self, value: Any) -> Any:
+        if isinstance(value, bool):
+            return not value
+        if isinstance(value, (int, np.integer)):
+            return int(self.one(SIZES)) if self.chance(0.7) else max(int(value) + int(self.rng.integers(-3, 4)), 0)
+        if isinstance(value, str):
+            return self.one(TEXTS)
+        if isinstance(value, list) and value and not isinstance(value[0], float):
+            return self.one(([], value[1:], [*value, value[0]], value[::-1], 50 * value))
+        numbers = np.array(value)
+        if numbers.dtype == np.uint8:
+            return self.make.data(self.damaged(numbers.tobytes()))
+        count = len(numbers) if self.chance(0.7) else int(self.one((0, 1, 2, 3, 5, 8, 12, 1000)))
+        numbers = np.resize(numbers, count).astype(float) if len(numbers) else np.full(count, 0.1)
+        if self.chance(0.8):
+            numbers[self.rng.random(count) < self.one((0.2, 1.0))] = self.one(FLOATS)
+        else:
+            numbers *= self.one((-1.0, 1e-3, 1e3))
+        return numbers if self.make.family == "rosbags" else numbers.tolist()
 
-    def _cloud_size(self, message: Any) -> None:
-        name = self.one(("width", "height", "point_step", "row_step"))
-        setattr(message, name, self.number(getattr(message, name)))
+    def damaged(self, data: bytes) -> bytes:
         if self.chance(0.2):
-            message.width, message.height = message.height, message.width
+            return data + self.rng.bytes(int(self.rng.integers(1, 200)))
+        return binary_file(self.rng, data)
 
-    def _field(self, message: Any) -> None:
-        if message.fields:
-            field = self.one(message.fields)
-            name = self.one(("offset", "count", "datatype", "name", "name"))
-            if name == "name":
-                field.name = self.one(NAMES)
-            elif name == "datatype":
-                field.datatype = int(self.rng.integers(0, 13)) if self.chance(0.8) else 255
-            else:
-                setattr(field, name, self.number(getattr(field, name)))
+    # ---- whole ones ---------------------------------------------------------------------------------------------------
 
-    def _fields(self, message: Any) -> None:
-        fields = list(message.fields)
-        how = self.one(("none", "drop", "drop", "twice", "shuffle", "many"))
-        if how == "drop" and fields:
-            fields.pop(int(self.rng.integers(len(fields))))
-        elif how == "twice" and fields:
-            fields.append(self.one(fields))
-        elif how == "shuffle":
-            fields = [fields[k] for k in self.rng.permutation(len(fields))]
-        elif how in ("none", "many"):
-            fields = fields * (50 if how == "many" else 0)
-        message.fields = fields
+    def cloud(self, stamp: int = STAMP) -> Any:
+        return self.mutated(self.make.cloud(self._points(self.one(LAYOUTS)), padding=int(self.one((0, 0, 5))), stamp=stamp))
 
-    def _cloud_data(self, message: Any) -> None:
-        message.data = self.make.data(self.damaged(bytes(message.data)))
+    def compressed_cloud(self) -> Any:
+        return self.mutated(self.make.compressed_cloud(self._points(VELODYNE).ravel(), self.one(PACKINGS)))
 
-    def _order(self, message: Any) -> None:
-        message.is_bigendian = not message.is_bigendian
-
-    # ---- pictures -----------------------------------------------------------------------------------------------------
+    def _points(self, layout: Any) -> np.ndarray:
+        """A scan with such columns, some of them with wild values."""
+        dtype, columns = np.dtype(layout), scan(self.rng, *self.one(((4, 30), (16, 100), (16, 100), (32, 60), (1, 1))))
+        known = {**dict(zip("xyz", columns["xyz"].T, strict=True)), **columns}
+        known |= {"i": known["intensity"], "reflectivity": known["intensity"], "line": known["ring"]}
+        points = np.zeros(len(columns["ring"]), dtype)
+        for name in set(dtype.names or ()) - {"pad"}:
+            values, kind = np.array(known.get(name, columns["time"]), float), dtype[name]
+            if name in ("t", "timestamp", "time"):
+                unit = self.one((1.0, 1e3, 1e6, 1e9, 0.0, -1.0))
+                values = values * unit + self.one((0.0, 0.1 * unit, STAMP * 1e-9, STAMP * 1.0))
+            if self.chance(0.25):
+                values[self.rng.random(len(values)) < self.one((0.01, 0.5, 1.0))] = self.one(FLOATS)
+            if kind.kind in "iu":
+                low, high = np.iinfo(kind).min, np.iinfo(kind).max
+                values = np.clip(np.nan_to_num(values, posinf=high, neginf=low), low, high)
+            with np.errstate(all="ignore"):
+                points[name] = values.astype(kind)
+        return points.reshape(-1, 10) if len(points) > 1 and self.chance(0.4) else points
 
     def picture(self, channels: int = 3) -> np.ndarray:
         shape = (HEIGHT, WIDTH) if channels == 1 else (HEIGHT, WIDTH, channels)
-        how = self.one(("noise", "noise", "blocks", "constant"))
-        if how == "constant":
-            return np.full(shape, self.one((0, 128, 255)), np.uint8)
-        if how == "blocks":
-            small = self.rng.integers(0, 256, (8, 12, *shape[2:]), np.uint8)
-            return np.asarray(cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST))
-        return self.rng.integers(0, 256, shape, np.uint8)
+        return np.full(shape, 128, np.uint8) if self.chance(0.1) else self.rng.integers(0, 256, shape, np.uint8)
 
     def good_image(self) -> Any:
         return self.make.image("bgr8", WIDTH, HEIGHT, self.picture(), 3 * WIDTH)
@@ -185,42 +139,21 @@ class MessageFuzzer:
         row = WIDTH * kind.channels * kind.bytes
         rows = HEIGHT * 3 // 2 if kind.planar_420 else HEIGHT
         data = np.resize(self.picture(), rows * row).tobytes()
-        message = self.make.image(encoding, WIDTH, HEIGHT, data, row, big=int(self.one((0, 0, 1, 255))))
-        for _ in range(int(self.one((0, 1, 1, 2)))):
-            name = self.one(("width", "height", "step", "encoding", "data", "data"))
-            if name == "encoding":
-                message.encoding = self.one((*TEXTS, *ENCODINGS))
-            elif name == "data":
-                message.data = self.make.data(self.damaged(bytes(message.data)))
-            else:
-                setattr(message, name, self.number(getattr(message, name)))
-        if self.chance(0.1):
-            self.stamp(message)
-        return message
+        return self.mutated(self.make.image(encoding, WIDTH, HEIGHT, data, row, big=int(self.one((0, 0, 1, 255)))))
 
     def compressed(self) -> Any:
         suffix = self.one((".png", ".jpg"))
-        picture: np.ndarray = self.picture(int(self.one((1, 3, 3, 4) if suffix == ".png" else (1, 3))))
-        if suffix == ".png" and self.chance(0.2):
-            picture = picture.astype(np.uint16) * 200
-        data = cv2.imencode(suffix, picture)[1].tobytes()
+        data = cv2.imencode(suffix, self.picture(int(self.one((1, 3, 3, 4) if suffix == ".png" else (1, 3)))))[1].tobytes()
         if self.chance(0.2):
-            data = png_header(self.number(WIDTH), self.number(HEIGHT), int(self.one((0, 2, 6))), data)
-        elif self.chance(0.6):
-            data = self.damaged(data)
-        elif self.chance(0.1):
-            data = b"P5\n60000 60000\n255\n" + data
+            data = png_header(int(self.one(SIZES)), HEIGHT, int(self.one((0, 2, 6))), data)
         layout = self.one(("jpeg", "png", "bgr8; jpeg compressed bgr8", "bayer_rggb8; png compressed", "16UC1; compressedDepth"))
-        return self.make.compressed(self.one(TEXTS) if self.chance(0.2) else layout, data)
+        return self.mutated(self.make.compressed(layout, data))
 
     def video(self) -> list[Any]:
         """Messages of a few pictures, of a type and a codec, of which some are changed, lost or in another place."""
         codec, kind = self.one(tuple(ENCODERS)), self.one((FOXGLOVE, FFMPEG))
-        out = []
-        for packet in self.packets_of(codec):
-            data = self.damaged(packet) if self.chance(0.15) else packet
-            layout = self.one((*TEXTS, *ENCODERS)) if self.chance(0.05) else codec
-            out.append(video_message(self.make, kind, layout, self.make.header(), data))
+        out = [video_message(self.make, kind, codec, self.make.header(), packet) for packet in self.packets_of(codec)]
+        out = [self.mutated(message) if self.chance(0.15) else message for message in out]
         if self.chance(0.2):
             out.insert(int(self.rng.integers(len(out))), out.pop(int(self.rng.integers(len(out)))))
         return out[int(self.chance(0.1)) :]
@@ -230,60 +163,24 @@ class MessageFuzzer:
             self.packets[codec] = encoded([self.picture() for _ in range(5)], codec, 3)
         return self.packets[codec]
 
-    def compressed_cloud(self) -> Any:
-        kinds = [(name, "<f4") for name in ("x", "y", "z", "intensity")] + [("ring", "<u2"), ("time", self.one(("<f4", "<f8")))]
-        columns = scan(self.rng, 4, 30)
-        points = np.zeros(120, kinds)
-        for name in points.dtype.names or ():
-            points[name] = self._column(name, points.dtype[name], columns)
-        layout = self.one(("zlib", "zstd", "draco", "draco"))
-        message = self.make.compressed_cloud(points, layout)
-        for _ in range(int(self.one((0, 1, 1, 2)))):
-            how = self.one((self._cloud_size, self._field, self._fields, self._layout, self._packed, self._packed))
-            how(message)
-        return message
-
-    def _layout(self, message: Any) -> None:
-        message.format = self.one((*TEXTS, "zlib", "zstd", "draco", "cloudini"))
-
-    def _packed(self, message: Any) -> None:
-        message.compressed_data = self.make.data(self.damaged(bytes(message.compressed_data)))
-
-    # ---- cameras ------------------------------------------------------------------------------------------------------
-
     def camera_info(self) -> Any:
-        counts = self.one((DISTORTIONS, DISTORTIONS, OTHER_DISTORTIONS))
-        model = self.one(tuple(counts))
-        P = np.c_[K, np.zeros(3)]
-        D = self.rng.normal(0, self.one((0.0, 0.02, 0.3)), counts[model])
-        message = self.make.camera_info(WIDTH, HEIGHT, K, D, P, model=model)
-        for _ in range(int(self.one((0, 1, 1, 2, 3)))):
-            self._change(message, self.one(("size", "matrix", "matrix", "distortion", "distortion", "model", "part")))
-        return message
+        model = self.one(tuple(DISTORTIONS))
+        D = self.rng.normal(0, self.one((0.0, 0.02, 0.3)), DISTORTIONS[model])
+        return self.mutated(self.make.camera_info(WIDTH, HEIGHT, K, D, np.c_[K, np.zeros(3)], model=model))
 
-    def _change(self, message: Any, what: str) -> None:
-        """Another size, matrix, distortion, model or part of the picture for a CameraInfo."""
-        if what == "model":
-            message.distortion_model = self.one((*DISTORTIONS, *OTHER_DISTORTIONS, "fisheye", "none", "thin_prism", *TEXTS))
-        elif what == "matrix":
-            name = self.one("kkp")
-            values = np.array(getattr(message, name), float)
-            values[self.some(values)] = self.one(FLOATS)
-            if self.chance(0.2):
-                values = np.array(getattr(message, name), float)
-                values[self.some(values)] *= self.one((0.0, -1.0, 1e-3, 1e3))
-            setattr(message, name, values)
-        elif what == "distortion":
-            D = self.rng.normal(0, self.one((0.1, 10.0, 1e6)), int(self.one((0, 1, 2, 3, 4, 5, 8, 12, 14, 15, 1000))))
-            if len(D) and self.chance(0.5):
-                D[self.some(D)] = self.one(FLOATS)
-            message.d = D if self.make.family == "rosbags" else D.tolist()
-        elif what == "size":
-            name = self.one(("width", "height"))
-            setattr(message, name, self.number(getattr(message, name)))
-        else:
-            name = self.one(("binning_x", "binning_y", "x_offset", "y_offset", "width", "height"))
-            setattr(message if name.startswith("binning") else message.roi, name, self.number(2))
+
+def _parts(message: Any) -> Iterator[tuple[Any, str]]:
+    """What can be changed: each field of a message, and of the messages in it, with its owner."""
+    fields = getattr(message, "__dataclass_fields__", None)  # of rosbags; else of rclpy
+    for name in (fields or message.get_fields_and_field_types()) if message is not None else ():
+        if name != "__msgtype__":
+            value = getattr(message, name)
+            within = value if isinstance(value, list) else [value]
+            nested = [own for own in within if hasattr(own, "__dataclass_fields__") or hasattr(own, "get_fields_and_field_types")]
+            if not nested or isinstance(value, list):
+                yield message, name
+            for own in nested:
+                yield from _parts(own)
 
 
 def png_header(width: int, height: int, colour: int, data: bytes = b"") -> bytes:

@@ -1,4 +1,4 @@
-"""Jobs of a few milliseconds for test_pools.py, in a module that workers can import; run, a small evaluation of them."""
+"""Jobs of a few milliseconds for test_pool.py, in a module that workers can import; run, a small evaluation of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pathlib import Path
 from waiting import until
 
 from calib_ros_check.jobs.journal import Answer, Journal
-from calib_ros_check.jobs.local import LocalPool
 from calib_ros_check.jobs.pool import run
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 
@@ -49,18 +48,18 @@ def fall(folder: Path, deaths: int, jobs: Sequence[EvaluationJob]) -> list[Answe
     return work(folder, 0.005, jobs)
 
 
-class Unportable(Exception):
-    """Cannot be pickled."""
-
-    def __init__(self) -> None:
-        super().__init__("no way")
-        self.lock = (n for n in ())
+def hang(jobs: Sequence[EvaluationJob]) -> list[Answer]:
+    """Does not end on frame 3, whoever asks."""
+    if jobs[0].frames[0] == 3:
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+        time.sleep(1000)
+    return answers(jobs)
 
 
 def refuse(error: type[Exception], jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """Raises on frame 3."""
     if jobs[0].frames[0] == 3:
-        raise error() if error is Unportable else error("frame 3 is bad")
+        raise error("frame 3 is bad")
     return answers(jobs)
 
 
@@ -75,7 +74,7 @@ def main(folder: Path, n: int, workers: int, duration: float) -> None:
     """The evaluation of n groups."""
     with Journal(folder, {"version": "1"}) as journal:
         doing = partial(work, folder, duration, workers=workers)
-        run(groups(n), doing, journal, LocalPool(workers), lambda done, total: None)
+        run(groups(n), doing, journal, lambda done, total: None, workers)
 
 
 if __name__ == "__main__":

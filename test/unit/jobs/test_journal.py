@@ -83,20 +83,20 @@ def test_a_journal_killed_at_its_first_line_begins_anew(tmp_path: Path, start: b
     ],
 )
 def test_other_evaluation_names_the_difference(tmp_path: Path, before: dict, now: dict, words: list[str]) -> None:
-    Journal(tmp_path, before).close()
+    with Journal(tmp_path, before):
+        pass
     with pytest.raises(BadInputError, match=r"--out.*--fresh") as caught:
         Journal(tmp_path, now)
     assert all(word in str(caught.value) for word in words)
     assert len(str(caught.value)) < 400
     with Journal(tmp_path, now, fresh=True) as journal:
         assert journal.done == {}
-    Journal(tmp_path, now).close()
 
 
 @pytest.mark.parametrize(
     ("theirs", "fresh", "words"),
     [
-        *((theirs, fresh, "was not written by an evaluation") for fresh in (False, True) for theirs in FOREIGN),
+        *((theirs, fresh, "was not written by this evaluation") for fresh in (False, True) for theirs in FOREIGN),
         (b'{"about":{"a"\n', False, "line 1 is damaged"),
     ],
 )

@@ -12,7 +12,7 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online import glance as module
-from calib_ros.online.glance import EVERY_S, LEAST_KEPT, Glance, depth_edges, in_view, match_loss, nearness_picture
+from calib_ros.online.glance import EVERY_S, LEAST_KEPT, Glance, match_loss
 
 CONFIG = Config()
 KNOCKS = {"1.5 deg": ([0.9, 0.9, 0.8], [0, 0, 0]), "15 cm": ([0, 0, 0], [0.1, -0.1, 0.05])}
@@ -81,24 +81,3 @@ def test_neither_rings_nor_an_order_of_points_are_needed(scene):
     off = se3.perturb(rosette.reference, [0, 2, 0], [0, 0, 0])
     losses = [match_loss(rosette[0], T, CONFIG) for T in (rosette.reference, off)]
     assert losses[1] > losses[0] + 0.5
-
-
-def test_only_what_is_in_view_is_drawn(scene):
-    xyz = scene.frames[0].cloud.xyz
-    seen = in_view(xyz, scene.truth, scene.camera, 1.0)
-    _, inside = scene.camera.project(se3.transform(scene.truth, xyz.astype(float)))
-    assert len(seen) < 0.25 * len(xyz)
-    assert set(np.flatnonzero(inside & (np.linalg.norm(xyz, axis=1) >= 1.0))) <= set(seen)
-    nearness = nearness_picture(scene.frames[0], scene.truth, CONFIG)
-    assert 1 / nearness[nearness > 0].min() <= np.linalg.norm(xyz[seen], axis=1).max() + 3.0
-
-
-def test_depth_edges_lie_on_the_nearer_side():
-    nearness = np.full((40, 60), 1 / 20, np.float32)
-    nearness[10:30, 20:40] = 1 / 5
-    nearness[::2] = 0  # every second row is empty
-    across, down = depth_edges(nearness)
-    assert np.array_equal(np.unique(np.nonzero(across)[1]), [20, 39])
-    assert np.array_equal(np.unique(np.nonzero(down)[0]), [11, 29])  # the first and the last row of the near ones that is drawn
-    sparse = np.where(np.arange(40)[:, None] % 8 == 0, nearness + 0.05, 0).astype(np.float32)
-    assert not depth_edges(sparse)[1].any()

@@ -31,27 +31,23 @@ def hist(*values: float) -> np.ndarray:
 # --- eq. 3.15 -------------------------------------------------------------------------------------------------------------
 
 
+ONE, HALVES = hist(1.0), hist(0.5, 0.5)
+
+
 @pytest.mark.parametrize(
     ("first", "second", "expected"),
     [
-        ((1.0,), (1.0,), 1.0),
-        ((0.5, 0.5), (0.5, 0.5), 1.0),
-        ((1.0,), (0.0, 1.0), 0.0),
-        ((0.5, 0.5), (0.5, 0.25, 0.25), 0.75 / 1.25),
-        ((0.2, 0.3, 0.5), (0.5, 0.3, 0.2), (0.2 + 0.3 + 0.2) / (2 - 0.7)),
-        ((1.0,), (0.25, 0.75), 0.25 / 1.75),
+        (ONE, ONE, 1.0),
+        (ONE, hist(0.0, 1.0), 0.0),
+        (HALVES, hist(0.5, 0.25, 0.25), 0.75 / 1.25),
+        (hist(0.2, 0.3, 0.5), hist(0.5, 0.3, 0.2), (0.2 + 0.3 + 0.2) / (2 - 0.7)),
+        # The mean of the channels; a grey and a colour picture have nothing in common.
+        (np.r_[ONE, ONE, HALVES], np.r_[ONE, hist(0.0, 1.0), hist(0.5, 0.25, 0.25)], (1 + 0 + 0.6) / 3),
+        (np.r_[ONE, ONE, HALVES], ONE, 0.0),
     ],
 )
 def test_similarity_is_the_overlap_over_the_union(first, second, expected):
-    for a, b in ((first, second), (second, first)):
-        assert similarity(hist(*a), hist(*b)) == pytest.approx(expected, abs=1e-6)
-
-
-def test_similarity_of_colours_is_the_mean_of_the_channels():
-    a = np.concatenate([hist(1.0), hist(1.0), hist(0.5, 0.5)])
-    b = np.concatenate([hist(1.0), hist(0.0, 1.0), hist(0.5, 0.25, 0.25)])
-    assert similarity(a, b) == pytest.approx((1 + 0 + 0.6) / 3, abs=1e-6)
-    assert similarity(a, a[:1]) == 0  # a grey and a colour picture have nothing in common
+    assert similarity(first, second) == similarity(second, first) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_histogram_holds_the_shares_of_each_channel():
@@ -95,21 +91,17 @@ def test_nothing_above_the_static_similarity_is_a_keyframe(threshold):
     assert offer_all(selector, [still, nearly, changed], period_s=100) == [True, False, True]
 
 
-def played(selector: KeyframeSelector, pictures: list[np.ndarray], *steps: tuple[int, float]) -> list[bool]:
-    """Pictures by their number, at these seconds."""
-    return [selector.select(pictures[k], round(t * NANOSECONDS)) for k, t in steps]
-
-
-def test_after_a_while_a_small_change_is_enough():
-    pictures = brightening(0.025, 2)  # similarity 0.951: too alike, yet not the same
-    selector = KeyframeSelector(CONFIG)
-    seen = played(selector, pictures, (0, 0.0), (1, 0.99), (1, 1.0), (0, 1.99), (0, 2.0))  # counted from the last keyframe
-    assert seen == [True, False, True, False, True]
-
-
-def test_a_clock_that_was_set_back_does_not_stop_the_keyframes():
-    seen = played(KeyframeSelector(CONFIG), brightening(0.025, 2), (0, 1e6), (1, 5.0), (0, 5.5), (1, 4.0))
-    assert seen == [True, True, False, False]  # the last one shows the same
+@pytest.mark.parametrize(
+    ("steps", "taken"),
+    [
+        ([(0, 0.0), (1, 0.99), (1, 1.0), (0, 1.99), (0, 2.0)], [True, False, True, False, True]),  # a second from the last one
+        ([(0, 1e6), (1, 5.0), (0, 5.5), (1, 4.0)], [True, True, False, False]),  # the clock was set back; the last shows the same
+    ],
+)
+def test_after_a_while_a_small_change_is_enough(steps, taken):
+    """Pictures by their number, at these seconds: their similarity is 0.951, too alike, yet not the same."""
+    selector, pictures = KeyframeSelector(CONFIG), brightening(0.025, 2)
+    assert [selector.select(pictures[k], round(t * NANOSECONDS)) for k, t in steps] == taken
 
 
 def test_keyframes_keep_their_distance_in_time():

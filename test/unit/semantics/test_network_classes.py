@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import re
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from calib_ros.datasets.kitti import KittiSource
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import UNLABELLED, PointCloud
 from calib_ros.frame import SemanticClass as C
-from calib_ros.registration.classes import CLOUD, IMAGE, MASKS
+from calib_ros.registration.classes import CLOUD, IMAGE
 from calib_ros_semantics.models.cloud_classes import (
     BONNETAL,
     CENET,
@@ -153,25 +153,6 @@ EXPORTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", EXPORTS)
-def test_networks_for_pictures_put_every_class_at_its_place(tmp_path: Path, name: str) -> None:
-    (classes, names, size, margin, channel, yaml, says), graph = EXPORTS[name]
-    path = segmentation(tmp_path / "n.onnx", classes, names=graph.pop("names_of_tensors", None), **graph)
-    network = pixel_model(str(beside(path, yaml)), CONFIG)
-    for first in (0, 11) if classes > ROWS * COLUMNS else (0,):
-        numbers = blocks(*size, classes, first)
-        image = picture(numbers, classes, channel or 0)
-        found = network(frame_of(image if channel is not None else image[..., 0].copy()), later()).classes
-        assert found.shape == size
-        assert found.dtype == np.uint8
-        keep = inner(numbers, margin)
-        assert keep.mean() > 0.3
-        assert np.array_equal(found[keep], lookup(names)[numbers[keep]])
-    scores = any(not part.strip().startswith(("argmax", "edge")) for part in graph["outputs"].split(";"))
-    assert (f"scores of {classes} classes" if scores else "class numbers") in network.describe()
-    assert says in network.describe()
-
-
 def test_what_is_assumed_of_a_network_is_said(tmp_path: Path) -> None:
     path = segmentation(tmp_path / "n.onnx", 34, "argmax 1 256 512")
     network = pixel_model(str(path), CONFIG)
@@ -226,81 +207,6 @@ def test_label_dataset_is_chosen_once() -> None:
     assert table.classes(low).tolist() == [[C.GROUND, C.GROUND], [C.BUILDING, UNLABELLED]]
     for numbers in (np.array([60]), low):
         assert "7 to 60 so far, are those of no known" in error_of(lambda numbers=numbers: table.classes(numbers))
-
-
-SCORES, MEANS = {"outputs": "o 1 19 256 512"}, {"outputs": "mean 1 19 1 1"}
-REFUSED = [
-    (SCORES, "labels: [road, sky]", "names 2 classes by 'labels:', but the network gives scores of 19"),
-    (SCORES, "labels: {19: road}", "but the network gives scores of 19"),
-    (SCORES, "labels: {0: raod}", "class name 'raod' is unknown; map it to one of other, vehicle"),
-    (SCORES, "labels: kitti", "labels = 'kitti' is none of cityscapes"),
-    (SCORES, "output: b", "there is no output 'b'"),
-    (SCORES, "mean: [1, 2]", "'mean:' of the YAML beside it must have 1 or 3 numbers"),
-    (SCORES, "size: [512, 512]", "does not run at the height and width [512, 512]"),
-    (SCORES, "channels: [range, x]", "must be rgb or bgr"),
-    (SCORES, "family: zzz", "family 'zzz' is unknown; known are mmsegmentation, pidnet"),
-    ({"outputs": "s ?", "inputs": DYNAMIC}, "size: [16384, 16384]", "[height, width], each 8 to 8192 px"),
-    ({"classes": 3, "outputs": "s 1 3 256 512"}, "labels: [object, void, unknown]", "none of its classes is of use here"),
-    ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "scores of 7 classes, which are of no known dataset"),
-    ({"classes": 7, "outputs": "o 1 7 256 512"}, "", "inputs: input float32 1x3x256x512; outputs: o float32 1x7x256x512"),
-    (MEANS, "", "none of its outputs is a map of classes"),
-    ({"classes": 256, "inputs": "1 3 64 64", "outputs": "s 1 256 64 64"}, "", "If it is Segment Anything, it goes to semantics"),
-    ({"inputs": "1 5 64 1024", "outputs": "o 1 19 64 1024", "normal": ([0] * 5, [1] * 5)}, "", "takes one picture as 1x3xHxW"),
-    (
-        {"inputs": "1 3 1024 2048", "outputs": "s 1 19 4096 8192", "enlarged": 4},
-        *("", "takes 2.6 GB for an input of 1024x2048, and at most 1 GB are taken; export it for 640x1280 or less"),
-    ),
-    (
-        {"inputs": "1 3 4096 8192", "outputs": "argmax 1 4096 8192"},
-        *("", "pictures of 4096x8192, which need gigabytes inside the network; at most 8.4 million pixels"),
-    ),
-]
-
-
-@pytest.mark.parametrize(("graph", "yaml", "says"), REFUSED)
-def test_networks_for_pictures_that_cannot_be_used(tmp_path: Path, graph: dict, yaml: str, says: str) -> None:
-    text = error_of(lambda: pixel_model(str(beside(segmentation(tmp_path / "n.onnx", **graph), yaml)), CONFIG))
-    assert says in text
-    assert str(tmp_path / "n.") in text
-
-
-def made(path: Path, *outputs: tuple) -> Path:
-    """A graph that takes a picture and gives outputs of these shapes, all of them 0."""
-    names = [f"o{k}" for k in range(len(outputs))]
-    constants = {f"z{k}": np.zeros(shape, np.float32) for k, shape in enumerate(outputs)}
-    nodes = [helper.make_node("ReduceMean", ["i"], ["m"], axes=[0, 1, 2, 3], keepdims=0)]
-    nodes += [helper.make_node("Add", ["m", f"z{k}"], [name]) for k, name in enumerate(names)]
-    declared = [value(name, list(shape)) for name, shape in zip(names, outputs, strict=True)]
-    return save(path, nodes, [value("i", [1, 3, 320, 320])], declared, constants)
-
-
-OTHERS = {
-    "YOLOv8": ((1, 84, 2100),),
-    "YOLOv5": ((1, 6300, 85),),
-    "boxes after NMS": ((1, 300, 6),),
-    "corners and scores": ((100, 4), (100,)),
-    "heads by anchor": ((1, 3, 40, 40, 85), (1, 3, 20, 20, 85)),
-    "heads of COCO": ((1, 255, 40, 40), (1, 255, 20, 20), (1, 255, 10, 10)),
-    "heads of two classes": ((1, 28, 40, 40), (1, 28, 20, 20)),
-    "FastSAM": ((1, 37, 2100), (1, 32, 80, 80)),
-    "encoder of Segment Anything": ((1, 256, 20, 20),),
-    "encoder of SAM2": ((1, 32, 80, 80), (1, 64, 40, 40), (1, 256, 20, 20)),
-    "classifier": ((1, 1000),),
-    "classifier of 19 classes": ((1, 19, 1, 1),),
-    "a network for classes": ((1, 19, 320, 320),),
-}
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_networks_of_other_kinds_are_refused(tmp_path: Path, name: str) -> None:
-    """Also where they are meant for the other parameter."""
-    path = str(made(tmp_path / "n.onnx", *OTHERS[name]))
-    if name != "a network for classes":
-        assert re.search("none of its outputs is a map|which are of no known", error_of(lambda: pixel_model(path, CONFIG)))
-    if name not in ("FastSAM", "heads of COCO"):
-        said = error_of(lambda: load_model(MASKS, path, CONFIG))
-        assert "set semantics.segment_anything_decoder" in said
-        assert "networks for classes go to semantics.image_classes" in said
 
 
 @pytest.mark.parametrize(
@@ -389,7 +295,7 @@ def assert_labels(network: SegmentationModel, family: str, channel: str, cloud: 
 
 
 TOLD = f"mean: {[CENET[c][0] for c in RANGE_FIRST[:5]]}\nstd: {[CENET[c][1] for c in RANGE_FIRST[:5]]}"
-SCAN_EXPORTS = {
+EXPORTS |= {
     "SalsaNext": ("bonnetal", {"name": "salsanext"}, "", BANDS),
     "CENet": ("cenet", {"name": "CENet_64x1024"}, "", BANDS),
     "SqueezeSeg": ("squeezeseg", {}, "", BANDS),
@@ -400,7 +306,7 @@ SCAN_EXPORTS = {
     "dynamic": ("bonnetal", {"size": ("height", "width")}, ""),
     "dynamic SqueezeSeg": ("squeezeseg", {"size": ("height", "width")}, ""),
     "dynamic width": ("bonnetal", {"size": (64, "width"), "outputs": ["softmax"]}, ""),
-    "channels last": ("squeezeseg", {"last": True}, ""),
+    "scan, channels last": ("squeezeseg", {"last": True}, ""),
     "mask": ("squeezeseg", {"last": True, "mask": [1, 64, 1024, 1]}, ""),
     "mask without channel": ("squeezeseg", {"mask": [1, 64, 1024]}, ""),
     "mask first": ("bonnetal", {"mask": [1, 1, 64, 1024]}, ""),
@@ -411,14 +317,37 @@ SCAN_EXPORTS = {
 }
 
 
-@pytest.mark.parametrize("name", SCAN_EXPORTS)
-def test_networks_for_scans_give_each_point_the_class_of_its_value(tmp_path: Path, name: str) -> None:
-    family, graph, yaml, *channels = SCAN_EXPORTS[name]
-    for channel in channels[0] if channels else ("range", "y"):
-        network = point_model(str(beside(scan_network(tmp_path, family, channel, **graph), yaml)), CONFIG)
+@pytest.mark.parametrize("name", EXPORTS)
+def test_every_export_puts_every_class_at_its_place(tmp_path: Path, name: str) -> None:
+    first, *others = EXPORTS[name]
+    (assert_scan if isinstance(first, str) else assert_picture)(tmp_path, first, *others)
+
+
+def assert_picture(folder: Path, expected: tuple, graph: dict) -> None:
+    classes, names, size, margin, channel, yaml, says = expected
+    own = {key: given for key, given in graph.items() if key != "names_of_tensors"}
+    path = segmentation(folder / "n.onnx", classes, names=graph.get("names_of_tensors"), **own)
+    network = pixel_model(str(beside(path, yaml)), CONFIG)
+    for first in (0, 11) if classes > ROWS * COLUMNS else (0,):
+        numbers = blocks(*size, classes, first)
+        image = picture(numbers, classes, channel or 0)
+        found = network(frame_of(image if channel is not None else image[..., 0].copy()), later()).classes
+        assert found.shape == size
+        assert found.dtype == np.uint8
+        keep = inner(numbers, margin)
+        assert keep.mean() > 0.3
+        assert np.array_equal(found[keep], lookup(names)[numbers[keep]])
+    scores = any(not part.strip().startswith(("argmax", "edge")) for part in graph["outputs"].split(";"))
+    assert (f"scores of {classes} classes" if scores else "class numbers") in network.describe()
+    assert says in network.describe()
+
+
+def assert_scan(folder: Path, family: str, graph: dict, yaml: str, channels: Iterable[str] = ("range", "y")) -> None:
+    for channel in channels:
+        network = point_model(str(beside(scan_network(folder, family, channel, **graph), yaml)), CONFIG)
         assert_labels(network, family, channel, scan())
         assert network.note == ""
-        assert not channels or network.describe().startswith(f"{family}: 64x1024 ")
+        assert channels is not BANDS or network.describe().startswith(f"{family}: 64x1024 ")
 
 
 def test_assumed_statistics_are_said(tmp_path: Path) -> None:
@@ -520,27 +449,6 @@ def test_classes_of_a_street_come_back_to_its_points() -> None:
         taken = pixels[view.row, view.column]
         behind = np.abs(view.ranges[view.row, view.column] - view.range) > 5
         assert np.mean(found[behind] == cloud.label[behind]) > np.mean(taken[behind] == cloud.label[behind]) + 0.2
-
-
-def test_networks_for_scans_that_cannot_be_used(tmp_path: Path) -> None:
-    groups = [(kind, [1, 11, 64, 2048], [1, 11, 16, 8192]) for kind in ("i", "o")]
-    inputs, outputs = ([value(f"{kind}{k}", shape) for k, shape in enumerate(shapes)] for kind, *shapes in groups)
-    nodes = [helper.make_node("Identity", [f"i{k}"], [f"o{k}"]) for k in (0, 1)]
-    usual = scan_network(tmp_path, "bonnetal")
-    for path, yaml, says in (
-        (segmentation(tmp_path / "n.onnx"), "", "takes one range image as 1xCxHxW or 1xHxWxC of 5 or 6 channels"),
-        (range_network(tmp_path / "7.onnx", centres(7), 0, [0] * 5, [1] * 5), "", "scores of 7 classes, which are of no known"),
-        (save(tmp_path / "mininet.onnx", nodes, inputs, outputs), "", "groups of neighbours, as 3D-MiniNet takes them"),
-        (usual, "family: pointnet", "family 'pointnet' is unknown; known are bonnetal"),
-        (usual, "channels: rgb", "must be a list of range, x, y, z, remission, mask"),
-        (usual, "channels: [range, x, y, z, colour]", "must be a list of range"),
-        (usual, "channels: [range, x, y, z, depth]", "must be a list of range, x, y, z, remission, mask, each once"),
-        (usual, "channels: [range, x, y]", "of 3 channels"),
-        (usual, "mean: [1, 2, 3]", "'mean:' must have 5 numbers"),
-        (usual, "size: [64, 512]", "does not run at the height and width"),
-        (usual, "labels: [car]", "names 1 classes"),
-    ):
-        assert says in error_of(lambda path=path, yaml=yaml: point_model(str(beside(path, yaml)), CONFIG))
 
 
 def test_labels_of_the_source(drive: SyntheticDrive) -> None:

@@ -131,9 +131,6 @@ def test_the_yaml_beside_the_encoder_tells_the_family(tmp_path: Path) -> None:
     (tmp_path / "encoder.yaml").write_text("family: mobile_sam\nmean: [0.485, 0.456, 0.406]\nstd: [0.229, 0.224, 0.225]\n")
     assert segmenter_of(settings(encoder, decoder)).describe().startswith("Segment Anything (mobilesam), 5 prompts")
     assert_finds(settings(encoder, decoder), IMAGE, TRUTH)
-    (tmp_path / "encoder.yaml").write_text("family: segnet\n")
-    with pytest.raises(ModelError, match=r"family 'segnet'.*mobilesam.*efficientsam"):
-        segmenter_of(settings(encoder, decoder))
 
 
 @pytest.mark.parametrize(
@@ -157,20 +154,13 @@ def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text
     (tmp_path / "encoder.yaml").write_text(text)
     image = np.full((64, 64, 3), COLOUR, np.uint8)
     halves = segmenter_of(settings(encoder, decoder))
-    embedded = halves.encoder(image, later())
+    embedded = halves.embedded(image, later())
     cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
     assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
     network = segmentation(tmp_path / "net.onnx", 19, "o 1 19 64 64", inputs="1 3 64 64")
     network.with_suffix(".yaml").write_text(text)
     fed = load_model("image_classes", str(network), SemanticsConfig()).feed(image)["input"]
     assert fed[0, :, 50, 50] == pytest.approx(expected, abs=1e-3)
-
-
-def test_a_yaml_that_no_picture_fits(tmp_path: Path) -> None:
-    for model in (official(tmp_path), (in_wide(tmp_path),)):
-        Path(model[0]).with_suffix(".yaml").write_text("std: [1, 2, 3, 4]")
-        with pytest.raises(ModelError, match=rf"{Path(model[0]).name}: 'std:' of the YAML beside it must have 1 or 3 numbers"):
-            segmenter_of(settings(*model))
 
 
 def test_the_yaml_beside_the_decoder_names_the_masks(tmp_path: Path) -> None:
@@ -240,10 +230,6 @@ def test_fast_sam_with_a_yaml(tmp_path: Path) -> None:
     assert len(segment(settings(path), IMAGE)) == 0  # the first table has no detections
     yaml.write_text("output: output0")
     assert_finds_things(path)
-    for name in ("nothing", "many"):
-        yaml.write_text(f"output: {name}")
-        with pytest.raises(ModelError, match=rf"fast\.onnx: '{name}', which 'output:'.*outputs: empty"):
-            segmenter_of(settings(path))
 
 
 @pytest.mark.parametrize(("column", "bad"), [("c0", np.nan), ("c3", np.inf), ("c3", -np.inf), ("c5", np.nan), ("c5", np.inf)])
@@ -253,36 +239,17 @@ def test_fast_sam_drops_nan_detections(tmp_path: Path, column: str, bad: float) 
     assert masks[0].box == pytest.approx(list(TWO_ALIKE)[1], abs=4)
 
 
-def test_fast_sam_with_nms_inside_is_refused(tmp_path: Path) -> None:
-    says = r"fast\.onnx: it was exported with NMS inside; export it with nms=False"
-    for metadata in ({"nms": "True"}, {"end2end": "True"}, {"args": "{'batch': 1, 'half': False, 'nms': True}"}):
-        with pytest.raises(ModelError, match=says):
-            segmenter_of(settings(in_wide(tmp_path, metadata=metadata)))
+def test_fast_sam_with_nms_inside_that_its_file_does_not_tell(tmp_path: Path) -> None:
+    """Corners, confidence, class, coefficients, filled up with nothing; fewer rows than columns, too."""
     without = {"nms": "False", "args": "{'batch': 1, 'nms': False}", "end2end": "False"}
     assert_finds_things(in_wide(tmp_path, metadata=without))
-    # Nothing said: corners, confidence, class, coefficients, filled up with nothing; fewer rows than columns, too.
     rows = np.zeros((300, 9))
     rows[:3] = [[*np.add(box, [0, TOP, 0, TOP]), 0.9, 0, *one] for box, one in zip(WIDE, np.eye(3), strict=True)]
     palette = np.array(list(WIDE.values()))[:, ::-1] / 255
     for count in (300, 5):
         path = graphs.fast_sam(tmp_path / "fast.onnx", 640, rows[:count], palette, transposed=True)
-        with pytest.raises(ModelError, match=says):
+        with pytest.raises(ModelError, match="it was exported with NMS inside"):
             segment(settings(path), IMAGE)
-
-
-def test_files_without_an_encoder_decoder_pair_are_refused(tmp_path: Path) -> None:
-    encoder, decoder = official(tmp_path)
-    small = graphs.encoder(tmp_path / "small.onnx", side=512)
-    for pair, says in (
-        ((encoder, graphs.other(tmp_path / "o.onnx")), r"encoder\.onnx and .*o\.onnx are no pair.*image_embeddings.*FastSAM"),
-        ((decoder, encoder), r"no pair"),
-        ((small, decoder), r"the encoder gives image_embeddings.*32x32.*decoder takes.*64x64"),
-        ((encoder,), r"semantics\.segment_anything_decoder"),
-        ((graphs.other(tmp_path / "o.onnx"),), r"semantics\.segment_anything_decoder"),
-        ((encoder, str(tmp_path / "gone.onnx")), r"gone\.onnx.*no such file"),
-    ):
-        with pytest.raises(ModelError, match=says):
-            segmenter_of(settings(*pair))
 
 
 def test_deadline_ends_segmentation(tmp_path: Path) -> None:
