@@ -1,7 +1,7 @@
 """How far the current extrinsic is to be relied on: the tracker's states, and what leads from one to another.
 
-docs/online.md shows the table as a drawing, made by tools/draw_states.py. A suspicion of the monitor and a blind sensor are no
-states: they come and go over any of these, and what was known before holds again afterwards.
+docs/online.md shows the table. A suspicion of the monitor and a blind sensor are no states: they come and go over any of these,
+and what was known before holds again afterwards.
 """
 
 from __future__ import annotations

@@ -66,9 +66,7 @@ def test_a_drive_succeeds_where_the_displacement_alone_is_told() -> None:
     own = trial("online", length=10, knock_at=5, knock=knock.tolist())
     told = answer([0.0] * 6, "suspect") | {"settled": True, "alarm": False, "noticed_s": 1.0}
     assert outcome(own, told).success == 1.0
-    assert [outcome(own, told | change).success for change in ({"noticed_s": 9.0}, {"noticed_s": None}, {"alarm": True})] == [
-        0
-    ] * 3
+    assert not any(outcome(own, told | change).success for change in ({"noticed_s": 9.0}, {"noticed_s": None}, {"alarm": True}))
     unseen = outcome(own, told | {"status": "converged", "noticed_s": None})
     assert (unseen.success, unseen.accepted_wrong) == (0.0, 1.0)  # it still says where the LiDAR was
 
@@ -127,10 +125,8 @@ def test_sets_of_a_recording_share_no_frames_and_starts_are_drawn_by_number() ->
     assert all(se3.rotation_error_deg(frames[0].reference, T) > 0.1 for T in starts)
     assert len({T.tobytes() for T in starts}) == 4
     turned, shifted = (next(laps(Recording("online", SMALL, k), frames, 0, None)) for k in (1, 0))
-    sizes = [
-        (np.rad2deg(np.linalg.norm(x[:3])), np.linalg.norm(x[3:]))
-        for x in (se3.log(np.array(t.knock)) for t in (turned, shifted))
-    ]
+    knocks = [se3.log(np.array(one.knock)) for one in (turned, shifted)]
+    sizes = [(np.rad2deg(np.linalg.norm(x[:3])), np.linalg.norm(x[3:])) for x in knocks]
     np.testing.assert_allclose(sizes, [(1.5, 0.0), (0.0, 0.15)], atol=1e-9)
 
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import venv
 import xml.etree.ElementTree as ET
+from email.message import Message
 from email.parser import Parser
 from pathlib import Path
 from zipfile import ZipFile
@@ -61,11 +62,15 @@ def wheel(dist):
     return built
 
 
+def metadata_of(wheel: Path) -> Message:
+    with ZipFile(wheel) as file:
+        (name,) = (name for name in file.namelist() if name.endswith(".dist-info/METADATA"))
+        return Parser().parsestr(file.read(name).decode())
+
+
 def link_requirements(environment: Path, wheel: Path, extra: str = "") -> None:
     """What the wheel requires, and what that requires, as links into the environment that runs the tests: nothing to download."""
-    with ZipFile(wheel) as file:
-        metadata = file.read(next(name for name in file.namelist() if name.endswith(".dist-info/METADATA"))).decode()
-    lines = [(line, extra) for line in Parser().parsestr(metadata).get_all("Requires-Dist") or []]
+    lines = [(line, extra) for line in metadata_of(wheel).get_all("Requires-Dist") or []]
     seen = {"calib-ros", "calib-ros-msgs"}
     while lines:
         line, extra = lines.pop()
@@ -109,9 +114,7 @@ def test_it_holds_all_packages_with_types_weights_and_shared_files(wheel):
 
 @slow
 def test_its_metadata_name_version_requirements_and_extras(wheel):
-    with ZipFile(wheel) as file:
-        (name,) = (name for name in file.namelist() if name.endswith("METADATA"))
-        metadata = Parser().parsestr(file.read(name).decode())
+    metadata = metadata_of(wheel)
     package = ET.parse(ROOT / "package.xml").getroot()
     assert metadata["Name"] == package.findtext("name") == "calib_ros"
     assert metadata["Version"] == package.findtext("version") == calib_ros.__version__

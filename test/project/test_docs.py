@@ -16,6 +16,7 @@ from calib_ros import __version__
 from calib_ros.cli.main import main
 from calib_ros.config import Config
 from calib_ros.config.removed import REMOVED
+from calib_ros.online.tracker_states import TRANSITIONS, TrackerEvent, TrackerState
 from calib_ros.ros.parameters import SETTINGS
 
 DOCUMENT = ROOT / "docs/method.md"
@@ -103,6 +104,15 @@ def test_tables_of_figures_are_linked_and_whole() -> None:
         assert {len(row) for row in rows} == {len(header)}, path.name
 
 
+def test_the_table_of_states_is_that_of_the_tracker() -> None:
+    rows = [["from", *(event.name.lower().replace("_", " ") for event in TrackerEvent)]]
+    for state in TrackerState:
+        after = (TRANSITIONS.get((state, event)) for event in TrackerEvent)
+        rows.append([state.name.lower(), *(there.name.lower() if there else "" for there in after)])
+    shown = re.findall(r"^\| (?:from|initial|tentative|confirmed|lost) .*$", (ROOT / "docs/online.md").read_text(), re.MULTILINE)
+    assert [[cell.strip() for cell in line.split("|")[1:-1]] for line in shown] == rows
+
+
 def test_commands_in_the_text_exist() -> None:
     """`python -m benchmarks.NAME` and the like are modules of the repository."""
     for page in PAGES:
@@ -166,13 +176,8 @@ def test_fences_are_closed_and_braces_match() -> None:
         assert line.count("$") % 2 == 0, line
 
 
-def test_pictures_have_words_and_captions() -> None:
-    for words, path, caption in SHOWN:
-        assert len(words) > 15, path
-        assert caption.startswith("*"), path
-
-
-def test_the_pictures_are_small_and_all_shown() -> None:
+def test_the_pictures_are_small_and_all_shown_with_words_and_captions() -> None:
+    assert all(len(words) > 15 and caption.startswith("*") for words, _, caption in SHOWN)
     files = sorted(PICTURES.iterdir())
     assert [file.name for file in files] == sorted(Path(path).name for _, path, _ in SHOWN)
     assert sum(file.stat().st_size for file in files) < 2e6
