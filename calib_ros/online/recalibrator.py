@@ -185,10 +185,8 @@ class Recalibrator:
             # Another estimate tells nothing new while all new keyframes move as those in the last one.
             waits = self.tracker.awaits_motion and self._keyframes_fit
             waits = waits and self._seen_motion.covers(list(self.buffer)[-self.keyframes.new :])
-            rest_s = self.config.online.rest_period_s if waits else 0.0
-            if self.at_rest:
-                rest_s = self.schedule.estimates_at_rest_s
-            return self.schedule.due(rest_s, self.tracker.lost or (self.tracker.tentative and not waits)) and self._has_enough()
+            urgent = self.tracker.lost or (self.tracker.tentative and not waits)
+            return self.schedule.due(self.at_rest, waits, urgent) and self._has_enough()
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
