@@ -42,7 +42,16 @@ class Command(Protocol):
 
 
 class NodeService:
-    """A service of the node, to be inherited from. Used on the executor's thread."""
+    """A part of the node, such as a service, to be inherited from. Used on the executor's thread, but for add."""
+
+    def start(self) -> None:
+        """The node is active from now on: it receives messages and makes estimates."""
+
+    def check(self) -> None:
+        """To be called about once a second while it is active."""
+
+    def pause(self) -> None:
+        """It is not active any more; what has been found stays."""
 
     def stop(self) -> None:
         """The node ends: no thread of the service's own may go on. Called once, after the pipeline's threads have ended."""
@@ -52,6 +61,9 @@ class NodeService:
 
     def status(self) -> Any:
         """A diagnostic_msgs/DiagnosticStatus for /diagnostics, asked for every second; None = nothing to say."""
+
+    def add(self, event: Any) -> None:
+        """Any event of the pipeline (calib_ros/online/events.py); on any thread."""
 
 
 @cache

@@ -188,14 +188,14 @@ def _play(args: argparse.Namespace) -> int:
     from calib_ros.cli.output import progress_bar
 
     try:
-        from calib_ros.ros.bags import PlayOptions, play
+        from calib_ros.ros.bags import play
     except ImportError as error:
         raise CalibrationError(
             f"playing needs ROS 2 ({error.name} is missing); source your ROS install or pip install 'calib_ros[ros]'"
         ) from None
-    options = PlayOptions(args.rate, args.loop, args.clock, args.wait, follow=args.follow)
+    options = args.rate, args.loop, args.clock, args.wait, args.follow
     with progress_bar("playing") as step:
-        counts = play(args.bag, options, lambda text: print(text, file=sys.stderr), step)
+        counts = play(args.bag, lambda text: print(text, file=sys.stderr), step, *options)
     for topic, count in counts.items():
         print(f"{count:7d}  {topic}")
     return OK

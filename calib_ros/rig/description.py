@@ -6,6 +6,7 @@ import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,10 @@ class Sensor:
     sigma_m: float = SIGMA_M
     mask: str = ""
 
+    def believed(self, T: Transform) -> tuple[Transform, Covariance]:
+        """T_reference_sensor (4, 4) as its prior, with the covariance (6, 6) of a left twist, rad and m."""
+        return T, prior_covariance(T, self.sigma_deg, self.sigma_m)
+
 
 @dataclass(frozen=True, eq=False)
 class RigDescription:
@@ -70,6 +75,16 @@ class RigDescription:
     def lidars(self) -> tuple[str, ...]:
         """Names of the LiDARs."""
         return tuple(sensor.name for sensor in self.sensors if sensor.kind == LIDAR)
+
+    @property
+    def lidar_pairs(self) -> list[tuple[str, str]]:
+        """The pairs of two LiDARs."""
+        return [pair for pair in self.pairs or combinations(self.lidars, 2) if self[pair[0]].kind == LIDAR]
+
+    @property
+    def camera_pairs(self) -> list[tuple[str, str]]:
+        """The pairs of a camera and a LiDAR, whether they share a view or not where no pairs are given."""
+        return [pair for pair in self.pairs or product(self.cameras, self.lidars) if self[pair[0]].kind == CAMERA]
 
 
 def prior_covariance(T: Transform, sigma_deg: float, sigma_m: float) -> Covariance:

@@ -3,9 +3,8 @@ joined by how they move. Scans are read, searched for edges and aligned once, wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -25,9 +24,9 @@ from calib_ros.registration.features import FeatureExtractor, ScanEdges
 from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
-from calib_ros.rig.description import CAMERA, RigDescription, prior_covariance
+from calib_ros.rig.description import RigDescription
 from calib_ros.rig.graph import Edge, RigSolution, solve
-from calib_ros.rig.lidars import SHARED, UNKNOWN_M, LidarScans, motion_edge, scan_edge, shared_view
+from calib_ros.rig.lidars import MOTION_KIND, SCANS_KIND, SHARED, UNKNOWN_M, LidarScans, motion_edge, scan_edge, shared_view
 
 # Half width of a search: two standard deviations of what the priors say, but no less than the odd centimetre of a mount.
 SIGMAS, LEAST_DEG, LEAST_M = 2.0, 0.5, 0.05
@@ -61,7 +60,7 @@ def priors_of(description: RigDescription, rig: RigSource) -> dict[str, tuple[Tr
                 f"{rig.name} does not state where {sensor.name} is; set sensors.{sensor.name}.prior to translation_m and "
                 "quaternion_xyzw, or a result file"
             )
-        found[sensor.name] = T, prior_covariance(T, sensor.sigma_deg, sensor.sigma_m)
+        found[sensor.name] = sensor.believed(T)
     return found
 
 
@@ -116,22 +115,18 @@ class RigMeasurer:
 
     def between_lidars(self) -> list[Measurement]:
         """Edges of all pairs of LiDARs."""
-        given, prior = self.description.pairs, self.solution([])
-        pairs = list(combinations(self.description.lidars, 2))
-        if given is not None:
-            pairs = [(a, b) for a, b in given if self.description[a].kind != CAMERA]
-        out = []
+        prior, pairs, out = self.solution([]), self.description.lidar_pairs, []
         for k, (a, b) in enumerate(pairs):
             self.progress(f"{a} with {b}", k / len(pairs))
             T, _ = prior.between(a, b)
             ends = (a, self.scans[a]), (b, self.scans[b])
-            out.append(self._tried(a, b, "scans", scan_edge, *ends, T) if self._share(a, b, T) else _apart(a, b))
+            if shared_view(self.scans[a], self.scans[b], T) >= SHARED:
+                out.append(self._tried(a, b, SCANS_KIND, scan_edge, *ends, T))
+            else:
+                out.append(Measurement(a, b, SCANS_KIND, None, "by their priors they share no view"))
             if out[-1].edge is None:
-                out.append(self._tried(a, b, "motion", motion_edge, *ends, T))
+                out.append(self._tried(a, b, MOTION_KIND, motion_edge, *ends, T))
         return out
-
-    def _share(self, a: str, b: str, T: Transform) -> bool:
-        return shared_view(self.scans[a], self.scans[b], T) >= SHARED
 
     def _tried(self, target: str, source: str, kind: str, make: Callable[..., Edge], *given: Any) -> Measurement:
         try:
@@ -141,9 +136,10 @@ class RigMeasurer:
 
     def camera_pairs(self, known: RigSolution) -> list[tuple[str, str]]:
         """The pairs of a camera and a LiDAR to register: as described, else all that share a view."""
+        pairs, lidars = self.description.camera_pairs, self.description.lidars
         if self.description.pairs is not None:
-            return [(a, b) for a, b in self.description.pairs if self.description[a].kind == CAMERA]
-        return [(c, lid) for lid in self.description.lidars for c in self.description.cameras if self._sees(c, lid, known)]
+            return pairs
+        return sorted((pair for pair in pairs if self._sees(*pair, known)), key=lambda pair: lidars.index(pair[1]))
 
     def _sees(self, camera: str, lidar: str, known: RigSolution) -> bool:
         own, T = self.rig.camera(camera), known.between(camera, lidar)[0]
@@ -175,48 +171,43 @@ class RigMeasurer:
         LiDAR (hand-eye), the first of which that tells it. Its place is not told."""
         out = []
         for lidar in self.description.lidars:
-            out.append(self._tried(camera, lidar, "motion", self._turns, camera, lidar, known))
+            out.append(self._tried(camera, lidar, MOTION_KIND, self._turns, camera, lidar, known))
             if out[-1].edge is not None:
                 break
         return out
 
     def _turns(self, camera: str, lidar: str, known: RigSolution) -> Edge:
         source, config = self.rig.pair(camera, lidar), self.config_of(camera)
-        frames = [
-            self._with_motion(frame, lidar, config, _ahead(source)) for frame in neighbours(source, self._positions(source))
-        ]
+        near = neighbours(source, self._positions(source))
+        frames = [self._with_motion(frame, camera, lidar, source) for frame in near]
         guess = motion_guess(frames, FeatureExtractor(source.camera, config), config.search.seed)
         T, _ = known.between(camera, lidar)
         R = min((h[:3, :3] for h in guess.hypotheses), key=lambda R: se3.rotation_error_deg(R, T))
         C = np.diag(np.repeat([0.0, UNKNOWN_M**2], 3))
         C[:3, :3] = guess.covariance
         at = se3.inverse(T)[:3, 3]  # the camera stays where it is believed to be: it turns about itself
-        return Edge(camera, lidar, se3.from_parts(R, -R @ at), C, "motion", samples=len(frames))
+        return Edge(camera, lidar, se3.from_parts(R, -R @ at), C, MOTION_KIND, samples=len(frames))
 
     def frames_of(self, camera: str, lidar: str) -> list[Frame]:
         """The chosen frames of a pair, with the LiDAR's motion. Raises what reading raises."""
-        source, config = self.rig.pair(camera, lidar), self.config_of(camera)
-        return [self._with_motion(source[i], lidar, config, _ahead(source)) for i in self._positions(source)]
+        source = self.rig.pair(camera, lidar)
+        return [self._with_motion(source[i], camera, lidar, source) for i in self._positions(source)]
 
     def config_of(self, camera: str) -> Config:
         """The configuration with the camera's mask."""
         mask = self.description[camera].mask
         return update(self.config, {"image": {"mask": mask}}) if mask else self.config
 
-    def _with_motion(self, frame: Frame, lidar: str, config: Config, ahead_ns: int) -> Frame:
-        if not needs_ego_motion(frame, config.motion):
+    def _with_motion(self, frame: Frame, camera: str, lidar: str, source: Source) -> Frame:
+        if not needs_ego_motion(frame, self.config_of(camera).motion):
             return frame
-        stamp = None if frame.cloud_stamp is None else frame.cloud_stamp + ahead_ns
+        stamp = None if frame.cloud_stamp is None else frame.cloud_stamp + _ahead(source)
         return replace(frame, twist=self.scans[lidar].twist_at(stamp))
 
 
 def _ahead(source: Source) -> int:
     """What a source has taken out of the stamps of its clouds, ns; of the LiDAR's own scans it is not."""
     return int(getattr(source, "cloud_ahead_ns", 0))
-
-
-def _apart(a: str, b: str) -> Measurement:
-    return Measurement(a, b, "scans", None, "by their priors they share no view")
 
 
 def box_of(covariance: Covariance) -> SearchBox:
@@ -232,8 +223,3 @@ def seen_share(camera: Camera, T: Transform, points: Matrix) -> float:
     uv, inside = camera.project(se3.transform(T, points))
     cell = np.floor((uv[inside] + 0.5) / [camera.width, camera.height] * GRID)
     return len(np.unique(cell, axis=0)) / (GRID[0] * GRID[1])
-
-
-def errors(solution: RigSolution, truth: Mapping[str, Transform]) -> dict[str, tuple[float, float]]:
-    """deg and m of every sensor's pose against a known one."""
-    return {name: se3.error(T, solution.poses[name]) for name, T in truth.items() if name in solution.columns}

@@ -298,3 +298,12 @@ def _open(solution: RigSolution, factors: Sequence[Edge]) -> dict[str, Matrix]:
         if rest.size:
             found[name] = np.linalg.solve(W, rest).T
     return found
+
+
+def joined_to(reference: str, pairs: Sequence[tuple[str, str]]) -> set[str]:
+    """Sensors that pairs join to the reference, itself among them where there is one."""
+    joined, before = {reference}, 0
+    while len(joined) > before:
+        before = len(joined)
+        joined |= {name for pair in pairs if joined & set(pair) for name in pair}
+    return joined if len(joined) > 1 else set()

@@ -10,7 +10,7 @@ from calib_ros.config import RefineConfig
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
 from calib_ros.rig.description import RigDescription
 from calib_ros.rig.edges import Measurement
-from calib_ros.rig.graph import PRIOR, Edge, RigSolution, solve
+from calib_ros.rig.graph import PRIOR, Edge, RigSolution, joined_to, solve
 from calib_ros.rig.moved import MOVED as KNOCKED
 from calib_ros.rig.moved import hypotheses, verdict
 from calib_ros.rig.report import RigReport
@@ -191,12 +191,3 @@ def suspects(lost: set[Pair], fitting: Sequence[Pair]) -> tuple[str, ...]:
     names = sorted({name for pair in lost for name in pair} - right)
     common = [name for name in names if all(name in pair for pair in lost)]
     return tuple(common or names)
-
-
-def joined_to(reference: str, pairs: Sequence[Pair]) -> set[str]:
-    """Sensors that pairs join to the reference, itself among them where there is one."""
-    joined, before = {reference}, 0
-    while len(joined) > before:
-        before = len(joined)
-        joined |= {name for pair in pairs if joined & set(pair) for name in pair}
-    return joined if len(joined) > 1 else set()

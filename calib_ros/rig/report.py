@@ -20,7 +20,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.result import CONSUMERS_SIGMAS, CONVERGED, INSUFFICIENT, REFUSED, VERSION, Consumer
 from calib_ros.rig.description import CAMERA, RigDescription
 from calib_ros.rig.edges import Measurement, RigMeasurer
-from calib_ros.rig.graph import PRIOR, Edge, Loop, RigSolution, at_sensor, worst_sigmas
+from calib_ros.rig.graph import PRIOR, Edge, Loop, RigSolution, at_sensor, joined_to, worst_sigmas
 from calib_ros.rig.moved import RigHypothesis, hypotheses, verdict
 
 REFERENCE = "reference"
@@ -68,10 +68,7 @@ class RigReport:
         alone tells), refused (its edges contradict others, or are too uncertain)."""
         if name == self.solution.reference:
             return REFERENCE, "the others are stated in its frame"
-        joined, edges = {self.solution.reference}, [{e.target, e.source} for e in self.solution.edges]
-        for _ in edges:
-            joined |= {n for ends in edges if ends & joined for n in ends}
-        if name not in joined:
+        if name not in joined_to(self.solution.reference, [(e.target, e.source) for e in self.solution.edges]):
             why = [m.reason for m in self.measured if name in (m.target, m.source) and m.edge is None and m.reason]
             return INSUFFICIENT, "no edge joins it to the reference, its pose is the prior" + "".join(f"; {w}" for w in why[:2])
         doubted = [e.name for e in self.solution.doubted if name in (e.target, e.source)]

@@ -1,4 +1,4 @@
-"""Answers that take long, on an executor of one thread: it goes on with everything else meanwhile."""
+"""Answers of services, also those that take long, on an executor of one thread: it goes on with everything else meanwhile."""
 
 from __future__ import annotations
 
@@ -6,11 +6,35 @@ from collections.abc import Callable
 from concurrent.futures import Future as Promise
 from typing import Any
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
+from rclpy.service import Service
 from rclpy.task import Future
+
+from calib_ros.errors import CalibrationError
+from calib_ros.ros.diagnostics import Health
 
 # Of the executor: in the first one coroutines whose promise is done return, in the second one what they left to do is done.
 ROUNDS = 2
+
+
+def serve(
+    node: Node, health: Health, kind: Any, name: str, answer: Callable[[Any, Any], Any], group: CallbackGroup | None = None
+) -> Service:
+    """A service. answer: fills the response to a request; what it raises becomes the message, since it would end the node. One
+    that awaits blocks its group: in the node's own group it would block all others until it is done."""
+
+    async def answered(request: Any, response: Any) -> Any:
+        try:
+            if (awaited := answer(request, response)) is not None:
+                await awaited
+        except CalibrationError as error:
+            response.success, response.message = False, str(error)
+        except Exception as error:
+            response.success, response.message = False, health.unexpected(error)
+        return response
+
+    return node.create_service(kind, name, answered, callback_group=group)
 
 
 def done(node: Node, promise: Promise[Any]) -> Future:

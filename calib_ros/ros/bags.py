@@ -6,9 +6,8 @@ import importlib
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import closing
 from itertools import islice, product
 from pathlib import Path
 from typing import Any
@@ -37,24 +36,6 @@ SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
 LINGER_S = 1.0  # after the last message, so that late joiners get latched topics and nothing in flight is lost
 SENT_KEPT = 10  # messages on their way to a node that says nothing
 FOLLOW_S = 60.0  # longest wait for a followed node, which may have lost messages or have ended
-
-
-@dataclass(frozen=True)
-class PlayOptions:
-    """rate: times the recorded pace. loop: start over at the end. clock: publish /clock. wait_s: seconds to wait until every
-    image and cloud topic has a subscriber. follow: a node of this package that the playing waits for where it is slower, for
-    example /calib_ros; empty = none."""
-
-    rate: float = 1.0
-    loop: bool = False
-    clock: bool = False
-    wait_s: float = 10.0
-    follow: str = ""
-
-    def __post_init__(self) -> None:
-        for name, low, high in (("rate", 0.01, 1000.0), ("wait_s", 0.0, 3600.0)):
-            if not low <= getattr(self, name) <= high:
-                raise BadInputError(f"{name} = {getattr(self, name)!r} is out of range [{low:g}, {high:g}]")
 
 
 def message_class(type_name: str) -> Any:
@@ -132,13 +113,13 @@ def _sleep(seconds: float, stopped: Callable[[], bool]) -> None:
 
 
 class Player:
-    """Publishes the messages of a bag at the pace they were recorded, as serialised bytes.
+    """Publishes the messages of a bag at the pace they were recorded, as serialised bytes; see `play`.
 
     skipped: topics whose types are not installed. published: messages so far, by topic.
     """
 
-    def __init__(self, node: Node, bag: BagFile, options: PlayOptions) -> None:
-        self.node, self.bag, self.options = node, bag, options
+    def __init__(self, node: Node, bag: BagFile, rate: float, clock: bool, follow: str) -> None:
+        self.bag, self.rate = bag, rate
         self.skipped: list[str] = []
         self.published: dict[str, int] = {}
         self._publishers: dict[str, Publisher] = {}
@@ -158,13 +139,13 @@ class Player:
                 self._sensors.append(publisher)
         if not any(bag.topics[name].count for name in self._publishers):
             raise BadInputError(f"bag {bag.path} holds no message that can be published; see calib-ros info")
-        self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock else None
-        self._follower = Follower(node, options.follow) if options.follow else None
+        self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None
+        self._follower = Follower(node, follow) if follow else None
 
-    def wait_for_subscribers(self, stopped: Callable[[], bool]) -> bool:
+    def wait_for_subscribers(self, wait_s: float, stopped: Callable[[], bool]) -> bool:
         """Wait until every image and cloud topic has a subscriber, and a followed node is known; False when the time is up
         first."""
-        end = time.monotonic() + self.options.wait_s
+        end = time.monotonic() + wait_s
         while not stopped() and time.monotonic() < end:
             if self.hears_followed_node() and all(publisher.get_subscription_count() for publisher in self._sensors):
                 # Discovery has two sides: the subscribers may not know us yet; best-effort ones would miss the first messages.
@@ -190,11 +171,11 @@ class Player:
                 began = time.monotonic()
                 follower.wait(stopped)
                 started += time.monotonic() - began  # the pace of what follows stays the recorded one
-            due = started + (stamp - first) / NANOSECONDS / self.options.rate
+            due = started + (stamp - first) / NANOSECONDS / self.rate
             while not stopped():
                 now = time.monotonic()
                 if self._clock is not None:
-                    recorded = min(first + int((now - started) * self.options.rate * NANOSECONDS), stamp)
+                    recorded = min(first + int((now - started) * self.rate * NANOSECONDS), stamp)
                     if recorded >= clock_at:
                         self._clock.publish(Clock(clock=time_message(recorded)))
                         clock_at = recorded + CLOCK_PERIOD
@@ -211,52 +192,58 @@ class Player:
                 progress(min((stamp - first) / NANOSECONDS / self.bag.duration_s, 1.0))
 
 
-def play(path: str, options: PlayOptions, report: Callable[[str], None], progress: Callable[[float], None]) -> dict[str, int]:
-    """Play a bag as a process of its own until its end or SIGINT/SIGTERM; returns the messages published per topic."""
-    use_large_message_profile()
-    with _no_keyboard_interrupt(), closing(BagFile(Path(path))) as bag:
-        rclpy.init()
-        node = rclpy.create_node("calib_player")
-        try:
-            return _play(node, bag, options, report, progress)
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
-
-
-@contextmanager
-def _no_keyboard_interrupt() -> Iterator[None]:
-    """SIGINT ends the ROS context, which the player looks at; an exception besides could come in the middle of anything, such as
-    the end of a generator, where nobody can catch it."""
-    before = signal.signal(signal.SIGINT, lambda *_: None)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _play(
-    node: Node, bag: BagFile, options: PlayOptions, report: Callable[[str], None], progress: Callable[[float], None]
+def play(
+    path: str,
+    report: Callable[[str], None],
+    progress: Callable[[float], None],
+    rate: float = 1.0,
+    loop: bool = False,
+    clock: bool = False,
+    wait_s: float = 10.0,
+    follow: str = "",
 ) -> dict[str, int]:
+    """Play a bag as a process of its own until its end or SIGINT/SIGTERM; returns the messages published per topic.
+
+    rate: times the recorded pace. loop: start over at the end. clock: publish /clock. wait_s: seconds to wait until every image
+    and cloud topic has a subscriber. follow: a node of this package that the playing waits for where it is slower, for example
+    /calib_ros; empty = none.
+    """
+    for name, value, low, high in (("rate", rate, 0.01, 1000.0), ("wait_s", wait_s, 0.0, 3600.0)):
+        if not low <= value <= high:
+            raise BadInputError(f"{name} = {value!r} is out of range [{low:g}, {high:g}]")
+
     def stopped() -> bool:
         return not rclpy.ok()
 
     published: dict[str, int] = {}
+    use_large_message_profile()
+    # SIGINT ends the ROS context, which the player looks at; an exception besides could come in the middle of anything, such as
+    # the end of a generator, where nobody can catch it.
+    before = signal.signal(signal.SIGINT, lambda *_: None)
     try:
-        player = Player(node, bag, options)
-        published = player.published
-        for text in player.skipped:
-            report(f"not played: {text}")
-        if options.wait_s and not player.wait_for_subscribers(stopped) and not stopped():
-            problem = "no subscriber on every image and cloud topic"
-            if not player.hears_followed_node():
-                problem = f"{options.follow} is not heard, or subscribes to other topics (check name, remapping, ROS_DOMAIN_ID)"
-            report(f"{problem} after {options.wait_s:g} s; playing all the same")
-        player.play_once(stopped, progress)
-        while options.loop and not stopped():
-            player.play_once(stopped, progress)
-        _sleep(LINGER_S, stopped)
-    except Exception:
-        if rclpy.ok():
-            raise  # else: a signal took the context away meanwhile
+        with closing(BagFile(Path(path))) as bag:
+            rclpy.init()
+            node = rclpy.create_node("calib_player")
+            try:
+                player = Player(node, bag, rate, clock, follow)
+                published = player.published
+                for text in player.skipped:
+                    report(f"not played: {text}")
+                if wait_s and not player.wait_for_subscribers(wait_s, stopped) and not stopped():
+                    problem = "no subscriber on every image and cloud topic"
+                    if not player.hears_followed_node():
+                        problem = f"{follow} is not heard, or subscribes to other topics (check name, remapping, ROS_DOMAIN_ID)"
+                    report(f"{problem} after {wait_s:g} s; playing all the same")
+                player.play_once(stopped, progress)
+                while loop and not stopped():
+                    player.play_once(stopped, progress)
+                _sleep(LINGER_S, stopped)
+            except Exception:
+                if rclpy.ok():
+                    raise  # else: a signal took the context away meanwhile
+            finally:
+                node.destroy_node()
+                rclpy.try_shutdown()
+    finally:
+        signal.signal(signal.SIGINT, before)
     return published

@@ -13,6 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Executor
 from contextlib import suppress
 from datetime import datetime, timezone
 from itertools import chain, count
@@ -21,15 +22,23 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import yaml
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
 from rclpy.serialization import serialize_message
+from std_srvs.srv import Trigger
 
 from calib_ros.datasets.capture import BAG, CONFIG, EVENTS, MASK, RESULT
-from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
+from calib_ros.extensions import NodeService
 from calib_ros.io import ABANDONED_S, flush
 from calib_ros.messages import stamp_ns
+from calib_ros.online.black_box import BlackBox, Occasion
+from calib_ros.online.events import FrameIngested
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
+from calib_ros.ros.answers import after_answers, done, serve
 from calib_ros.ros.conversions import Serialized
+from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.subscriptions import type_name
 
@@ -48,14 +57,25 @@ class RawKeyframe(NamedTuple):
     camera_info: Serialized
 
 
-class Capture:
-    """Keeps the raw messages of at most capture_frames keyframes and writes them. Thread-safe.
+class Capture(NodeService):
+    """Keeps the raw messages of at most capture_frames keyframes; writes them on ~/capture and for its black box. Thread-safe.
 
-    parameters: gives the current ones. camera_info: gives the newest CameraInfo message.
+    parameters: gives the current ones. files: writes them. camera_info: gives the newest CameraInfo message.
     """
 
-    def __init__(self, parameters: Callable[[], Parameters], camera_info: Callable[[], Any]) -> None:
-        self._parameters, self._camera_info = parameters, camera_info
+    def __init__(
+        self,
+        node: Node,
+        pipeline: Pipeline,
+        parameters: Callable[[], Parameters],
+        health: Health,
+        files: Executor,
+        camera_info: Callable[[], Any],
+    ) -> None:
+        self._node, self._pipeline, self._parameters, self._health, self._files = node, pipeline, parameters, health, files
+        self._camera_info = camera_info
+        self.black_box = BlackBox(pipeline, lambda: parameters()["capture.on"], self._record)
+        self._service = serve(node, health, Trigger, "~/capture", self._answer, MutuallyExclusiveCallbackGroup())
         self._frames: deque[RawKeyframe] = deque(maxlen=parameters()["capture_frames"])
         self._lock = threading.Lock()
         if self._frames.maxlen:
@@ -65,14 +85,46 @@ class Capture:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def add(self, image: Serialized, cloud: Serialized) -> None:
-        """Add the messages of a new keyframe. Keeps references: nothing is copied."""
-        self.resize()
-        with self._lock:
-            self._frames.append(RawKeyframe(image, cloud, self._camera_info()))
+    def add(self, event: Any) -> None:
+        """Keep the messages of a new keyframe. Keeps references: nothing is copied."""
+        if isinstance(event, FrameIngested) and self.black_box.wants(event):
+            self._resize()
+            with self._lock:
+                self._frames.append(RawKeyframe(event.image, event.cloud, self._camera_info()))
+        self.black_box.add(event)
 
-    def resize(self) -> None:
+    def check(self) -> None:
         """Follow the parameter; fewer frames free their memory at once."""
+        self._resize()
+        self.black_box.check()
+
+    def pause(self) -> None:
+        """Write what has happened by now."""
+        self.black_box.check(flush=True)
+
+    stop = pause
+
+    def destroy(self) -> None:
+        """Answers that are made already are sent before."""
+        after_answers(self._node, lambda: self._node.destroy_service(self._service))
+
+    def _record(self, occasion: Occasion, events: str) -> None:
+        def write() -> None:
+            try:
+                said = self.write_occasion(occasion.kind, occasion.result, events)
+                self._node.get_logger().info(f"{occasion.kind}: {said}")
+            except CalibrationError as error:
+                self._health.error(str(error), "capture.on")
+            except Exception as error:
+                self._health.unexpected(error)
+
+        self._files.submit(write)
+
+    async def _answer(self, request: Trigger.Request, response: Trigger.Response) -> None:
+        written = await done(self._node, self._files.submit(self.write))
+        response.message, response.success = written.result(), True
+
+    def _resize(self) -> None:
         wanted = self._parameters()["capture_frames"]
         with self._lock:
             if self._frames.maxlen != wanted:
@@ -83,12 +135,12 @@ class Capture:
         with self._lock:
             self._frames.clear()
 
-    def write(self, pipeline: Pipeline, events: str) -> str:
-        """A new capture in capture_dir, on request; returns what was written where, in a line. events: as JSON lines.
+    def write(self) -> str:
+        """A new capture in capture_dir, on request; returns what was written where, in a line.
 
         The folder is there when it is whole, or not at all. BadInputError if nothing is kept or it cannot be written.
         """
-        parameters, recalibrator, frames = self._parameters(), pipeline.recalibrator, self._kept()
+        parameters, recalibrator, frames = self._parameters(), self._pipeline.recalibrator, self._kept()
         if not parameters["capture_dir"] or not parameters["capture_frames"]:
             raise BadInputError(
                 "nothing captured: set the parameters capture_dir to a folder and capture_frames to how many keyframes are to be "
@@ -97,7 +149,7 @@ class Capture:
         if not frames or recalibrator is None:
             raise BadInputError("nothing captured: no keyframe has come since capture_frames was set")
         result = recalibrator.current.result
-        return _write(parameters, "capture_{}", frames, result, _files(parameters, result, events))
+        return _write(parameters, "capture_{}", frames, result, _files(parameters, result, self.black_box.events()))
 
     def write_occasion(self, kind: str, result: Result, events: str) -> str:
         """The same for the black box. The oldest of its captures make room by KEPT and MOST_BYTES; keyframes that do

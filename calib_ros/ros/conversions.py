@@ -20,9 +20,8 @@ from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from calib_ros import se3
-from calib_ros.camera import Camera
-from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
+from calib_ros.frame import NANOSECONDS, PointCloud
+from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image
 from calib_ros.messages.point_fields import LIVOX_FIELDS, LIVOX_OFFSETS, LIVOX_STRIDE, livox_scan
 from calib_ros.messages.wire import WireHeader, wire_header
 from calib_ros.online.coach import Advice
@@ -31,12 +30,6 @@ from calib_ros.result import Consumer, Extrinsic
 # ROS orders covariances of poses translation first; calib_ros has rotation first. The way back is the same.
 _ROS_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 LIVOX_DATATYPES = {"u4": PointField.UINT32, "f4": PointField.FLOAT32, "u1": PointField.UINT8}
-
-
-def frame_from_messages(image: Serialized, cloud: Serialized, camera: Camera) -> Frame:
-    """Image or CompressedImage and PointCloud2 -> Frame. BadInputError if one of them cannot be decoded."""
-    stamps = stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp)
-    return Frame(pixels_from_message(image), cloud_from_message(cloud), camera, *stamps)
 
 
 def pixels_from_message(image: Serialized) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""The Fast DDS profiles for large messages, and where the installed config files lie."""
+"""The Fast DDS profiles for large messages, where the installed config files lie, and the QoS of what late joiners get."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
 from calib_ros.errors import MissingDependencyError
 from calib_ros.ros.distributions import is_fast_dds, large_messages, profile_variables
 
 PROFILE, LARGE_PROFILE = "fastdds_profile.xml", "fastdds_profile_large.xml"
 PROFILE_BYTES = 6_000_000  # the largest message that PROFILE is made for: two of them and their like fit its memory
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 _set_here = False  # a profile, by this process for itself
 

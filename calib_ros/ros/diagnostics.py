@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Container, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +15,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from calib_ros.config.options import has_room
 from calib_ros.config.sensors import REFINE
 from calib_ros.errors import defect, raised_at
+from calib_ros.extensions import NodeService
 from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, RefinedCamera
-from calib_ros.online.events import QuietLog
+from calib_ros.online.events import ExtrinsicUpdated, Problem, QuietLog
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
 from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
@@ -39,7 +39,7 @@ ERROR_SHOWN_S = 10.0  # a problem sets the level for this long
 LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
 
 
-class Health:
+class Health(NodeService):
     """Collects what happens to the node, for log and diagnostics. Thread-safe, since every field is replaced whole.
 
     log: of problems. last_error: the newest of them, and when it came by time.monotonic(). extrinsic: its newest state.
@@ -79,8 +79,18 @@ class Health:
         self.error(line, raised_at(error))
         return line
 
-    def add_extrinsic(self, extrinsic: Extrinsic) -> None:
-        """Log a change of the current extrinsic."""
+    def check(self) -> None:
+        """See `QuietLog`."""
+        self.log.catch_up()
+
+    def add(self, event: Any) -> None:
+        """Log what the pipeline tells a person."""
+        if isinstance(event, ExtrinsicUpdated):
+            self._add_extrinsic(event.extrinsic)
+        elif isinstance(event, Problem):
+            (self.note if event.solved else self.error)(event.message, event.kind)
+
+    def _add_extrinsic(self, extrinsic: Extrinsic) -> None:
         before, self.extrinsic = self.extrinsic, extrinsic
         result = extrinsic.result
         accepted = extrinsic.accepted > 0 and (before is None or extrinsic.accepted != before.accepted)
@@ -123,15 +133,30 @@ class Health:
         return None if self._estimated_at is None else time.monotonic() - self._estimated_at
 
 
-class _Window(NamedTuple):
-    """What has come in the last seconds. dropped_share: of the pairs. unpaired: what is said of messages without partner."""
+class _Sample(NamedTuple):
+    """What has been counted by one moment, by time.monotonic(). intake_s: in which there was a pair to look at. left_out:
+    keyframes, for their unknown motion. load: CPU time."""
 
-    seconds: float = 0.0
-    images: int = 0
-    clouds: int = 0
-    pairs: int = 0
-    dropped_share: float = 0.0
-    unpaired: str = ""
+    at: float
+    images: int
+    clouds: int
+    pairs: int
+    dropped: int
+    intake_s: float
+    estimates_s: float
+    left_out: int
+    load: LoadCounts
+
+    @classmethod
+    def of(cls, pipeline: Pipeline) -> _Sample:
+        counts, recalibrator = pipeline.synchronizer.counts, pipeline.recalibrator
+        came = counts.images, counts.clouds, counts.pairs, pipeline.dropped_pairs
+        left_out = recalibrator.motion.left_out if recalibrator else 0
+        return cls(time.monotonic(), *came, *pipeline.busy_seconds(), left_out, pipeline.load.counts())
+
+    def seconds_since(self, before: _Sample, work: Work) -> float:
+        """CPU time."""
+        return self.load.seconds.get(work, 0.0) - before.load.seconds.get(work, 0.0)
 
 
 class Diagnostics:
@@ -139,32 +164,25 @@ class Diagnostics:
 
     def __init__(self, name: str, health: Health, pipeline: Pipeline) -> None:
         self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
-        self._counts: deque[tuple[float, int, int, int, int]] = deque(maxlen=int(SILENCE_S) + 1)
-        self._busy = (time.monotonic(), *pipeline.busy_seconds())
         self._pairing = PairingHealth(pipeline.synchronizer)
-        self._loads: deque[_Load] = deque([_Load(time.monotonic())], maxlen=int(LOAD_WINDOW_S) + 1)
-        self._window, self._flow_values = _Window(), dict[str, str]()
-        self.count()
+        self._samples = deque([_Sample.of(pipeline)], maxlen=int(LOAD_WINDOW_S) + 1)
+        self._unpaired = ""  # what is said of messages without partner
 
     def count(self) -> None:
         """To be called about once a second: rates and loads count from the calls before."""
-        now = time.monotonic()
-        counts = self._pipeline.synchronizer.counts
-        self._counts.append((now, counts.images, counts.clouds, counts.pairs, self._pipeline.dropped_pairs))
-        since, images, clouds, pairs, dropped = self._counts[0]
-        new = (counts.images - images, counts.clouds - clouds, counts.pairs - pairs)
-        share = (self._pipeline.dropped_pairs - dropped) / max(new[2], 1)
-        unpaired = self._pairing.check()
-        if unpaired:
-            self._health.error(unpaired, "unpaired")
-        self._loads.append(_Load.of(now, self._pipeline))
-        self._window = _Window(now - since, *new, share, unpaired)
-        self._flow_values = self._flow(now, max(now - since, 1e-3), *new)
+        self._unpaired = self._pairing.check()
+        if self._unpaired:
+            self._health.error(self._unpaired, "unpaired")
+        self._samples.append(_Sample.of(self._pipeline))
+
+    def _window(self) -> tuple[_Sample, _Sample]:
+        """First and last sample of the last SILENCE_S."""
+        return self._samples[-min(len(self._samples), int(SILENCE_S) + 1)], self._samples[-1]
 
     def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
         """One status, as of now; stamp: builtin_interfaces/Time. extra: more values, by name."""
         level, text = self._summary()
-        values = {**self._flow_values, **self._extrinsic(), **(extra or {})}
+        values = {**self._flow(), **self._extrinsic(), **(extra or {})}
         values |= {
             "callback 99th percentile, ms": f"{self._health.callback_p99_ms:.2f}",
             "errors": str(self._health.errors),
@@ -176,19 +194,18 @@ class Diagnostics:
         message.header.stamp = stamp
         return message
 
-    def _flow(self, now: float, span: float, images: int, clouds: int, pairs: int) -> dict[str, str]:
+    def _flow(self) -> dict[str, str]:
         pipeline, counts = self._pipeline, self._pipeline.synchronizer.counts
         recalibrator, gate = pipeline.recalibrator, pipeline.speed_gate
-        intake, estimates = pipeline.busy_seconds()
-        before, was_intake, was_estimates = self._busy
-        self._busy = (now, intake, estimates)
-        took = max(now - before, 1e-3)
-        loads = [(intake - was_intake) / took, (estimates - was_estimates) / took]
+        first, last = self._window()
+        before, span = self._samples[max(len(self._samples) - 2, 0)], max(last.at - first.at, 1e-3)
+        took = max(last.at - before.at, 1e-3)
+        intake, estimates = (last.intake_s - before.intake_s) / took, (last.estimates_s - before.estimates_s) / took
         settled = counts.pairs + counts.unpaired_images
         return {
-            "images per s": f"{images / span:.1f}",
-            "clouds per s": f"{clouds / span:.1f}",
-            "pairs per s": f"{pairs / span:.1f}",
+            "images per s": f"{(last.images - first.images) / span:.1f}",
+            "clouds per s": f"{(last.clouds - first.clouds) / span:.1f}",
+            "pairs per s": f"{(last.pairs - first.pairs) / span:.1f}",
             "images": str(counts.images),
             "clouds": str(counts.clouds),
             "pairs": str(counts.pairs),
@@ -206,16 +223,16 @@ class Diagnostics:
             "motion from scans": _motion(recalibrator),
             "keyframes left out, motion unknown": str(recalibrator.motion.left_out if recalibrator else 0),
             "semantics": recalibrator.describe_semantics() if recalibrator else "none yet",
-            "worker load": f"{sum(loads):.2f}",
-            "estimate load": f"{loads[1]:.2f}",
+            "worker load": f"{intake + estimates:.2f}",
+            "estimate load": f"{estimates:.2f}",
             **self._budget(),
         }
 
     def _budget(self) -> dict[str, str]:
         """CPU time of the last LOAD_WINDOW_S as shares of a core, and what online.max_load did to keyframes so far."""
-        first, last = self._loads[0], self._loads[-1]
-        span, counts = max(last.at - first.at, 1e-3), last.counts
-        shares = {work: (last.seconds(work) - first.seconds(work)) / span for work in Work}
+        first, last = self._samples[0], self._samples[-1]
+        span, counts = max(last.at - first.at, 1e-3), last.load
+        shares = {work: last.seconds_since(first, work) / span for work in Work}
         return {
             "CPU, share of a core": f"{sum(shares.values()):.2f} of {self._pipeline.config.online.max_load:g}",
             **{f"CPU for {work.value}": f"{share:.3f}" for work, share in shares.items()},
@@ -258,30 +275,31 @@ class Diagnostics:
     def _summary(self) -> tuple[bytes, str]:
         """Level and message, worst first: an unreliable extrinsic, silent topics, its lesser problems, messages that get lost or
         find no partner, the newest problem, too little time, too few keyframes."""
-        window = self._window
         level, text = _level(self._health.extrinsic)
         if level == ERROR:
             return level, text
         if (silent := self._silence()) is not None:
             return silent
-        input_problems = [*self._health.losses.values(), *filter(None, [window.unpaired, self._pipeline.clock_difference])]
+        input_problems = [*self._health.losses.values(), *filter(None, [self._unpaired, self._pipeline.clock_difference])]
         if level == WARN or input_problems:
             return WARN, "; ".join([text, *input_problems])
         problem, at = self._health.last_error
         if time.monotonic() - at < ERROR_SHOWN_S:
             return WARN, problem
-        if window.pairs >= MIN_PAIRS and window.dropped_share > DROPPED_SHARE:
-            dropped = f"{window.dropped_share:.0%} of the pairs are dropped before they are looked at"
-            return WARN, f"{text}; {dropped}: {self._why_dropped()}"
+        first, last = self._window()
+        pairs, dropped = last.pairs - first.pairs, last.dropped - first.dropped
+        if pairs >= MIN_PAIRS and dropped > DROPPED_SHARE * pairs:
+            lost = f"{dropped / pairs:.0%} of the pairs are dropped before they are looked at"
+            return WARN, f"{text}; {lost}: {self._why_dropped()}"
         limits = self._limits()
         return (WARN, f"{text}; {limits}") if limits else (level, text)
 
     def _why_dropped(self) -> str:
         """Cause and advice: the thread that looks at pairs computes itself, or waits to be let."""
-        first, last, config = self._loads[0], self._loads[-1], self._pipeline.config
-        worked = sum(last.seconds(work) - first.seconds(work) for work in (Work.INTAKE, Work.KEYFRAMES))
+        first, last, config = self._samples[0], self._samples[-1], self._pipeline.config
+        worked = sum(last.seconds_since(first, work) for work in (Work.INTAKE, Work.KEYFRAMES))
         cures = ["lower online.max_load"] if has_room(config.online, "max_load", up=False) else []
-        if worked < COMPUTING_SHARE * (last.intake_busy - first.intake_busy):
+        if worked < COMPUTING_SHARE * (last.intake_s - first.intake_s):
             return f"the node gets too little CPU time; {', or '.join(['give it a core', *cures])}"
         if has_room(config.image, "max_width", up=False):
             cures.append("lower image.max_width")
@@ -291,14 +309,14 @@ class Diagnostics:
 
     def _limits(self) -> str:
         """What has kept keyframes away for long, and what to do; "" if nothing has."""
-        first, last = self._loads[0], self._loads[-1]
+        first, last = self._samples[0], self._samples[-1]
         if last.left_out - first.left_out >= MANY_LEFT_OUT:
             return (
                 f"{last.left_out - first.left_out} keyframes of the last {last.at - first.at:.0f} s left out, since the vehicle "
                 f"moves and nobody knows how (motion from scans: {_motion(self._pipeline.recalibrator)}); see that no clouds get "
                 "lost, or state the velocity"
             )
-        keyframes, forced = last.counts.keyframes - first.counts.keyframes, last.counts.forced - first.counts.forced
+        keyframes, forced = last.load.keyframes - first.load.keyframes, last.load.forced - first.load.forced
         if keyframes >= MIN_KEYFRAMES and forced > FORCED_SHARE * keyframes:
             online = self._pipeline.config.online
             return (
@@ -309,17 +327,18 @@ class Diagnostics:
         return ""
 
     def _silence(self) -> tuple[bytes, str] | None:
-        window = self._window
-        if window.seconds <= SILENCE_S - 1.5:
+        first, last = self._window()
+        if last.at - first.at <= SILENCE_S - 1.5:
             return None
-        missing = [topic for topic, count in (("image", window.images), ("points", window.clouds)) if count == 0]
+        silent = last.images == first.images, last.clouds == first.clouds
+        missing = [topic for topic, is_silent in zip(("image", "points"), silent, strict=True) if is_silent]
         if missing and self._health.losses:
             return WARN, "; ".join(self._health.losses.values())
         if missing:
             return STALE, "; ".join(self._health.silence.get(topic, f"no messages on {topic}") for topic in missing)
         if self._pipeline.data_age_s > SILENCE_S and self._pipeline.starved(SILENCE_S):
             return WARN, STARVED
-        if window.pairs:
+        if last.pairs > first.pairs:
             return None
         if self._pairing.waiting:
             return OK, "waiting for the next pair"
@@ -346,27 +365,6 @@ def refined_values(refined: RefinedCamera | None) -> dict[str, str]:
         seen = "" if change.observable else ", as stated"
         values[f"refined {titles[name]}"] = f"{value:.{digits}f} +- {scale * change.sigma:.{digits}f}{seen}"
     return values
-
-
-@dataclass(frozen=True)
-class _Load:
-    """The load at one moment: all counts are so far. at: by time.monotonic(). intake_busy: s in which there was a pair to look
-    at. left_out: keyframes, for their unknown motion."""
-
-    at: float
-    counts: LoadCounts = field(default_factory=LoadCounts)
-    intake_busy: float = 0.0
-    left_out: int = 0
-
-    @classmethod
-    def of(cls, now: float, pipeline: Pipeline) -> _Load:
-        recalibrator = pipeline.recalibrator
-        left_out = recalibrator.motion.left_out if recalibrator else 0
-        return cls(now, pipeline.load.counts(), pipeline.busy_seconds()[0], left_out)
-
-    def seconds(self, work: Work) -> float:
-        """CPU time."""
-        return self.counts.seconds.get(work, 0.0)
 
 
 def _level(extrinsic: Extrinsic | None) -> tuple[bytes, str]:

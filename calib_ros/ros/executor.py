@@ -1,4 +1,4 @@
-"""Nodes that spin along with another one: what it costs to wait for a message must not grow with them.
+"""Timers, and nodes that spin along with another one: what it costs to wait for a message must not grow with them.
 
 rclpy asks every entity of every node before and after each wait: with the nodes of six pairs, whose services and timers hardly
 ever have anything to do, that took more time than the messages.
@@ -6,6 +6,7 @@ ever have anything to do, that took more time than the messages.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
@@ -17,6 +18,11 @@ MOST = 50  # callbacks in a row
 SPIN_S = 0.2  # between two looks at these nodes: how late their services may answer
 
 
+def every(node: Node, seconds: float, call: Callable[[], None]) -> Timer:
+    """A timer of steady time: a simulated clock that stands still must not silence the node."""
+    return node.create_timer(seconds, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
 class Beside(SingleThreadedExecutor):
     """Spun now and then, from a timer of the node that its nodes belong to and on the same thread."""
 
@@ -25,7 +31,7 @@ class Beside(SingleThreadedExecutor):
 
     def spin_from(self, node: Node) -> None:
         """Spin whenever that node does, every SPIN_S."""
-        self._timer = node.create_timer(SPIN_S, self.spin_ready, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = every(node, SPIN_S, self.spin_ready)
 
     def destroy(self, node: Node) -> None:
         """End, and destroy its nodes; node: that it is spun from."""

@@ -5,29 +5,41 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from rclpy.node import Node
 
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
+from calib_ros.extensions import NodeService
+from calib_ros.online.events import ExtrinsicUpdated
 from calib_ros.online.pipeline import Pipeline
-from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import load_state, provenance_of, read_state, save_state
 from calib_ros.registration.initial_guess import nominal, nominal_start
-from calib_ros.result import INITIAL, InitialSource, Result
+from calib_ros.result import CONVERGED, INITIAL, InitialSource, Result
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.tf import StaticTf
 
 
-class InitialExtrinsic:
-    """Chooses the initial extrinsic, and saves accepted ones.
+class InitialExtrinsic(NodeService):
+    """Chooses the initial extrinsic of a pipeline, and saves accepted ones.
 
     parameters: gives the current ones. error: takes one line for a person, and its kind for the log.
     """
 
-    def __init__(self, parameters: Callable[[], Parameters], tf: StaticTf, error: Callable[[str, str], None]) -> None:
-        self._parameters, self._tf, self._error = parameters, tf, error
+    def __init__(
+        self,
+        node: Node,
+        pipeline: Pipeline,
+        parameters: Callable[[], Parameters],
+        tf: StaticTf,
+        error: Callable[[str, str], None],
+    ) -> None:
+        self._node, self._pipeline, self._parameters, self._tf, self._error = node, pipeline, parameters, tf, error
         self._reported = ""
+        self._saved = 0  # accepted estimates when the extrinsic was saved
+        self._stamp = 0  # of the newest data, ns
 
     def choose(self, camera: Camera, camera_frame: str, lidar_frame: str) -> Result | None:
         """The extrinsic to start from; None while TF may still come."""
@@ -54,34 +66,46 @@ class InitialExtrinsic:
     def before_messages(self) -> Result:
         """The initial extrinsic before any message has named the sensors, as far as the parameters allow it; without TF."""
         parameters = self._parameters()
-        return self._saved() or parameters.initial() or Result(nominal(parameters["nominal_yaw_deg"]), INITIAL)
+        return self._from_file() or parameters.initial() or Result(nominal(parameters["nominal_yaw_deg"]), INITIAL)
 
-    def superseded_by_tf(self, recalibrator: Recalibrator) -> bool:
-        """True if TF has come for an extrinsic that started as nominal, and no estimate has been accepted since."""
+    def check(self) -> None:
+        """Start anew if TF has come for an extrinsic that started as nominal, and no estimate has been accepted since."""
+        recalibrator = self._pipeline.recalibrator
+        if recalibrator is None or recalibrator.current.accepted:
+            return
         initial = recalibrator.tracker.initial
-        if initial.origin is not InitialSource.NOMINAL or recalibrator.current.accepted:
-            return False
+        if initial.origin is not InitialSource.NOMINAL:
+            return
         T = self._tf.lookup(initial.camera_frame, initial.lidar_frame)[0]
-        if T is None:
-            return False
-        return not np.allclose(T, initial.T_camera_lidar, atol=1e-6)
+        if T is not None and not np.allclose(T, initial.T_camera_lidar, atol=1e-6):
+            self._node.get_logger().info("TF connects camera and LiDAR by now: starting anew from it")
+            self._pipeline.restart()
 
-    def save(self, result: Result, pipeline: Pipeline, stamp: int) -> tuple[bool, str]:
-        """Write an accepted estimate to the state file; whether it was, and where or why not, for a person. stamp: ns, of the
-        newest data, if the estimate does not tell its own."""
-        path, camera, recalibrator = self._parameters()["state_file"], pipeline.camera, pipeline.recalibrator
+    def add(self, event: Any) -> None:
+        """Save a new extrinsic if it is an estimate that has been accepted."""
+        if not isinstance(event, ExtrinsicUpdated):
+            return
+        extrinsic, self._stamp = event.extrinsic, event.stamp
+        self._saved = min(self._saved, extrinsic.accepted)  # counted anew after a reset
+        if extrinsic.result.status == CONVERGED and extrinsic.accepted > self._saved:
+            self._saved = extrinsic.accepted
+            self.save(extrinsic.result)
+
+    def save(self, result: Result) -> tuple[bool, str]:
+        """Write an accepted estimate to the state file; whether it was, and where or why not, for a person."""
+        path, camera, recalibrator = self._parameters()["state_file"], self._pipeline.camera, self._pipeline.recalibrator
         if not path or camera is None or recalibrator is None:
             return False, "nothing saved: set the parameter state_file to a path"
         accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
         try:
-            newest = result.data_stamp or stamp
+            newest = result.data_stamp or self._stamp
             save_state(path, result, camera, provenance_of(recalibrator.config, accepted, keyframes, newest))
         except BadInputError as error:
             self._error(str(error), "state file written")
             return False, str(error)
         return True, f"saved to {path}"
 
-    def _saved(self) -> Result | None:
+    def _from_file(self) -> Result | None:
         """The saved extrinsic, unless the parameters name other frames."""
         parameters = self._parameters()
         path = parameters["state_file"]

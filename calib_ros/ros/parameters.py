@@ -11,7 +11,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -20,7 +20,7 @@ from calib_ros import se3
 from calib_ros.config import Config, load_stages, preset, stages, update
 from calib_ros.config.options import checked, option
 from calib_ros.config.removed import REMOVED, notices
-from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.errors import ConfigError
 from calib_ros.export import DESCRIPTIONS, WRITABLE
 from calib_ros.extensions import PRESETS, names
 from calib_ros.image.mask import check_mask
@@ -248,30 +248,25 @@ def replaced(name: str, config: Config, given: Iterable[str]) -> list[str]:
     return [f"the preset {name} is changed by the parameters given: {', '.join(other)}"] if name and other else []
 
 
-def on_change(
-    parameters: Parameters, changed: list[Parameter], image_size: tuple[int, int] | None
-) -> tuple[SetParametersResult, Parameters]:
-    """Check a run-time change as a whole -> the answer to the caller, and all parameters from now on. image_size: of the camera,
-    px, where it is known."""
+def changed(parameters: Parameters, given: list[Parameter], image_size: tuple[int, int] | None) -> Parameters:
+    """All parameters after a change at run time, which is checked as a whole. image_size: of the camera, px, where it is known.
+    Raises a CalibrationError."""
     new: dict[str, dict[str, Any]] = {}
     known, settings = stages(), dict(parameters.settings)
-    try:
-        unknown = misspelt({p.name: p.value for p in changed}, parameters.to_dict())
-        if unknown:
-            raise ConfigError("; ".join(unknown))
-        for p in changed:
-            stage, dot, name = p.name.partition(".")
-            if dot and stage in known:
-                new.setdefault(stage, {})[name] = _plain(p.value)
-            elif p.name in SETTINGS:
-                settings[p.name] = checked(p.name, _plain(p.value), SETTINGS[p.name])
-        config = update(parameters.config, new) if new else parameters.config
-        Parameters(settings, config).check()
-        if config.image != parameters.config.image:
-            check_mask(config.image, image_size)
-    except CalibrationError as error:
-        return SetParametersResult(successful=False, reason=str(error)), parameters
-    return SetParametersResult(successful=True), Parameters(settings, config)
+    unknown = misspelt({p.name: p.value for p in given}, parameters.to_dict())
+    if unknown:
+        raise ConfigError("; ".join(unknown))
+    for p in given:
+        stage, dot, name = p.name.partition(".")
+        if dot and stage in known:
+            new.setdefault(stage, {})[name] = _plain(p.value)
+        elif p.name in SETTINGS:
+            settings[p.name] = checked(p.name, _plain(p.value), SETTINGS[p.name])
+    config = update(parameters.config, new) if new else parameters.config
+    Parameters(settings, config).check()
+    if config.image != parameters.config.image:
+        check_mask(config.image, image_size)
+    return Parameters(settings, config)
 
 
 def _plain(value: Any) -> Any:

@@ -68,12 +68,12 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
     global _ros_runs
     import cv2
     import rclpy
-    from rclpy.clock import Clock, ClockType
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
     from calib_ros.ros import parameters
     from calib_ros.ros.dds import use_large_message_profile
+    from calib_ros.ros.executor import every
 
     use_large_message_profile()
     return_freed_memory()
@@ -92,7 +92,7 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
     node: Any = None
     try:
         node = make()
-        node.create_timer(WAKE_S, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        every(node, WAKE_S, lambda: None)
         executor.add_node(node)
         while not _asked_to_end:
             executor.spin_once()

@@ -7,18 +7,21 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
+from geometry_msgs.msg import TransformStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
+from calib_ros.extensions import NodeService
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.deskew import deskewed_frame
+from calib_ros.online.events import ExtrinsicUpdated, FrameIngested, IntakeIdle
 from calib_ros.online.pipeline import Pipeline
-from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.overlay import caption, render
 from calib_ros.result import Extrinsic
 from calib_ros.ros.conversions import (
@@ -29,7 +32,9 @@ from calib_ros.ros.conversions import (
     duration_message,
     extrinsic_message,
     image_message,
+    transform_message,
 )
+from calib_ros.ros.dds import LATCHED
 from calib_ros.ros.parameters import Parameters
 
 PROCESSED_KEPT = 100  # headers; more are of messages that are gone before a pair is worked off
@@ -40,17 +45,15 @@ STARVED_PERIODS = 3
 STARVED = "starved: pairs of image and cloud wait for CPU time; give the node a core of its own, or let other work yield (nice)"
 
 
-class ExtrinsicPublisher:
-    """~/extrinsic: on every change, and at least once in publish_period_s, with what a consumer needs to rely on it.
+class ExtrinsicPublisher(NodeService):
+    """~/transform on every change, and ~/extrinsic at least once in publish_period_s, with what a consumer needs to rely on it.
 
     DDS tells subscribers that ask for it when the messages stay away (deadline) or the process ends (liveliness). stamp: of the
     newest message, ns. served: the consumers that may use the newest published one. silent: which sensor sends nothing, for a
     person.
     """
 
-    def __init__(
-        self, node: Node, pipeline: Pipeline, parameters: Callable[[], Parameters], silent: Callable[[], str] = lambda: ""
-    ) -> None:
+    def __init__(self, node: Node, pipeline: Pipeline, parameters: Callable[[], Parameters], silent: Callable[[], str]) -> None:
         self._node, self._pipeline, self._parameters, self._silent = node, pipeline, parameters, silent
         self._valid_s = VALID_PERIODS * parameters()["publish_period_s"]
         self.stamp = 0
@@ -64,7 +67,17 @@ class ExtrinsicPublisher:
             liveliness=LivelinessPolicy.AUTOMATIC,
             liveliness_lease_duration=Duration(seconds=self._valid_s),
         )
-        self.publisher = node.create_publisher(ExtrinsicMsg, "~/extrinsic", profile)
+        self._publisher = node.create_publisher(ExtrinsicMsg, "~/extrinsic", profile)
+        self._transforms = node.create_publisher(TransformStamped, "~/transform", LATCHED)
+
+    def pause(self) -> None:
+        """Say as the last message that the extrinsic is not usable any more."""
+        self._pipeline.read_current(self._publish)
+
+    def destroy(self) -> None:
+        """See `NodeService`."""
+        for publisher in (self._publisher, self._transforms):
+            self._node.destroy_publisher(publisher)
 
     def validity(self, extrinsic: Extrinsic) -> Validity:
         """Whether an extrinsic is to be used as of now."""
@@ -79,12 +92,23 @@ class ExtrinsicPublisher:
         until = self._node.get_clock().now().nanoseconds + round(self._valid_s * NANOSECONDS)
         return Validity(extrinsic.usable, until if extrinsic.usable else 0, age, STARVED if starved and age > most else "")
 
-    def publish(self, extrinsic: Extrinsic, stamp: int) -> None:
-        """stamp: ns, of the newest data the extrinsic was tested with."""
+    def add(self, event: Any) -> None:
+        """Publish a new extrinsic."""
+        if isinstance(event, ExtrinsicUpdated):
+            result = event.extrinsic.result
+            self._publish(event.extrinsic, event.stamp)
+            frames = result.camera_frame, result.lidar_frame
+            self._transforms.publish(transform_message(result.T_camera_lidar, *frames, event.stamp))
+
+    def again(self) -> None:
+        """Others see that the node is alive, and whether its extrinsic still is."""
+        self._pipeline.read_current(self._publish, wait=False)
+
+    def _publish(self, extrinsic: Extrinsic, stamp: int) -> None:
         self.stamp = stamp
         message = self.message(extrinsic)
         self.served = [consumer.name for consumer in message.consumers if consumer.usable]
-        self.publisher.publish(message)
+        self._publisher.publish(message)
 
     def message(self, extrinsic: Extrinsic, stamp: int | None = None) -> ExtrinsicMsg:
         """The message as of now. stamp: ns, if not that of the newest one published."""
@@ -106,24 +130,35 @@ class ExtrinsicPublisher:
         return msg
 
 
-class OverlayPublisher:
+class OverlayPublisher(NodeService):
     """~/overlay and ~/overlay/compressed: the diagnostic picture, drawn once for both while someone listens to either, at most
-    once per period_s, which may be replaced.
+    once per overlay_period_s.
 
     Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset.
     """
 
-    def __init__(self, node: Node, period_s: float) -> None:
-        self._context = node.context
+    def __init__(self, node: Node, pipeline: Pipeline, parameters: Callable[[], Parameters]) -> None:
+        self._node, self._pipeline, self._parameters = node, pipeline, parameters
         self.publisher = node.create_publisher(Image, "~/overlay", 1)
         self.compressed = node.create_publisher(CompressedImage, "~/overlay/compressed", 1)
-        self.period_s = period_s
         self._last = 0.0
 
-    def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
-        """Draw a frame with the current extrinsic below the initial one; at_once: whatever the period."""
-        due = at_once or time.monotonic() - self._last >= self.period_s
-        if recalibrator is None or frame is None or not due or not self._context.ok():  # not ok: the node is being stopped
+    def destroy(self) -> None:
+        """See `NodeService`."""
+        for publisher in (self.publisher, self.compressed):
+            self._node.destroy_publisher(publisher)
+
+    def add(self, event: Any) -> None:
+        """Draw a frame, and a new extrinsic at once, whatever the period."""
+        if isinstance(event, ExtrinsicUpdated):
+            self._publish(self._pipeline.last_keyframe)
+        elif isinstance(event, FrameIngested) and time.monotonic() - self._last >= self._parameters()["overlay_period_s"]:
+            self._publish(event.frame)
+
+    def _publish(self, frame: Frame | None) -> None:
+        """A frame with the current extrinsic below the initial one."""
+        recalibrator = self._pipeline.recalibrator
+        if recalibrator is None or frame is None or not self._node.context.ok():  # not ok: the node is being stopped
             return
         heard, heard_compressed = (own.get_subscription_count() > 0 for own in (self.publisher, self.compressed))
         if not (heard or heard_compressed):
@@ -147,7 +182,7 @@ class OverlayPublisher:
             self.compressed.publish(compressed_image_message(picture, extrinsic.result.camera_frame, frame.stamp))
 
 
-class ProcessedPublisher:
+class ProcessedPublisher(NodeService):
     """~/processed: the header of every image and cloud, once nothing that was received by then waits to be taken in.
 
     Whoever sends no more before it comes, as `calib-ros play --follow` does, loses no pair, however slow the machine is.
@@ -157,20 +192,29 @@ class ProcessedPublisher:
         self._node, self._pipeline = node, pipeline
         # Kept for whoever this node discovers late.
         kept = QoSProfile(depth=PROCESSED_KEPT, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.publisher = node.create_publisher(Header, "~/processed", kept)
+        self._publisher = node.create_publisher(Header, "~/processed", kept)
         self._received: deque[Header] = deque(maxlen=PROCESSED_KEPT)
         self._lock = threading.Lock()
 
-    def add(self, header: Header) -> None:
+    def destroy(self) -> None:
+        """See `NodeService`."""
+        self._node.destroy_publisher(self._publisher)
+
+    def receive(self, header: Header) -> None:
         """Of a message that the pipeline has been given."""
         with self._lock:
             self._received.append(header)
-        self.publish()
+        self._publish()
 
-    def publish(self) -> None:
+    def add(self, event: Any) -> None:
+        """All pairs so far may be worked off."""
+        if isinstance(event, IntakeIdle):
+            self._publish()
+
+    def _publish(self) -> None:
         """All headers, unless a pair is being taken in: what comes of the newest messages is not known before."""
         with self._lock:
             if self._pipeline.taking_in or not self._node.context.ok():
                 return
             while self._received:
-                self.publisher.publish(self._received.popleft())
+                self._publisher.publish(self._received.popleft())

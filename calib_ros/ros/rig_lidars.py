@@ -11,6 +11,7 @@ from sensor_msgs.msg import PointCloud2
 
 from calib_ros.arrays import Transform
 from calib_ros.errors import CalibrationError, MissingDependencyError
+from calib_ros.extensions import NodeService
 from calib_ros.frame import NANOSECONDS
 from calib_ros.lidar.ego_motion import MAX_GAP_S
 from calib_ros.online.common import Common
@@ -22,8 +23,8 @@ from calib_ros.rig.lidars import LidarScans
 from calib_ros.rig.live import PairState
 from calib_ros.ros.conversions import Serialized
 from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.inputs import Decoded, Listener, SharedTopics
 from calib_ros.ros.parameters import Parameters
-from calib_ros.ros.shared_topics import Decoded, Listener, SharedTopics
 from calib_ros.ros.subscriptions import livox_forms, serialized
 
 SCANS_KEPT = 8  # messages of a LiDAR, among them the first one of a beat and that before it, while the other one is late
@@ -31,7 +32,7 @@ Stamped = tuple[int, Serialized]
 Moment = Mapping[str, list[Stamped]]  # of each LiDAR a scan and the one before it
 
 
-class LidarsOfRig:
+class LidarsOfRig(NodeService):
     """Registers the scans of two LiDARs, those that cameras look at as well, on a thread of its own and within the load budget.
 
     names: target and source, their topics and decoders by name. start: T_target_source (4, 4) to begin with, None = unknown yet.
@@ -41,6 +42,7 @@ class LidarsOfRig:
     def __init__(
         self,
         names: tuple[str, str],
+        shared: SharedTopics,
         topics: Mapping[str, str],
         decoded: Mapping[str, Decoded],
         common: Common,
@@ -48,7 +50,7 @@ class LidarsOfRig:
         health: Health,
         start: Callable[[], Transform | None],
     ) -> None:
-        self.names, self._topics, self._decoded, self._common = names, topics, decoded, common
+        self.names, self._shared, self._topics, self._decoded, self._common = names, shared, topics, decoded, common
         self._parameters, self._health, self._start = parameters, health, start
         self.reset()
         self.load = LoadBudget(parameters().config.online, purse=common.purse)
@@ -60,13 +62,13 @@ class LidarsOfRig:
         self._listeners: dict[str, Listener] = {}
         self._worker: Worker[Moment] = Worker("calib_lidars", self._register, self._failed)
 
-    def activate(self, shared: SharedTopics) -> None:
+    def start(self) -> None:
         """Receive scans."""
-        subscribe = partial(shared.subscribe, preference=self._parameters()["reliability"], guard=self._health.guard)
+        subscribe = partial(self._shared.subscribe, preference=self._parameters()["reliability"], guard=self._health.guard)
         forms = [serialized(PointCloud2), *livox_forms()]
         self._listeners = {name: subscribe(forms, self._topics[name], partial(self._add, name)) for name in self.names}
 
-    def deactivate(self) -> None:
+    def pause(self) -> None:
         """Receive nothing any more."""
         for listener in self._listeners.values():
             listener.destroy()
@@ -79,7 +81,7 @@ class LidarsOfRig:
         config = self._parameters().config
         self.pair = LidarPair(*self.names, config.motion.time_offset_sigma_s, config.refine)
 
-    def stop(self) -> bool:
+    def end(self) -> bool:
         """End the thread; True if it ended."""
         return self._worker.stop()
 
@@ -95,7 +97,7 @@ class LidarsOfRig:
         return PairState(*self.names, extrinsic, extrinsic.usable and not silent, silent, self.pair.kind)
 
     def check(self) -> None:
-        """Follow the publishers and the parameters; to be called about once a second."""
+        """Follow the publishers and the parameters."""
         self.load.config = self._parameters().config.online
         for listener in self._listeners.values():
             listener.check()

@@ -5,23 +5,23 @@ Every pair has the interface of a node of its own, named by its LiDAR below the 
 
 from __future__ import annotations
 
+import re
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 from calib_ros_msgs.msg import Rig
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
+from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
@@ -30,160 +30,129 @@ from calib_ros.online.pacing import LoadBudget
 from calib_ros.online.worker import Worker
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import MOVED, SUSPECT
-from calib_ros.rig.description import CAMERA, Sensor, prior_covariance, read_rig
+from calib_ros.rig.description import CAMERA, RigDescription, read_rig
 from calib_ros.rig.edges import box_of
 from calib_ros.rig.graph import solve
 from calib_ros.rig.lidars import MOTION_KIND
 from calib_ros.rig.live import LiveRig, Pair, PairState, RigState
-from calib_ros.ros import parameters
-from calib_ros.ros.answers import ROUNDS, after_answers
+from calib_ros.rig.report import RigReport
+from calib_ros.ros.answers import ROUNDS, after_answers, serve
 from calib_ros.ros.conversions import transform_message
-from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.dds import LATCHED
 from calib_ros.ros.executor import Beside
+from calib_ros.ros.inputs import PairInputs, SharedTopics, decoded_clouds, decoded_images
+from calib_ros.ros.interface import Interface
 from calib_ros.ros.pair import PairInterface
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import VALID_PERIODS
 from calib_ros.ros.rig_lidars import LidarsOfRig
 from calib_ros.ros.rig_messages import rig_message, rig_status
-from calib_ros.ros.rig_pairs import (
-    OF_PAIR,
-    OF_RIG,
-    USED,
-    PairOfRig,
-    camera_pairs,
-    lidar_pairs,
-    node_of_pair,
-)
-from calib_ros.ros.shared_topics import SharedTopics, decoded_clouds, decoded_images
-from calib_ros.ros.tf import LATCHED, StaticTf
-from calib_ros.ros.write_back import WriteBack, check_files
+from calib_ros.ros.write_back import check_files
 
 TF_CURE = "take what says otherwise out of the robot's description, or write the rig to its joints with calib-ros rig --out"
+TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")  # of the name of a node
+# Settings of a node of one pair that a rig has in another way, or a pair each by itself.
+OF_RIG = {"rig_file", "publish_tf", "tf_parent", "tf_child", "export.on_converged", "export.joint"}
+OF_PAIR = {"camera_frame", "lidar_frame", "initial_translation_m", "initial_quaternion_xyzw", "state_file", "capture_dir"}
+USED = {"rig_file", "publish_tf", "export.on_converged", "state_file", "capture_dir"}  # of these, by the rig as well
 Priors = dict[str, tuple[Transform, Covariance]]
 
 
-class RigInterface:
-    """Topics, services and parameters of a rig on a node, with the members of a `PairInterface`.
+class RigInterface(Interface):
+    """Topics, services and parameters of a rig.
 
     pairs: their interfaces, on nodes that spin along. state: the newest, None before the first second. Raises a CalibrationError
     for a rig file or parameters that cannot work.
     """
 
     def __init__(self, node: Node, declared: Parameters) -> None:
-        self._node, self.parameters, self.health = node, declared, Health(node.get_logger())
-        self.description = read_rig(declared["rig_file"])
-        wanted = camera_pairs(self.description, declared["rig_file"])
-        self._check_files(declared)
-        overrides = node._parameter_overrides
-        for line in parameters.misspelt({name: p.value for name, p in overrides.items()}, node._parameters):
-            node.get_logger().warning(line)
-        for name in sorted(((OF_RIG | OF_PAIR) - USED) & set(overrides)):
+        self.description, path = read_rig(declared["rig_file"]), declared["rig_file"]
+        for sensor in self.description.sensors:
+            if not TOKEN.fullmatch(sensor.name):
+                raise BadInputError(f"{path}: sensors.{sensor.name} cannot be part of a topic's name; use letters, digits and _")
+        if not self.description.camera_pairs:
+            raise BadInputError(f"{path}: pairs holds no camera with a LiDAR, which the node estimates; add one")
+        check_files(declared["export.on_converged"], self.description)
+        super().__init__(node, declared, node, (TF_CURE, TF_CURE))
+        for name in sorted(((OF_RIG | OF_PAIR) - USED) & set(self.given)):
             node.get_logger().warning(f"parameter '{name}' has no effect with a rig_file")
         self.state: RigState | None = None
-        others = [s for s in self.description.sensors if s.name != self.description.reference]
-        self._priors_given = {s.name: (s.prior, _covariance(s)) for s in others if s.prior is not None}
+        self._others = [s for s in self.description.sensors if s.name != self.description.reference]
+        self._priors_given = {s.name: s.believed(s.prior) for s in self._others if s.prior is not None}
         self._live = LiveRig(self.description, declared.config.refine)
-        wanted_tf = declared["initial_from_tf"], declared["publish_tf"]
-        self.tf = StaticTf(node, *wanted_tf, self.health.error, (TF_CURE, TF_CURE))
-        common, self._shared = Common(declared.config.online), SharedTopics(node)
+        common, shared = Common(declared.config.online), SharedTopics(node)
         self.load = LoadBudget(declared.config.online, purse=common.purse)  # of receiving messages
         decoded = {s.name: decoded_images() if s.kind == CAMERA else decoded_clouds() for s in self.description.sensors}
         self.pairs: dict[Pair, PairInterface] = {}
-        self._views: list[PairOfRig] = []  # of pairs that are estimated only if they share a view
+        self._views: list[PairInputs] = []  # of pairs that are estimated only if they share a view
         self._beside = Beside(context=node.context)
         self._beside.spin_from(node)
         try:
-            for camera, lidar in wanted:
-                pair = PairOfRig(
-                    *(camera, lidar, common, self._shared, self._topics(camera, lidar), decoded[camera], decoded[lidar])
-                )
+            for camera, lidar in self.description.camera_pairs:
+                topics = self._topics(camera, lidar)
+                inputs = PairInputs(shared, decoded[camera], decoded[lidar], common, camera, lidar, topics)
                 known = self._between(camera, lidar)
-                pair.T = None if known is None else known[0]
+                inputs.T = None if known is None else known[0]
                 own = node_of_pair(node, declared, self.description, (camera, lidar), known)
                 self._beside.add_node(own)
-                self.pairs[camera, lidar] = made = PairInterface(own, pair)
-                pair.on_reset = partial(self._reset_lidars, lidar)
+                self.pairs[camera, lidar] = made = PairInterface(own, inputs)
+                inputs.on_reset = partial(self._reset_lidars, lidar)
                 if self.description.pairs is None:
-                    pair.unseen = lambda why, made=made: self._unseen(made, why)
-                    self._views.append(pair)
+                    inputs.unseen = lambda why, made=made: self._unseen(made, why)
+                    self._views.append(inputs)
         except BaseException:  # of one pair: the others must not go on
             self._destroy_pairs()
             self._beside.destroy(node)
             self.tf.destroy()
             raise
-        topics = {name: self._topics(name, name)[1] for name in self.description.lidars}
-        given = (lambda: self.parameters, self.health)
-        self.lidars = [
-            LidarsOfRig(pair, topics, decoded, common, *given, partial(self._start_of, *pair))
-            for pair in lidar_pairs(self.description)
-        ]
+        topics_of = {name: self._topics(name, name)[1] for name in self.description.lidars}
+        of_all = shared, topics_of, decoded, common, lambda: self.parameters, self.health
+        self.lidars = [LidarsOfRig(pair, *of_all, partial(self._start_of, *pair)) for pair in self.description.lidar_pairs]
+        self.parts += self.lidars
         self._lock = threading.Lock()  # of state, active and what is published of them
         self._active = False
         self._priors_now: Priors = dict(self._priors_given)
         self._told: list[PairState] = []  # what the newest solution rests on
         self._text = ""
         self._edges: list[TransformStamped] = []  # of the newest solution
-        self._edges_told = self._edges
-        self._files = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_files")  # disks may be slow
-        self._write_back = WriteBack(lambda: self.parameters, self._files, self.health)
         self._solver: Worker[tuple[LiveRig, list[PairState], Priors]] = Worker("calib_rig", self._solve, self._failed)
         self.publisher = node.create_publisher(Rig, "~/rig", LATCHED)
         self._diagnostics_pub = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timers: list[Timer] = []
-        self._ended: bool | None = None
-        self._service = node.create_service(Trigger, "~/reset", self._reset)
+        self._service = serve(node, self.health, Trigger, "~/reset", self._reset)
         node.add_on_set_parameters_callback(self._on_parameters)
 
     # ---- states -------------------------------------------------------------------------------------------------------
 
     def activate(self) -> None:
-        """See `PairInterface`."""
+        """See `Interface`."""
         self._active = True
         for pair in self.pairs.values():
             pair.activate()
-        for lidars in self.lidars:
-            lidars.activate(self._shared)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timers = [
-            self._node.create_timer(1.0, self._every_second, clock=steady),
-            self._node.create_timer(self.parameters["publish_period_s"], self._publish, clock=steady),
-        ]
+        super().activate()
         names = ", ".join(f"{camera} with {lidar}" for camera, lidar in self.pairs)
-        self._node.get_logger().info(f"a rig of {len(self.description.sensors)} sensors: {names}")
+        self.node.get_logger().info(f"a rig of {len(self.description.sensors)} sensors: {names}")
 
     def deactivate(self) -> None:
-        """See `PairInterface`."""
-        for timer in self._timers:
-            self._node.destroy_timer(timer)
-        self._timers = []
+        """See `Interface`."""
         for pair in self.pairs.values():
             pair.deactivate()
-        for lidars in self.lidars:
-            lidars.deactivate()
+        super().deactivate()
         with self._lock:
             self._active = False
             self._forget()
 
-    def stop(self) -> bool:
-        """See `PairInterface`."""
-        if self._ended is None:
-            with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
-                ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
-            self._ended = all([*ended, *(lidars.stop() for lidars in self.lidars), self._solver.stop()])
-            self._files.shutdown(wait=True)
-        return self._ended
+    def _end_threads(self) -> bool:
+        with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
+            ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
+        return all([*ended, *(lidars.end() for lidars in self.lidars), self._solver.stop()])
 
     def destroy(self) -> bool:
-        """See `PairInterface`."""
-        if self._timers:
-            self.deactivate()
-        ended = self.stop()
+        """See `Interface`."""
+        ended = super().destroy()
         self._destroy_pairs()
-        self._node.remove_on_set_parameters_callback(self._on_parameters)
-        self.tf.destroy()
-        after_answers(self._node, partial(self._node.destroy_service, self._service))
+        after_answers(self.node, partial(self.node.destroy_service, self._service))
         for publisher in (self.publisher, self._diagnostics_pub):
-            self._node.destroy_publisher(publisher)
+            self.node.destroy_publisher(publisher)
         return ended
 
     def _destroy_pairs(self) -> None:
@@ -193,8 +162,8 @@ class RigInterface:
             self._beside.spin_ready()
 
     def destroy_nodes(self) -> None:
-        """Those of the pairs, at the very end."""
-        self._beside.destroy(self._node)
+        """See `Interface`."""
+        self._beside.destroy(self.node)
 
     # ---- what the pairs start from --------------------------------------------------------------------------------------
 
@@ -214,7 +183,7 @@ class RigInterface:
 
     def _unseen(self, pair: PairInterface, why: str) -> None:
         pair.pipeline.pause(why)
-        self._node.get_logger().info(why)
+        self.node.get_logger().info(why)
 
     def _frame(self, name: str) -> str:
         """TF frame of a sensor, as far as it is known."""
@@ -229,41 +198,35 @@ class RigInterface:
     def _priors(self) -> Priors:
         """Of all sensors whose places are known, by the description or TF."""
         found, reference = dict(self._priors_given), self._frame(self.description.reference)
-        for sensor in self.description.sensors:
-            if sensor.name not in found and sensor.name != self.description.reference:
+        for sensor in self._others:
+            if sensor.name not in found:
                 T, _ = self.tf.lookup(reference, self._frame(sensor.name))
                 if T is not None:
-                    found[sensor.name] = T, prior_covariance(T, sensor.sigma_deg, sensor.sigma_m)
+                    found[sensor.name] = sensor.believed(T)
         return found
 
     # ---- every second ---------------------------------------------------------------------------------------------------
 
-    def _every_second(self) -> None:
-        with self.health.guard():
-            self.health.log.catch_up()
-            self.load.count_messages()
-            self.tf.check()
-            states, priors = [self._state_of(*names, pair) for names, pair in self.pairs.items()], self._priors()
-            self._priors_now = priors
-            doubt = any(own.status in (SUSPECT, MOVED) for own in states)
-            for lidars in self.lidars:
-                lidars.urgent = doubt
-                if lidars.pair.kind == MOTION_KIND and any(
-                    own.status == MOVED and {*own.pair} & {*lidars.names} for own in states
-                ):
-                    lidars.reset()  # how both moved before says nothing of where they are now
-                lidars.check()
-                states.append(lidars.state())
-            for view in [own for own in self._views if own.T is None]:  # whose priors TF tells
-                if {view.camera, view.lidar} <= priors.keys() | {self.description.reference}:
-                    view.T = solve([], priors, self.description.reference).between(view.camera, view.lidar)[0]
-            changed = len(states) != len(self._told) or not all(map(PairState.says_as, states, self._told))
-            if changed or self.state is None or len(priors) + 1 != len(self.state.sensors):
-                self._told = states
-                self._solver.put((self._live, states, priors))
-            if (edges := self._edges) is not self._edges_told and self.tf.publish_tree(edges):
-                self._edges_told = edges
-            self._diagnostics_pub.publish(self._diagnostics(priors))
+    def check(self) -> None:
+        """See `Interface`."""
+        self.load.count_messages()
+        super().check()
+        states, priors = [self._state_of(*names, pair) for names, pair in self.pairs.items()], self._priors()
+        self._priors_now = priors
+        doubt, lost = any(own.status in (SUSPECT, MOVED) for own in states), {own.pair for own in states if own.status == MOVED}
+        for lidars in self.lidars:
+            lidars.urgent = doubt
+            if lidars.pair.kind == MOTION_KIND and any({*pair} & {*lidars.names} for pair in lost):
+                lidars.reset()  # how both moved before says nothing of where they are now
+            states.append(lidars.state())
+        for view in [own for own in self._views if own.T is None]:  # whose priors TF tells
+            if {view.camera, view.lidar} <= priors.keys() | {self.description.reference}:
+                view.T = solve([], priors, self.description.reference).between(view.camera, view.lidar)[0]
+        changed = len(states) != len(self._told) or not all(map(PairState.says_as, states, self._told))
+        if changed or self.state is None or len(priors) + 1 != len(self.state.sensors):
+            self._told = states
+            self._solver.put((self._live, states, priors))
+        self._diagnostics_pub.publish(self._diagnostics(priors))
 
     def _state_of(self, camera: str, lidar: str, pair: PairInterface) -> PairState:
         recalibrator = pair.pipeline.recalibrator
@@ -302,27 +265,27 @@ class RigInterface:
         reference = self._frame(state.solution.reference)
         others = [own for own in state.sensors if own.name != state.solution.reference]
         self._edges = [transform_message(own.T, reference, self._frame(own.name), self._stamp(own.name)) for own in others]
-        self._write(state)
+        self.tf.put_tree(self._edges)
+        self.write_back.put(self._report(state))
 
-    def _write(self, state: RigState) -> None:
-        """To the files of export.on_converged, once all sensors are to be relied on."""
-        if len(state.sensors) == len(self.description.sensors) and all(own.usable for own in state.sensors):
-            frames = {own.name: self._frame(own.name) for own in state.sensors}
-            of_cameras = {camera: pair.pipeline.camera for (camera, _), pair in self.pairs.items()}
-            cameras = {name: camera for name, camera in of_cameras.items() if camera is not None}
-            self._write_back.put(replace(state.report, frames=frames, cameras=cameras, source=self.parameters["vehicle"]))
+    def _report(self, state: RigState) -> RigReport | None:
+        """For the files of export.on_converged, once all sensors are to be relied on."""
+        if len(state.sensors) < len(self.description.sensors) or not all(own.usable for own in state.sensors):
+            return None
+        frames = {own.name: self._frame(own.name) for own in state.sensors}
+        of_cameras = {camera: pair.pipeline.camera for (camera, _), pair in self.pairs.items()}
+        cameras = {name: camera for name, camera in of_cameras.items() if camera is not None}
+        return replace(state.report, frames=frames, cameras=cameras, source=self.parameters["vehicle"])
 
-    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        with self.health.guard():
-            for pair in self.pairs.values():
-                pair.reset()
-            for lidars in self.lidars:
-                lidars.reset()
-            with self._lock:
-                self._live = LiveRig(self.description, self.parameters.config.refine)
-                self._forget()
-            response.success, response.message = True, "all pairs are back to the priors"
-        return response
+    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> None:
+        for pair in self.pairs.values():
+            pair.reset()
+        for lidars in self.lidars:
+            lidars.reset()
+        with self._lock:
+            self._live = LiveRig(self.description, self.parameters.config.refine)
+            self._forget()
+        response.success, response.message = True, "all pairs are back to the priors"
 
     def _reset_lidars(self, lidar: str) -> None:
         """What is known of a LiDAR by other ones."""
@@ -343,8 +306,9 @@ class RigInterface:
 
     # ---- messages -------------------------------------------------------------------------------------------------------
 
-    def _publish(self) -> None:
-        with self.health.guard(), self._lock:
+    def publish_again(self) -> None:
+        """See `Interface`."""
+        with self._lock:
             if self.state is not None:
                 self.publisher.publish(self._message(self.state))
 
@@ -355,49 +319,63 @@ class RigInterface:
         return max((stamp for names, stamp in stamps if not name or name in names), default=0)
 
     def _message(self, state: RigState, usable: bool = True) -> Rig:
-        now = self._node.get_clock().now().nanoseconds
+        now = self.node.get_clock().now().nanoseconds
         until = now + round(VALID_PERIODS * self.parameters["publish_period_s"] * NANOSECONDS)
         return rig_message(state, self._frame, self._stamp, (now, until), usable)
 
     def _diagnostics(self, priors: Mapping[str, Any]) -> DiagnosticArray:
-        missing = [s.name for s in self.description.sensors if s.name not in priors and s.name != self.description.reference]
+        missing = [s.name for s in self._others if s.name not in priors]
         told = dict.fromkeys(missing, "nobody knows where it is: set its prior, or publish it on /tf_static")
-        status = rig_status(f"{self._node.get_fully_qualified_name().lstrip('/')}: rig", self.state, told, self.health)
+        status = rig_status(f"{self.node.get_fully_qualified_name().lstrip('/')}: rig", self.state, told, self.health)
         status.hardware_id = self.parameters["vehicle"]
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.stamp = self.node.get_clock().now().to_msg()
         return message
 
     # ---- parameters -------------------------------------------------------------------------------------------------------
 
-    def _on_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
+    def _take(self, new: Parameters, changed: list[Parameter]) -> None:
         """What changes holds for all pairs, but for what is each one's own."""
-        answer, new = parameters.on_change(self.parameters, list(changed), None)
-        if answer.successful and new["publish_tf"] and self.tf.missing:
-            return SetParametersResult(successful=False, reason=self.tf.missing)
-        try:
-            if any(p.name == "export.on_converged" for p in changed):
-                self._check_files(new)
-        except BadInputError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+        if any(p.name == "export.on_converged" for p in changed):
+            check_files(new["export.on_converged"], self.description)
         passed = [p for p in changed if p.name not in OF_RIG | OF_PAIR]
-        for own in self._beside.get_nodes() if answer.successful and passed else ():
+        for own in self._beside.get_nodes() if passed else ():
             told = own.set_parameters_atomically(passed)
             if not told.successful:
-                return told
-        if answer.successful:
-            self.parameters, self.load.config = new, new.config.online
-            self.tf.switch(new["publish_tf"])
-            self._edges_told = []
-            if (state := self.state) is not None:
-                self._write(state)
-        return answer
-
-    def _check_files(self, given: Parameters) -> None:
-        pairs = [*camera_pairs(self.description, given["rig_file"]), *lidar_pairs(self.description)]
-        check_files(given["export.on_converged"], self.description, pairs)
+                raise BadInputError(told.reason)
+        self.parameters, self.load.config = new, new.config.online
+        self.tf.put_tree(self._edges)
 
 
-def _covariance(sensor: Sensor) -> Covariance:
-    assert sensor.prior is not None
-    return prior_covariance(sensor.prior, sensor.sigma_deg, sensor.sigma_m)
+def node_of_pair(
+    node: Node, given: Parameters, description: RigDescription, pair: Pair, known: tuple[Transform, SearchBox] | None
+) -> Node:
+    """A node of a pair, below that of the rig: what is remapped or renamed on the command line is the rig's.
+
+    given: parameters of the rig, which are the pair's but for what is its own. known: T_camera_lidar (4, 4) by the description,
+    and how far around to search.
+    """
+    overrides, (camera, lidar) = node._parameter_overrides, pair
+    own: dict[str, Any] = {"camera_frame": description[camera].frame, "lidar_frame": description[lidar].frame}
+    if description[camera].mask:
+        own["image.mask"] = description[camera].mask
+    if known is not None:
+        T, box = known
+        own["initial_translation_m"] = T[:3, 3].tolist()
+        own["initial_quaternion_xyzw"] = se3.quaternion_from_rotation(T[:3, :3]).tolist()
+        own["search.rotation_deg"], own["search.translation_m"] = np.max(box.rotation_deg), np.max(box.translation_m)
+        own |= {name: overrides[name].value for name in ("search.rotation_deg", "search.translation_m") if name in overrides}
+    if path := given["state_file"]:
+        stem, dot, ending = path.rpartition(".")
+        own["state_file"] = f"{stem}.{camera}.{lidar}.{ending}" if dot else f"{path}.{camera}.{lidar}"
+    if folder := given["capture_dir"]:
+        own["capture_dir"] = f"{folder}/{camera}/{lidar}"
+    of_all = [n for n in overrides if n in node._parameters and n not in OF_RIG | OF_PAIR and n not in own]
+    return Node(
+        lidar,
+        context=node.context,
+        namespace=f"{node.get_fully_qualified_name()}/{camera}",
+        use_global_arguments=False,
+        parameter_overrides=[overrides[n] for n in of_all] + [Parameter(n, value=v) for n, v in own.items()],
+        allow_undeclared_parameters=True,
+    )

@@ -1,59 +1,81 @@
-"""The services that answer at once, and ~/capture."""
+"""The services that answer at once, and ~/calibrate: a service that answers when it is done, and an action."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
-from concurrent.futures import Executor
+from concurrent.futures import Future as Promise
 from typing import Any
 
+from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from calib_ros_msgs.srv import GetExtrinsic
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from calib_ros.errors import CalibrationError
+from calib_ros.extensions import NodeService
 from calib_ros.online.pipeline import Pipeline
-from calib_ros.result import Extrinsic, Result
-from calib_ros.ros.answers import after_answers, done
-from calib_ros.ros.capture import Capture
+from calib_ros.registration.progress import Callback
+from calib_ros.result import CONVERGED, TENTATIVE, Extrinsic
+from calib_ros.ros.answers import after_answers, done, serve
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic
 from calib_ros.ros.publishers import ExtrinsicPublisher
 
+FEEDBACK_PERIOD_S = 0.1  # as often as a person can follow; a search reports some hundred times a second
 
-class Services:
-    """~/get_extrinsic, ~/reset, ~/save and ~/capture.
 
-    save: writes a result to the state file. publisher: of ~/extrinsic. files: writes captures. events: for these. reset: forgets
-    what was found.
+class Services(NodeService):
+    """~/get_extrinsic, ~/reset, ~/save and ~/calibrate, whose requests over the same keyframes share one estimate, which ends
+    when all are cancelled.
+
+    publisher: of ~/extrinsic. reset: forgets what was found.
     """
 
     def __init__(
         self,
         node: Node,
         pipeline: Pipeline,
-        initial: InitialExtrinsic,
-        capture: Capture,
-        save: Callable[[Result], tuple[bool, str]],
-        publisher: ExtrinsicPublisher,
         health: Health,
-        files: Executor,
-        events: Callable[[], str],
+        initial: InitialExtrinsic,
+        publisher: ExtrinsicPublisher,
         reset: Callable[[], None],
     ) -> None:
-        self._health = health
-        self._node, self._pipeline, self._initial, self._recorder = node, pipeline, initial, capture
-        self._write, self._publisher, self._files, self._events, self._forget = save, publisher, files, events, reset
+        self._node, self._pipeline, self._health, self._initial = node, pipeline, health, initial
+        self._publisher, self._forget = publisher, reset
+        self._promises: dict[bytes, Promise[Extrinsic]] = {}  # of the goals under way, by their ids
+        group = ReentrantCallbackGroup()  # requests for an estimate share one, and must not wait for each other
         self._services = [
-            node.create_service(GetExtrinsic, "~/get_extrinsic", self._safe(self._get_extrinsic)),
-            # A callback that awaits blocks its group: in the node's own group it would block all others until it is done.
-            node.create_service(Trigger, "~/capture", self._capture, callback_group=MutuallyExclusiveCallbackGroup()),
-            node.create_service(Trigger, "~/reset", self._safe(self._reset)),
-            node.create_service(Trigger, "~/save", self._safe(self._save)),
+            serve(node, health, GetExtrinsic, "~/get_extrinsic", self._get_extrinsic),
+            serve(node, health, Trigger, "~/reset", self._reset),
+            serve(node, health, Trigger, "~/save", self._save),
+            serve(node, health, Trigger, "~/calibrate", self._calibrate, group),
         ]
+        self._action = ActionServer(
+            node,
+            Calibrate,
+            "~/calibrate",
+            self._execute,
+            callback_group=ReentrantCallbackGroup(),
+            goal_callback=lambda _: GoalResponse.REJECT if pipeline.paused else GoalResponse.ACCEPT,
+            handle_accepted_callback=self._begin,
+            cancel_callback=self._cancel,
+        )
 
-    def message(self, extrinsic: Extrinsic | None = None) -> ExtrinsicMsg:
+    def destroy(self) -> None:
+        """To be called when no estimate is under way; answers that are made already are sent before."""
+        after_answers(self._node, self._destroy)
+
+    def _destroy(self) -> None:
+        for service in self._services:
+            self._node.destroy_service(service)
+        self._action.destroy()
+
+    def _message(self, extrinsic: Extrinsic | None = None) -> ExtrinsicMsg:
         """The message of an extrinsic as of now; None = of the current one, the initial one before any."""
         recalibrator = self._pipeline.recalibrator
         if extrinsic is None and recalibrator is not None:
@@ -62,64 +84,28 @@ class Services:
             return self._publisher.message(Extrinsic(self._initial.before_messages()), 0)
         return self._publisher.message(extrinsic)
 
-    def _safe(self, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Whatever an answer raises becomes its message: it would end the node."""
-
-        def answered(request: Any, response: Any) -> Any:
-            try:
-                return answer(request, response)
-            except CalibrationError as error:
-                response.success, response.message = False, str(error)
-            except Exception as error:
-                response.success, response.message = False, self._health.unexpected(error)
-            return response
-
-        return answered
-
-    def destroy(self) -> None:
-        """Answers that are made already are sent before."""
-        after_answers(self._node, self._destroy)
-
-    def _destroy(self) -> None:
-        for service in self._services:
-            self._node.destroy_service(service)
-
-    def _get_extrinsic(self, request: GetExtrinsic.Request, response: GetExtrinsic.Response) -> GetExtrinsic.Response:
+    def _get_extrinsic(self, request: GetExtrinsic.Request, response: GetExtrinsic.Response) -> None:
         recalibrator = self._pipeline.recalibrator
         if recalibrator is None:
-            response.extrinsic = self.message()
+            response.extrinsic = self._message()
             response.message = "no pair of image and cloud with a CameraInfo yet; this is the initial extrinsic"
-            return response
+            return
         extrinsic = recalibrator.current
-        result = extrinsic.result
-        response.extrinsic = self.message(extrinsic)
+        response.extrinsic = self._message(extrinsic)
         response.success = response.extrinsic.usable
         last_good = self._publisher.last_good()
         if last_good is not None:
             response.last_good_known, response.last_good = True, last_good
         more = recalibrator.config.online.min_keyframes - len(recalibrator.buffer)
         waiting = f"waiting for {more} more keyframes" if more > 0 else "no estimate yet"
-        made = f"estimated from {result.frames_used} keyframes"
+        made = f"estimated from {extrinsic.result.frames_used} keyframes"
         response.message = response.extrinsic.reason or (made if response.success else waiting)
-        return response
 
-    async def _capture(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        written = await done(self._node, self._files.submit(self._recorder.write, self._pipeline, self._events()))
-        error = written.exception()
-        if error is None:
-            response.success, response.message = True, str(written.result())
-        elif isinstance(error, CalibrationError):
-            response.message = str(error)
-        else:
-            response.message = self._health.unexpected(error)
-        return response
-
-    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> None:
         self._forget()
         response.success, response.message = True, "keyframes forgotten, back to the initial extrinsic"
-        return response
 
-    def _save(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _save(self, request: Trigger.Request, response: Trigger.Response) -> None:
         recalibrator = self._pipeline.recalibrator
         last_good = recalibrator.tracker.last_good if recalibrator is not None else None
         if recalibrator is None or last_good is None:
@@ -129,5 +115,60 @@ class Services:
         elif recalibrator.tracker.tentative:
             response.message = f"nothing saved: {recalibrator.current.result.reason}"
         else:
-            response.success, response.message = self._write(last_good)
-        return response
+            response.success, response.message = self._initial.save(last_good)
+
+    async def _calibrate(self, request: Trigger.Request, response: Trigger.Response) -> None:
+        response.success, response.message = _outcome(await done(self._node, self._pipeline.request_estimate()))
+
+    def _begin(self, goal: ServerGoalHandle) -> None:
+        self._promises[bytes(goal.goal_id.uuid)] = self._pipeline.request_estimate(self._feedback(goal))
+        goal.execute()
+
+    def _cancel(self, goal: ServerGoalHandle) -> CancelResponse:
+        promise = self._promises.get(bytes(goal.goal_id.uuid))
+        return CancelResponse.ACCEPT if promise is not None and promise.cancel() else CancelResponse.REJECT
+
+    async def _execute(self, goal: ServerGoalHandle) -> Calibrate.Result:
+        key = bytes(goal.goal_id.uuid)
+        estimate = await done(self._node, self._promises[key])
+        del self._promises[key]
+        result = Calibrate.Result()
+        if estimate.cancelled():
+            result.message, result.extrinsic = "cancelled", self._message(None)
+            goal.canceled()
+            return result
+        result.success, result.message = _outcome(estimate)
+        result.extrinsic = self._message(None if estimate.exception() else estimate.result())
+        if result.success:
+            goal.succeed()
+        else:
+            goal.abort()
+        return result
+
+    def _feedback(self, goal: ServerGoalHandle) -> Callback:
+        """Progress of an estimate as feedback of a goal, on the thread of estimates."""
+        last = float("-inf")
+
+        def tell(stage: str, share: float) -> None:
+            nonlocal last
+            if time.monotonic() - last < FEEDBACK_PERIOD_S:
+                return
+            last = time.monotonic()
+            try:
+                goal.publish_feedback(Calibrate.Feedback(stage=stage, progress=min(max(float(share), 0.0), 1.0)))
+            except Exception as error:  # it must not end the estimate, which others may share
+                if self._node.context.ok():  # else the node is about to end
+                    self._health.unexpected(error)
+
+        return tell
+
+
+def _outcome(estimate: Promise[Any]) -> tuple[bool, str]:
+    """Whether an estimate was accepted, and what came of it, for a person."""
+    error = estimate.exception()
+    if error is not None:
+        return False, str(error) or "stopped"
+    result = estimate.result().result
+    figures = f"{result.frames_used} keyframes, score {result.score:.3f}" if math.isfinite(result.score) else ""
+    message = ". ".join(filter(None, [figures, result.reason]))
+    return result.status in (CONVERGED, TENTATIVE), f"{result.status}: {message}"

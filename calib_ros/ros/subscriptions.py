@@ -1,4 +1,4 @@
-"""The node's subscriptions: image, cloud, CameraInfo, and what measures how fast the vehicle moves."""
+"""Subscriptions that follow what publishers offer, and what to do where messages do not come."""
 
 from __future__ import annotations
 
@@ -10,35 +10,24 @@ from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
 
-import numpy as np
-from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
-from std_msgs.msg import Header
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
-from calib_ros.errors import CalibrationError, MissingDependencyError
-from calib_ros.messages import decode_camera_info, stamp_ns
+from calib_ros.messages import stamp_ns
 from calib_ros.messages.compressed_points import COMPRESSED_POINTS
 from calib_ros.messages.point_fields import LIVOX
 from calib_ros.messages.video import VIDEO
-from calib_ros.online.pairing.health import MISSING_SHARE
-from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros.conversions import Serialized, cloud_of_livox
 from calib_ros.ros.dds import profile_for_sender
-from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.distributions import SubscriptionEventCallbacks, UnsupportedEventTypeError, where_nobody_publishes
-from calib_ros.ros.parameters import Parameters
 
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 DEPTH = 10  # half a second of a camera at 20 Hz
 HANDOVER_S = 1.0  # the old subscription stays so long: the new one has to be discovered first
 LOSS_CHECKS = 11  # checks, at one a second, over which lost messages count: 10 s
-SILENT_S = 1.0  # without a message: slower sensors than this are of no use
 MIN_LOSSES = 5  # messages in that time; fewer are those of the discovery
-AFTER_STAMP = 12  # bytes of a message: what comes behind is the same in nearly every CameraInfo
-MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
 # What to do about topics of other types, by what is wanted.
 IMAGE_ADVICE = {
     "sensor_msgs/msg/CompressedImage": "set image_transport: compressed",
@@ -65,131 +54,6 @@ def serialized(kind: type[Any]) -> Form:
 def type_name(kind: type[Any]) -> str:
     """sensor_msgs.msg.Image -> 'sensor_msgs/msg/Image'."""
     return f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
-
-
-class MotionSource(NamedTuple):
-    """A topic that tells the vehicle's motion. decode: message -> speed, m/s, and turn rate, deg/s; None = unknown."""
-
-    topic: str
-    kind: type[Any]
-    decode: Callable[[Any], tuple[float | None, float | None]]
-
-
-class SensorSubscriptions:
-    """Image, cloud, CameraInfo and motion; between start() and stop() every message goes to the pipeline.
-
-    camera_info: the newest usable CameraInfo. motion: what measures the vehicle's motion, from motion_source(). on_received:
-    called with the header of every image and cloud, once the pipeline has been given it. subscribe: makes an
-    AdaptiveSubscription, or what is like it. topics: of image, cloud and CameraInfo. names: of camera and LiDAR, where people
-    know them by names.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        parameters: Parameters,
-        motion: MotionSource | None,
-        pipeline: Pipeline,
-        health: Health,
-        on_received: Callable[[Header], None],
-        subscribe: Callable[..., Any] | None = None,
-        topics: tuple[str, str, str] = ("image", "points", "camera_info"),
-        names: tuple[str, ...] = (),
-    ) -> None:
-        self.camera_info: Serialized | None = None
-        self.adaptive: tuple[AdaptiveSubscription, ...] = ()
-        self._subscribe, self._topics, self._names = subscribe or partial(AdaptiveSubscription, node), topics, names
-        self._node, self._pipeline, self._health = node, pipeline, health
-        self._on_received = on_received
-        self._rectified = parameters["image_is_rectified"]
-        self._image = CompressedImage if parameters["image_transport"] == "compressed" else Image
-        self._motion = motion
-        self._motion_subscription: Any = None
-
-    def start(self, parameters: Parameters) -> None:
-        """Subscribe."""
-        pipeline = self._pipeline
-        subscribe = partial(self._subscribe, preference=parameters["reliability"], guard=self._health.guard)
-        image, points, camera_info = self._topics
-        self.adaptive = (
-            subscribe([serialized(self._image)], image, self._forwarding_to(pipeline.add_image)),
-            subscribe([serialized(PointCloud2), *livox_forms()], points, self._forwarding_to(pipeline.add_cloud)),
-            # A camera's driver may publish once, latched, what never changes.
-            subscribe([serialized(CameraInfo)], camera_info, self._on_camera_info, latched=True),
-        )
-        if self._motion is not None:
-            motion = self._motion
-
-            def on_motion(msg: Any) -> None:
-                with self._health.guard():
-                    pipeline.speed_gate.add_measurement(stamp_ns(msg.header.stamp), *motion.decode(msg))
-
-            self._motion_subscription = self._node.create_subscription(motion.kind, motion.topic, on_motion, MOTION_QOS)
-
-    def stop(self) -> None:
-        """Receive nothing any more, until start() is called again."""
-        for subscription in self.adaptive:
-            subscription.destroy()
-        self.adaptive = ()
-        if self._motion_subscription is not None:
-            self._node.destroy_subscription(self._motion_subscription)
-            self._motion_subscription = None
-
-    def check(self, parameters: Parameters) -> None:
-        """Follow the publishers and the parameters; to be called about once a second."""
-        for subscription in self.adaptive:
-            subscription.preference = parameters["reliability"]
-            problem = subscription.check()
-            if problem and subscription.tells:
-                self._health.error(problem, f"publishers of {subscription.topic}")
-        self._health.silence = {name: own.silence for name, own in zip(("image", "points"), self.adaptive, strict=False)}
-        self._health.set_losses(self._losses(), {own.topic for own in self.adaptive if own.tells})
-        if parameters["image_is_rectified"] != self._rectified:
-            self._rectified = parameters["image_is_rectified"]
-            if self.camera_info is not None:
-                self._use_camera(self.camera_info)
-
-    def silent(self) -> str:
-        """Which of the sensors, by its name, sends nothing, for a person; "" if both send or have no names."""
-        told = zip(self._names, self.adaptive, strict=False)
-        return ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told if own.silent_s > SILENT_S)
-
-    def _forwarding_to(self, add: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
-        def on_message(stamp: int, message: Any) -> None:
-            try:
-                add(stamp, message)
-            finally:
-                self._on_received(message.header)
-
-        return on_message
-
-    def _losses(self) -> dict[str, str]:
-        """Topic -> how many of its messages get lost, and what to do, for a person; of images and clouds, where many do.
-
-        Seen by the middleware, which knows of messages that did not arrive whole, or by the stamps of a stream that keeps its
-        period.
-        """
-        losses: dict[str, str] = {}
-        for subscription, missing in zip(self.adaptive, self._pipeline.synchronizer.missing_shares(), strict=False):
-            share = max(subscription.lost_share(), missing)
-            if share >= MISSING_SHARE:
-                losses[subscription.topic] = (
-                    f"{share:.0%} of the messages on {subscription.topic} get lost; {loss_advice(subscription)}"
-                )
-        return losses
-
-    def _on_camera_info(self, stamp: int, msg: Serialized) -> None:
-        if self.camera_info is None or msg.data[AFTER_STAMP:] != self.camera_info.data[AFTER_STAMP:]:
-            self._use_camera(msg)
-
-    def _use_camera(self, msg: Serialized) -> None:
-        try:
-            camera = decode_camera_info(msg.message(), self._rectified)
-        except CalibrationError as error:
-            self._health.error(str(error), "CameraInfo")
-            return
-        self.camera_info = msg
-        self._pipeline.set_camera(camera)
 
 
 class AdaptiveSubscription:
@@ -367,30 +231,3 @@ def loss_advice(subscription: AdaptiveSubscription) -> str:
         "let it publish reliably" + (" or compressed (image_transport: compressed)" if subscription.kind is Image else ""),
     ]
     return ", or ".join(cures)
-
-
-def motion_source(name: str) -> MotionSource | None:
-    """What the parameter motion_source names, None for none. MissingDependencyError without nav_msgs where it is needed."""
-    if name == "none":
-        return None
-    if name == "imu":
-        return MotionSource(
-            name, Imu, lambda msg: (None, None if msg.angular_velocity_covariance[0] == -1 else _turn_deg_s(msg.angular_velocity))
-        )
-    if name == "twist":
-        return MotionSource(name, TwistStamped, lambda msg: (_length(msg.twist.linear), _turn_deg_s(msg.twist.angular)))
-    try:
-        from nav_msgs.msg import Odometry
-    except ImportError:
-        raise MissingDependencyError(
-            "motion_source: odom needs nav_msgs; install it (apt: ros-<distro>-nav-msgs) or set motion_source to twist or imu"
-        ) from None
-    return MotionSource(name, Odometry, lambda msg: (_length(msg.twist.twist.linear), _turn_deg_s(msg.twist.twist.angular)))
-
-
-def _length(vector: Any) -> float:
-    return float(np.linalg.norm([vector.x, vector.y, vector.z]))
-
-
-def _turn_deg_s(vector: Any) -> float:
-    return float(np.rad2deg(_length(vector)))

@@ -18,14 +18,17 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.datasets.static_transforms import StaticTransforms
 from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.extensions import NodeService
+from calib_ros.online.events import ExtrinsicUpdated
 from calib_ros.result import Result
 from calib_ros.ros.conversions import transform_message
+from calib_ros.ros.dds import LATCHED
+from calib_ros.ros.parameters import Parameters
 
 CAMERA, LIDAR = "camera", "lidar"  # values of tf_parent
 OWN_TRANSFORMS = 64  # published transforms that are recognised when they are received: one of the newest
 WAIT_S = 2.0  # static transforms are latched: discovery of their publishers takes about a second
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 CURES = (
     "take the other one as tf_parent",
@@ -41,32 +44,33 @@ def _tf_message() -> Any:
     return TFMessage
 
 
-class StaticTf:
-    """Reads the static tree for an initial extrinsic, and publishes the extrinsic to it.
+class StaticTf(NodeService):
+    """Reads the static tree for an initial extrinsic, and publishes the extrinsic to it while publish_tf says so.
 
-    error: takes one line for a person, and its kind for the log. cures: what to do about a loop, and about a second parent.
-    MissingDependencyError if `publish` is asked for without tf2_msgs.
+    parameters: gives the current ones. error: takes one line for a person, and its kind for the log. cures: what to do about a
+    loop, and about a second parent. MissingDependencyError if publish_tf is asked for without tf2_msgs.
     """
 
     def __init__(
-        self, node: Node, listen: bool, publish: bool, error: Callable[[str, str], None], cures: tuple[str, str] = CURES
+        self, node: Node, parameters: Callable[[], Parameters], error: Callable[[str, str], None], cures: tuple[str, str] = CURES
     ) -> None:
-        self._node, self._error, self._cures = node, error, cures
+        self._node, self._parameters, self._error, self._cures = node, parameters, error, cures
         self._tree = StaticTransforms()  # of everybody but this node
         self._since = time.monotonic()
         self._type = _tf_message()
         self._publisher: Any = None
         self._own: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
-        self._wanted: tuple[Result, str, str, int] | None = None  # the newest that was to be published
+        self._wanted: tuple[Result, int] | None = None  # the newest that was to be published, with its stamp
+        self._edge = "", ""  # parent and child by the parameters when it was published last
         self._published: TransformStamped | None = None  # what late joiners get
-        self._correction = False  # of an edge that others publish
+        self._tree_wanted: Sequence[TransformStamped] = ()  # several edges that were not published yet
         self._lock = threading.RLock()  # a worker publishes, the executor switches and receives
-        self._use_tree = listen and self._type is not None
+        self._use_tree = parameters()["initial_from_tf"] and self._type is not None
         self._subscription: Any = None
         if self._use_tree:
             self._listen()
-        if publish:
-            self.switch(True)
+        if parameters()["publish_tf"]:
+            self._switch(True)
 
     @property
     def missing(self) -> str:
@@ -75,7 +79,7 @@ class StaticTf:
             return ""
         return "publish_tf needs tf2_msgs; install it (apt: ros-<distro>-tf2-msgs) or set publish_tf to false"
 
-    def switch(self, on: bool) -> None:
+    def _switch(self, on: bool) -> None:
         """Publish from now on, or take back what was published: who joins later does not get it any more."""
         if on and self.missing:
             raise MissingDependencyError(self.missing)
@@ -90,7 +94,7 @@ class StaticTf:
 
     def destroy(self) -> None:
         """Take back what was published, and receive nothing any more."""
-        self.switch(False)
+        self._switch(False)
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
 
@@ -112,58 +116,64 @@ class StaticTf:
         T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
         return {edge: self._edge_between(T, camera, lidar, *edge) for edge in self._tree.path(camera, lidar)}
 
-    def publish(self, result: Result, parent: str, child: str, stamp: int) -> None:
-        """Publish the extrinsic as an edge of the tree, if switched on; an edge that cannot carry it is reported instead.
+    def add(self, event: Any) -> None:
+        """Publish a new extrinsic as the edge of the tree that the parameters name; what cannot carry it is reported instead."""
+        if isinstance(event, ExtrinsicUpdated):
+            with self._lock:
+                self._wanted = event.extrinsic.result, event.stamp
+                self._publish()
 
-        parent: CAMERA or LIDAR, the other sensor being the child; with a child, the name of its parent.
-        """
-        with self._lock:
-            if self._publisher is None:
-                return
-            self._wanted = (result, parent, child, stamp)
-            if time.monotonic() - self._since < WAIT_S:
-                return  # what others publish is not known yet; see check()
-            try:
-                message = self._message(result, parent, child, stamp)
-            except BadInputError as error:
-                self._withdraw(str(error))
-                return
-            self._correction = bool(child)
-            self._own.append(message)
-            self._published = message
-            self._publisher.publish(self._type(transforms=[message]))
+    def _publish(self) -> None:
+        if self._publisher is None or self._wanted is None or time.monotonic() - self._since < WAIT_S:
+            return  # what others publish is not known yet; see check()
+        self._edge = self._wanted_edge()
+        try:
+            message = self._message(*self._wanted)
+        except BadInputError as error:
+            self._withdraw(str(error))
+            return
+        self._published = message
+        self._send([message])
 
-    def publish_tree(self, messages: Sequence[TransformStamped]) -> bool:
-        """Publish several edges at once, if switched on, in place of those before; those that /tf_static does not allow are
-        reported instead. False if it is too early, or switched off."""
+    def _send(self, messages: list[TransformStamped]) -> None:
+        self._own.extend(messages)
+        self._publisher.publish(self._type(transforms=messages))
+
+    def put_tree(self, messages: Sequence[TransformStamped]) -> None:
+        """Publish several edges at once with the next check, in place of those before; those that /tf_static does not allow are
+        reported instead."""
         with self._lock:
-            if self._publisher is None or time.monotonic() - self._since < WAIT_S:
-                return False
-            allowed = []
-            for message in messages:
-                conflict = self._conflict(message.header.frame_id, message.child_frame_id)
-                if conflict:
-                    self._error(conflict, f"tf {message.child_frame_id}")
-                else:
-                    allowed.append(message)
-            self._own.extend(allowed)
-            self._publisher.publish(self._type(transforms=allowed))
-            return True
+            self._tree_wanted = messages
+
+    def _publish_tree(self) -> None:
+        if self._publisher is None or not self._tree_wanted or time.monotonic() - self._since < WAIT_S:
+            return
+        messages, self._tree_wanted, allowed = self._tree_wanted, (), []
+        for message in messages:
+            conflict = self._conflict(message.header.frame_id, message.child_frame_id)
+            if conflict:
+                self._error(conflict, f"tf {message.child_frame_id}")
+            else:
+                allowed.append(message)
+        self._send(allowed)
+
+    def _wanted_edge(self) -> tuple[str, str]:
+        """Parent and child: CAMERA or LIDAR and "", the other sensor being the child; with a child, the name of its parent."""
+        return self._parameters()["tf_parent"], self._parameters()["tf_child"]
 
     def check(self) -> None:
-        """To be called about once a second: has the tree changed, for the better or the worse?
+        """Follow the parameters and the tree, which may have changed for the better or the worse.
 
         What could not be published is tried again. A corrected edge is published again: who joins late receives it from its
         first publisher too, in any order.
         """
         with self._lock:
-            message = self._published
-            if message is None or self._correction:
-                if self._wanted is not None:
-                    self.publish(*self._wanted)
-                return
-            conflict = self._conflict(message.header.frame_id, message.child_frame_id)
-            if conflict:
+            self._switch(self._parameters()["publish_tf"])
+            self._publish_tree()
+            message, edge = self._published, self._wanted_edge()
+            if message is None or edge[1] or edge != self._edge:
+                self._publish()
+            elif conflict := self._conflict(message.header.frame_id, message.child_frame_id):
                 self._withdraw(conflict)
 
     def _listen(self) -> None:
@@ -180,12 +190,13 @@ class StaticTf:
         """Nothing is published any more: tf2 would take the tree apart, or a wrong edge stay in it."""
         self._error(why, "tf")
         if self._published is not None:
-            self.switch(False)
-            self.switch(True)
+            self._switch(False)
+            self._switch(True)
 
-    def _message(self, result: Result, parent: str, child: str, stamp: int) -> TransformStamped:
+    def _message(self, result: Result, stamp: int) -> TransformStamped:
         """The transform of an edge. BadInputError if the child has another parent, or the edge does not join the sensors."""
         T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
+        parent, child = self._edge
         if not child:
             parent, child, T = (camera, lidar, T) if parent == CAMERA else (lidar, camera, se3.inverse(T))
         else:

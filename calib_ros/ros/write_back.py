@@ -6,48 +6,60 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib_ros.errors import BadInputError
 from calib_ros.export import AUTOWARE, CAMCHAIN, DESCRIPTIONS, Edges, content, has_changed, with_edges, write_back
+from calib_ros.extensions import NodeService
 from calib_ros.io import check_output
-from calib_ros.result import CONVERGED, Extrinsic, Result
+from calib_ros.online.events import ExtrinsicUpdated
+from calib_ros.result import CONVERGED, Result
 from calib_ros.rig.description import RigDescription
-from calib_ros.rig.live import Pair, joined_to
+from calib_ros.rig.graph import joined_to
 from calib_ros.rig.report import RigReport
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.parameters import Parameters
 
 
-class WriteBack:
+class WriteBack(NodeService):
     """Thread-safe; files are written on the executor's only thread. parameters: gives the current ones. edges: of a single pair,
     those of the tree of frames, see `calib_ros.export.write_back`."""
 
     def __init__(
-        self,
-        parameters: Callable[[], Parameters],
-        executor: Executor,
-        health: Health,
-        edges: Callable[[Result], Edges] = lambda _: {},
+        self, parameters: Callable[[], Parameters], executor: Executor, health: Health, edges: Callable[[Result], Edges]
     ) -> None:
         self._parameters, self._executor, self._health, self._edges = parameters, executor, health, edges
+        self._known: Result | RigReport | None = None
+        self._settings = self._wanted()
         self._written: dict[tuple[str, str], Result | RigReport] = {}  # by file and joint
 
-    def add(self, extrinsic: Extrinsic, stamp: int = 0) -> None:
-        """The current extrinsic of a single pair, whatever its status."""
-        if extrinsic.usable and extrinsic.result.status == CONVERGED:
-            self.put(extrinsic.result)
+    def _wanted(self) -> tuple[tuple[str, ...], str]:
+        return self._parameters()["export.on_converged"], self._parameters()["export.joint"]
 
-    def put(self, known: Result | RigReport) -> None:
+    def add(self, event: Any) -> None:
+        """A new extrinsic of a single pair, whatever its status."""
+        if isinstance(event, ExtrinsicUpdated):
+            result = event.extrinsic.result
+            self.put(result if event.extrinsic.usable and result.status == CONVERGED else None)
+
+    def put(self, known: Result | RigReport | None) -> None:
         """What has converged: of a pair, or of a rig a solution of which all sensors are usable."""
-        if self._parameters()["export.on_converged"]:
+        self._known = known
+        if known is not None and self._wanted()[0]:
             self._executor.submit(self._write, known)
 
+    def check(self) -> None:
+        """Other files want what is known."""
+        if (wanted := self._wanted()) != self._settings:
+            self._settings = wanted
+            self.put(self._known)
+
     def _write(self, known: Result | RigReport) -> None:
-        parameters = self._parameters()
-        for path in parameters["export.on_converged"]:
-            told, joint = f"export.on_converged {path}", parameters["export.joint"]
+        files, joint = self._wanted()
+        for path in files:
+            told = f"export.on_converged {path}"
             before = self._written.get((path, joint))
             if isinstance(known, Result):
                 same = isinstance(before, Result) and not has_changed(known, before)
@@ -67,11 +79,11 @@ class WriteBack:
                 self._health.unexpected(error)
 
 
-def check_files(files: Sequence[str], description: RigDescription, pairs: Sequence[Pair]) -> None:
-    """BadInputError for files of export.on_converged that no solution of a rig with these pairs can be written to."""
+def check_files(files: Sequence[str], description: RigDescription) -> None:
+    """BadInputError for files of export.on_converged that no solution of a rig can be written to."""
     if not files:
         return
-    names = [sensor.name for sensor in description.sensors]
+    names, pairs = [sensor.name for sensor in description.sensors], [*description.camera_pairs, *description.lidar_pairs]
     if apart := [name for name in names if name not in joined_to(description.reference, pairs)]:
         raise BadInputError(
             f"export.on_converged waits for all sensors, and no pairs join {', '.join(apart)} to {description.reference}; add "

@@ -58,7 +58,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(vehicle: Vehicle, street: l
     (tmp_path / "file").write_text("")
     peer.change(capture__on=["blinded"], capture_dir=str(tmp_path / "file"), capture_frames=3)
     peer.drive(vehicle.frame() for _ in range(3))
-    peer.calibration.black_box._begun.clear()  # the one of another test
+    peer.calibration.capture.black_box._begun.clear()  # the one of another test
     peer.drive(vehicle.frame(image=np.zeros_like(street[0].image)) for _ in range(3))
     peer.until(lambda: f"{tmp_path / 'file'} cannot be written" in peer.last_error(), "the reason")
     peer.change(capture__on=[], capture_frames=0)
@@ -80,7 +80,7 @@ def test_a_knock_is_recorded_explained_by_the_check_and_written_back_once_found(
         peer.publish(before.frame())
         before.assert_recovers()
         before.assert_recovers()
-        peer.calibration._files.submit(int).result()  # files are written one after the other
+        peer.calibration.files.submit(int).result()  # files are written one after the other
         written, after.stamp = result.read_text(), before.stamp
         statuses = []
         for _ in range(12):

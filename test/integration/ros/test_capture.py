@@ -117,10 +117,10 @@ def test_callbacks_go_on_during_a_capture_and_the_node_finishes_it_before_it_end
         capture, held, threads = peer.calibration.capture, threading.Event(), []
         write = capture.write
 
-        def slowly(pipeline: Any, events: str) -> str:
+        def slowly() -> str:
             threads.append(threading.current_thread().name)
             assert held.wait(LIMIT_S)
-            return write(pipeline, events)
+            return write()
 
         monkeypatch.setattr(capture, "write", slowly)
         answer = peer.call_async(peer._triggers["capture"], Trigger.Request())

@@ -21,12 +21,12 @@ from waiting import until
 from calib_ros.camera import Camera
 from calib_ros.config import Config, OnlineConfig, update
 from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
-from calib_ros.online.events import Inputs
+from calib_ros.online.events import ExtrinsicUpdated, Inputs
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
-from calib_ros.ros import node
+from calib_ros.ros import pair
 from calib_ros.ros.conversions import time_message
 from calib_ros.ros.diagnostics import Diagnostics, Health, refined_values
 
@@ -75,7 +75,7 @@ def test_every_status_has_its_level(watched, status, level, text):
     assert watched.status().message == "collecting keyframes"
     covariance = np.diag([1e-6, 4e-6, 1e-6, 1e-4, 1e-4, 9e-4])
     result = Result(np.eye(4), status, "" if status == CONVERGED else "because", 0.9, covariance)
-    watched.health.add_extrinsic(Extrinsic(result, 1.25, 7, "does not fit", 0.031))
+    watched.health.add(ExtrinsicUpdated(Extrinsic(result, 1.25, 7, "does not fit", 0.031), 0))
     found = watched.status(more="yes")
     assert (found.level, found.message) == (level, text)
     said = {v.key: v.value for v in found.values}
@@ -200,7 +200,7 @@ def test_a_node_at_work(street, drive, monkeypatch):
 
 
 def test_a_change_of_status_is_diagnosed_at_once(street, drive, monkeypatch):
-    monkeypatch.setattr(node, "DIAGNOSED_AGAIN_S", 0.0)
+    monkeypatch.setattr(pair, "DIAGNOSED_AGAIN_S", 0.0)
     with Peer(**start_parameters(drive.reference), **QUICK, initial_from_tf=False) as peer:
         for timer in peer.calibration._timers:  # nothing else diagnoses it
             timer.cancel()

@@ -44,10 +44,10 @@ from calib_ros.registration import features
 from calib_ros.rig.report import load
 from calib_ros.ros import conversions
 from calib_ros.ros.conversions import matrix_from_transform
+from calib_ros.ros.dds import LATCHED
+from calib_ros.ros.inputs import UNSEEN_SCANS, PairInputs
 from calib_ros.ros.node import CalibLifecycleNode, interface
 from calib_ros.ros.rig_lidars import LidarsOfRig
-from calib_ros.ros.rig_pairs import UNSEEN_SCANS, PairOfRig
-from calib_ros.ros.tf import LATCHED
 from calib_ros_synthetic.rig import SyntheticRig
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -181,7 +181,7 @@ def test_files_are_written_once_all_sensors_are_usable_and_a_wrong_one_is_refuse
     peer.until(lambda: peer.rigs[-1].text.startswith("0 of 3"), "the reset")
     later = tmp_path / "later.json"
     peer.change(export__on_converged=[str(later)])
-    peer.calibration._files.submit(int).result()  # files are written one after the other
+    peer.calibration.files.submit(int).result()  # files are written one after the other
     assert not later.exists()
     driven.at += SECONDS + PAUSE_S
     peer.drive(again(driven.items, driven.at))
@@ -299,7 +299,7 @@ def test_a_displaced_lidar_is_named_with_its_size_and_found_again(two) -> None:
 
 def test_without_the_library_lidars_keep_their_priors_and_one_line_says_so(two, monkeypatch) -> None:
     own = two.peer.calibration.lidars[0]
-    alone = LidarsOfRig(own.names, {}, own._decoded, Common(OnlineConfig()), own._parameters, own._health, own._start)
+    alone = LidarsOfRig(own.names, None, {}, own._decoded, Common(OnlineConfig()), own._parameters, own._health, own._start)
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     errors = own._health.errors
     for name in own.names:
@@ -322,7 +322,7 @@ def test_a_pair_that_shares_no_view_by_its_priors_is_left_out_unless_it_is_liste
     cloud, camera, told = rig.scans(TOP)[0][1], rig.camera("front"), []
     behind = replace(cloud, xyz=cloud.xyz * np.float32([-1, -1, 1])).select(cloud.xyz[:, 0] > 0)
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
-    pair = PairOfRig("front", TOP, Common(OnlineConfig()), None, ("",) * 3, lambda _: image, lambda _: behind)
+    pair = PairInputs(None, lambda _: image, lambda _: behind, None, "front", TOP)
     pair.T, pair.unseen = se3.inverse(rig.reference("front")), None if given else told.append
     message = SimpleNamespace(header=Header())
     if given:

@@ -36,7 +36,7 @@ def test_files_are_written_and_again_when_the_extrinsic_has_changed(vehicle: Veh
     assert (Path(f"{urdf}{FORMER}").read_text(), Path(f"{kit}{FORMER}").read_text()) == (URDF, KIT)
 
     vehicle.assert_recovers()  # another estimate
-    peer.calibration._files.submit(int).result()  # files are written one after the other
+    peer.calibration.files.submit(int).result()  # files are written one after the other
     assert not has_changed(peer.recalibrator.current.result, load(result))
 
 

@@ -1,0 +1,324 @@
+"""What pairs receive: image, cloud, CameraInfo, and what measures how fast the vehicle moves.
+
+Each message is received and decoded once for all pairs that look at it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from geometry_msgs.msg import TwistStamped
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
+from std_msgs.msg import Header
+
+from calib_ros.arrays import Transform
+from calib_ros.camera import Camera
+from calib_ros.datasets.recent import Recent
+from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
+from calib_ros.extensions import NodeService
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.messages import decode_camera_info, stamp_ns
+from calib_ros.online.common import Common
+from calib_ros.online.pairing.health import MISSING_SHARE
+from calib_ros.online.pipeline import Pipeline
+from calib_ros.rig.edges import SEEN, seen_share
+from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message
+from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.subscriptions import BEST_EFFORT, AdaptiveSubscription, Form, livox_forms, loss_advice, serialized
+
+Guard = Callable[[], AbstractContextManager[None]]
+CLOUDS_KEPT, IMAGES_KEPT = 6, 2  # decoded messages: of clouds, those before a keyframe's are asked for as well
+UNSEEN_SCANS = 10  # one after the other without a point in view: a second
+SILENT_S = 1.0  # without a message: slower sensors than this are of no use
+AFTER_STAMP = 12  # bytes of a message: what comes behind is the same in nearly every CameraInfo
+MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
+CHECKED_AGAIN_S = 0.5  # everybody who listens checks once a second
+
+
+class SharedTopics:
+    """Subscriptions of one node that several listen to, each with a callback of its own."""
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self._topics: dict[str, _Topic] = {}
+
+    def subscribe(
+        self, forms: Sequence[Form], topic: str, callback: Callable[[int, Any], None], guard: Guard = nullcontext, **options: Any
+    ) -> Listener:
+        """As an `AdaptiveSubscription`, which the first one makes with its options."""
+        if topic not in self._topics:
+            make = partial(AdaptiveSubscription, self.node, forms, topic, guard=guard, **options)
+            self._topics[topic] = _Topic(make)
+        return Listener(self._topics[topic], callback, guard, self._leave)
+
+    def _leave(self, topic: _Topic) -> None:
+        topic.subscription.destroy()
+        self._topics = {name: own for name, own in self._topics.items() if own is not topic}
+
+
+class _Topic:
+    def __init__(self, make: Callable[..., AdaptiveSubscription]) -> None:
+        self.listeners: list[Listener] = []
+        self.checked, self.problem = 0.0, ""
+        self.subscription = make(callback=self._receive)
+
+    def _receive(self, stamp: int, message: Any) -> None:
+        for listener in list(self.listeners):
+            with listener.guard():
+                listener.callback(stamp, message)
+
+
+class Listener:
+    """One of those who share a subscription, with the members of an `AdaptiveSubscription`."""
+
+    def __init__(
+        self,
+        topic: _Topic,
+        callback: Callable[[int, Any], None],
+        guard: Guard,
+        leave: Callable[[_Topic], None],
+    ) -> None:
+        self._topic, self.callback, self.guard, self._leave = topic, callback, guard, leave
+        self.preference = topic.subscription.preference
+        topic.listeners.append(self)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._topic.subscription, name)
+
+    @property
+    def tells(self) -> bool:
+        """See `AdaptiveSubscription`: of those who share it, the first one."""
+        return self._topic.listeners[:1] == [self]
+
+    def check(self) -> str:
+        """See `AdaptiveSubscription`."""
+        own, now = self._topic, time.monotonic()
+        if now - own.checked >= CHECKED_AGAIN_S:
+            own.checked, own.subscription.preference = now, self.preference
+            own.problem = own.subscription.check()
+        return own.problem
+
+    def destroy(self) -> None:
+        """Receive nothing any more; the last one ends the subscription."""
+        if self in self._topic.listeners:
+            self._topic.listeners.remove(self)
+            if not self._topic.listeners:
+                self._leave(self._topic)
+
+
+Decoded = Callable[[Serialized], Any]  # message -> what it holds
+
+
+def decoded_once(decode: Decoded, kept: int) -> Decoded:
+    """The same for several who ask; of so many of the newest messages."""
+    recent = Recent(kept)
+    return lambda message: recent(message, lambda: decode(message))
+
+
+def decoded_clouds() -> Decoded:
+    """Of a LiDAR."""
+    return decoded_once(cloud_from_message, CLOUDS_KEPT)
+
+
+def decoded_images() -> Decoded:
+    """Of a camera."""
+    return decoded_once(pixels_from_message, IMAGES_KEPT)
+
+
+@dataclass(eq=False)
+class PairInputs:
+    """What the interface of a pair receives, alone or as one of several of a rig.
+
+    camera, lidar: names; "" = they have none. topics: of image, points and CameraInfo. T: T_camera_lidar (4, 4) by the priors;
+    None = unknown. unseen: called with a line for people where no point of a scan is in view by it; None: not to be asked, the
+    pair is given. on_reset: called after ~/reset of the pair.
+    """
+
+    shared: SharedTopics
+    image: Decoded
+    cloud: Decoded
+    common: Common | None = None
+    camera: str = ""
+    lidar: str = ""
+    topics: tuple[str, str, str] = ("image", "points", "camera_info")
+    T: Transform | None = None
+    unseen: Callable[[str], None] | None = None
+    on_reset: Callable[[], None] = lambda: None
+    _unseen_scans: int = 0
+
+    def frame(self, image: Serialized, cloud: Serialized, camera: Camera) -> Frame:
+        """Image and cloud -> Frame. BadInputError if one of them cannot be decoded, or shows nothing of the other."""
+        points: PointCloud = self.cloud(cloud)
+        if self.unseen is not None and self.T is not None:
+            if seen_share(camera, self.T, points.finite().xyz.astype(float)) >= SEEN:
+                self.unseen = None
+            else:
+                self._unseen_scans += 1  # a LiDAR that starts may send parts of scans
+                line = f"{self.camera} and {self.lidar} share no view by their priors, and are not estimated"
+                if self._unseen_scans >= UNSEEN_SCANS:
+                    self.unseen(line)
+                raise BadInputError(line)
+        pixels: NDArray[np.uint8] = self.image(image)
+        return Frame(pixels, points, camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
+
+
+def of_one_pair(node: Node) -> PairInputs:
+    """Of a node of its own, that nobody shares anything with."""
+    return PairInputs(SharedTopics(node), pixels_from_message, cloud_from_message)
+
+
+class MotionSource(NamedTuple):
+    """A topic that tells the vehicle's motion. decode: message -> speed, m/s, and turn rate, deg/s; None = unknown."""
+
+    topic: str
+    kind: type[Any]
+    decode: Callable[[Any], tuple[float | None, float | None]]
+
+
+class SensorSubscriptions(NodeService):
+    """Image, cloud, CameraInfo and motion; while the node is active every message goes to the pipeline.
+
+    camera_info: the newest usable CameraInfo. parameters: gives the current ones. motion: what measures the vehicle's motion,
+    from motion_source(). on_received: called with the header of every image and cloud, once the pipeline has been given it.
+    """
+
+    def __init__(
+        self,
+        inputs: PairInputs,
+        parameters: Callable[[], Parameters],
+        motion: MotionSource | None,
+        pipeline: Pipeline,
+        health: Health,
+        on_received: Callable[[Header], None],
+    ) -> None:
+        self.camera_info: Serialized | None = None
+        self.adaptive: tuple[Any, ...] = ()  # of `Listener`
+        self._inputs, self._parameters, self._pipeline, self._health = inputs, parameters, pipeline, health
+        self._on_received = on_received
+        self._rectified = parameters()["image_is_rectified"]
+        self._motion = motion
+        self._motion_subscription: Any = None
+
+    def start(self) -> None:
+        """Subscribe."""
+        pipeline, parameters, shared = self._pipeline, self._parameters(), self._inputs.shared
+        subscribe = partial(shared.subscribe, preference=parameters["reliability"], guard=self._health.guard)
+        image, points, camera_info = self._inputs.topics
+        kind = CompressedImage if parameters["image_transport"] == "compressed" else Image
+        self.adaptive = (
+            subscribe([serialized(kind)], image, self._forwarding_to(pipeline.add_image)),
+            subscribe([serialized(PointCloud2), *livox_forms()], points, self._forwarding_to(pipeline.add_cloud)),
+            # A camera's driver may publish once, latched, what never changes.
+            subscribe([serialized(CameraInfo)], camera_info, self._on_camera_info, latched=True),
+        )
+        if self._motion is not None:
+            motion = self._motion
+
+            def on_motion(msg: Any) -> None:
+                with self._health.guard():
+                    pipeline.speed_gate.add_measurement(stamp_ns(msg.header.stamp), *motion.decode(msg))
+
+            self._motion_subscription = shared.node.create_subscription(motion.kind, motion.topic, on_motion, MOTION_QOS)
+
+    def pause(self) -> None:
+        """Receive nothing any more, until start() is called again."""
+        for subscription in self.adaptive:
+            subscription.destroy()
+        self.adaptive = ()
+        if self._motion_subscription is not None:
+            self._inputs.shared.node.destroy_subscription(self._motion_subscription)
+            self._motion_subscription = None
+
+    def check(self) -> None:
+        """Follow the publishers and the parameters."""
+        parameters = self._parameters()
+        for subscription in self.adaptive:
+            subscription.preference = parameters["reliability"]
+            problem = subscription.check()
+            if problem and subscription.tells:
+                self._health.error(problem, f"publishers of {subscription.topic}")
+        self._health.silence = {name: own.silence for name, own in zip(("image", "points"), self.adaptive, strict=False)}
+        self._health.set_losses(self._losses(), {own.topic for own in self.adaptive if own.tells})
+        if parameters["image_is_rectified"] != self._rectified:
+            self._rectified = parameters["image_is_rectified"]
+            if self.camera_info is not None:
+                self._use_camera(self.camera_info)
+
+    def silent(self) -> str:
+        """Which of the sensors, by its name, sends nothing, for a person; "" if both send or have no names."""
+        told = zip((self._inputs.camera, self._inputs.lidar), self.adaptive, strict=False)
+        return ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told if name and own.silent_s > SILENT_S)
+
+    def _forwarding_to(self, add: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
+        def on_message(stamp: int, message: Any) -> None:
+            try:
+                add(stamp, message)
+            finally:
+                self._on_received(message.header)
+
+        return on_message
+
+    def _losses(self) -> dict[str, str]:
+        """Topic -> how many of its messages get lost, and what to do, for a person; of images and clouds, where many do.
+
+        Seen by the middleware, which knows of messages that did not arrive whole, or by the stamps of a stream that keeps its
+        period.
+        """
+        losses: dict[str, str] = {}
+        for subscription, missing in zip(self.adaptive, self._pipeline.synchronizer.missing_shares(), strict=False):
+            share = max(subscription.lost_share(), missing)
+            if share >= MISSING_SHARE:
+                losses[subscription.topic] = (
+                    f"{share:.0%} of the messages on {subscription.topic} get lost; {loss_advice(subscription)}"
+                )
+        return losses
+
+    def _on_camera_info(self, stamp: int, msg: Serialized) -> None:
+        if self.camera_info is None or msg.data[AFTER_STAMP:] != self.camera_info.data[AFTER_STAMP:]:
+            self._use_camera(msg)
+
+    def _use_camera(self, msg: Serialized) -> None:
+        try:
+            camera = decode_camera_info(msg.message(), self._rectified)
+        except CalibrationError as error:
+            self._health.error(str(error), "CameraInfo")
+            return
+        self.camera_info = msg
+        self._pipeline.set_camera(camera)
+
+
+def motion_source(name: str) -> MotionSource | None:
+    """What the parameter motion_source names, None for none. MissingDependencyError without nav_msgs where it is needed."""
+    if name == "none":
+        return None
+    if name == "imu":
+        return MotionSource(
+            name, Imu, lambda msg: (None, None if msg.angular_velocity_covariance[0] == -1 else _turn_deg_s(msg.angular_velocity))
+        )
+    if name == "twist":
+        return MotionSource(name, TwistStamped, lambda msg: (_length(msg.twist.linear), _turn_deg_s(msg.twist.angular)))
+    try:
+        from nav_msgs.msg import Odometry
+    except ImportError:
+        raise MissingDependencyError(
+            "motion_source: odom needs nav_msgs; install it (apt: ros-<distro>-nav-msgs) or set motion_source to twist or imu"
+        ) from None
+    return MotionSource(name, Odometry, lambda msg: (_length(msg.twist.twist.linear), _turn_deg_s(msg.twist.twist.angular)))
+
+
+def _length(vector: Any) -> float:
+    return float(np.linalg.norm([vector.x, vector.y, vector.z]))
+
+
+def _turn_deg_s(vector: Any) -> float:
+    return float(np.rad2deg(_length(vector)))
