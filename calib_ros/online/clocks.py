@@ -120,13 +120,18 @@ def at_offset(estimate: Result, seconds: float) -> Transform:
 
 
 class SeenMotion:
-    """How the keyframes in the last estimate move: those of another speed or turn tell of the clocks."""
+    """How the keyframes in the last estimate move: those of another speed or turn tell of the clocks.
+
+    newest: stamp of the newest of them, ns, None before the first estimate.
+    """
 
     def __init__(self) -> None:
+        self.newest: int | None = None
         self._lowest = self._highest = np.full(6, np.nan)
 
     def learn(self, keyframes: Sequence[FrameFeatures]) -> None:
-        """Those in an estimate."""
+        """Those in an estimate, oldest first."""
+        self.newest = keyframes[-1].stamp
         if len(twists := _twists(keyframes)):
             self._lowest, self._highest = twists.min(axis=0), twists.max(axis=0)
 

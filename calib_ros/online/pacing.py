@@ -237,24 +237,22 @@ class Schedule:
         """The estimate that began last ended without a result."""
         self._estimated = self._estimated_before
 
-    def due(self, rest_s: float = 0.0, urgent: bool = False) -> bool:
+    def due(self, at_rest: bool = False, waits: bool = False, urgent: bool = False) -> bool:
         """True if new keyframes are to be estimated now; the first ones at once, as after a clock was set back.
 
-        rest_s: between estimates of mode continuous, where the extrinsic is at rest, else 0. urgent: it has moved or
-        is to be confirmed, for which mode periodic does not wait.
+        at_rest: in mode continuous as long after the last estimate as the extrinsic was steady by then. waits: it is as good as
+        at rest. urgent: it has moved or is to be confirmed, for which mode periodic does not wait.
         """
         if self.config.mode == MANUAL:
             return False
         periodic = self.config.mode == PERIODIC
         if self.newest is None or self._estimated is None or (periodic and urgent):
             return True
+        wait_s = self.config.rest_period_s if at_rest or waits else 0.0
+        if at_rest:
+            wait_s = max(wait_s, min(self._steady_by_estimate_s, LONGEST_REST_S))
         elapsed = (self.newest - self._estimated) / NANOSECONDS
-        return elapsed < 0 or elapsed >= (self.config.period_s if periodic else rest_s)
-
-    @property
-    def estimates_at_rest_s(self) -> float:
-        """Time from the last estimate to the next, s: as long as it was steady by then."""
-        return max(self.config.rest_period_s, min(self._steady_by_estimate_s, LONGEST_REST_S))
+        return elapsed < 0 or elapsed >= (self.config.period_s if periodic else wait_s)
 
     @property
     def keyframes_at_rest_s(self) -> float:

@@ -96,7 +96,7 @@ class Recalibrator:
         self.glance, self.selector = Glance(in_step), KeyframeSelector(self.config.online, in_step)
         self.segmentation = models(self.config.semantics)
         self._to_segment: tuple[Frame, FrameFeatures] | None = None  # the newest keyframe: models are slower than a drive
-        self.segmented, self._segmented_s = 0, dict[str, float]()  # keyframes, and what the models took for the last one
+        self.segmented: tuple[int, dict[str, float]] = 0, {}  # keyframes, and s that the models took for the last one
         self.motion = EgoMotion(
             self.config.motion, self.config.lidar.accumulate_s, estimate_motion if scans is None else scans.motion
         )
@@ -105,7 +105,6 @@ class Recalibrator:
         self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
         self._calibrator = self._calibrator_for(self.config)
         self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
-        self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
         self._seen_motion = SeenMotion()
@@ -185,10 +184,8 @@ class Recalibrator:
             # Another estimate tells nothing new while all new keyframes move as those in the last one.
             waits = self.tracker.awaits_motion and self._keyframes_fit
             waits = waits and self._seen_motion.covers(list(self.buffer)[-self.keyframes.new :])
-            rest_s = self.config.online.rest_period_s if waits else 0.0
-            if self.at_rest:
-                rest_s = self.schedule.estimates_at_rest_s
-            return self.schedule.due(rest_s, self.tracker.lost or (self.tracker.tentative and not waits)) and self._has_enough()
+            urgent = self.tracker.lost or (self.tracker.tentative and not waits)
+            return self.schedule.due(self.at_rest, waits, urgent) and self._has_enough()
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
@@ -296,15 +293,15 @@ class Recalibrator:
             # Where searches begin that come by themselves, and those on request: other points need no classes.
             starts = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
             points = reduce(np.union1d, [points_in_reach(frame, calibrator.extract, T, self._search_box()) for T in starts])
-            if not (self._in_doubt and self._estimated_at is not None):
+            if not (self._in_doubt and self._seen_motion.newest is not None):
                 kinds = calibrator.kinds_without_doubt or ALL
         semantics = calibrator.segmentation(frame, cancelled, kinds, points)
-        self._segmented_s = dict(semantics.seconds)
+        self.segmented = self.segmented[0], dict(semantics.seconds)
         if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):
             return semantics.problems
         features = calibrator.extract(frame, semantics, plain)
         with self._lock:
-            self.segmented += 1
+            self.segmented = self.segmented[0] + 1, self.segmented[1]
             self.keyframes.replace(plain, features)
             self.keyframes.new += self.first_guess.needs_classes  # the classes are what the guess waits for
         return semantics.problems
@@ -314,8 +311,9 @@ class Recalibrator:
         models = self.segmentation.describe()
         if not models:
             return "none: no models are configured"
-        took = [f"{kind} {seconds:.1f} s" for kind, seconds in self._segmented_s.items()]
-        return "; ".join([f"{self.segmented} keyframes", *took, *models])
+        count, times = self.segmented
+        took = [f"{kind} {seconds:.1f} s" for kind, seconds in times.items()]
+        return "; ".join([f"{count} keyframes", *took, *models])
 
     def _monitor_extrinsic(self, tested: FrameFeatures | None = None) -> None:
         """Test the current extrinsic with the newest keyframe, or with a frame that becomes one if it speaks against it. Where it
@@ -406,9 +404,8 @@ class Recalibrator:
                 self.first_guess.end()
             seconds, self._in_doubt = 0.0, leaves_doubt(result)
             if batch.features:
-                newest = batch.features[-1].stamp
-                seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
-                self._estimated_at = newest
+                before = self._seen_motion.newest
+                seconds = 0.0 if before is None else (batch.features[-1].stamp - before) / NANOSECONDS
                 self._seen_motion.learn(batch.features)
             accepted = self.tracker.current.accepted
             share_new = min(batch.unfused_features / max(len(batch.features), 1), 1.0)

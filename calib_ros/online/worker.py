@@ -54,7 +54,10 @@ class Worker(Generic[Item]):
                 return replaced
             # One that an idle thread has been woken for is as good as begun: on a busy machine it may take a while to run.
             self.busy, self._busy_since = True, time.monotonic()
-            self._under_way = self._thread.submit(self._work_off, item)
+            try:
+                self._under_way = self._thread.submit(self._work_off, item)
+            except RuntimeError:  # the interpreter ends
+                self.busy = False
             return []
 
     def newer(self, item: Item) -> Item:

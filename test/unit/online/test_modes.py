@@ -20,12 +20,12 @@ def seconds(s: float) -> int:
     return round(s * NANOSECONDS)
 
 
-def moments(schedule: Schedule, *times: float, rest_s: float = 0.0) -> list[bool]:
+def moments(schedule: Schedule, *times: float, waits: bool = False) -> list[bool]:
     """Whether an estimate is due at each of these times, s; where it is, it begins."""
     out = []
     for t in times:
         schedule.add_frame(seconds(t))
-        out.append(schedule.due(rest_s))
+        out.append(schedule.due(waits=waits))
         if out[-1]:
             schedule.start_estimate()
     return out
@@ -37,18 +37,18 @@ def test_continuous_mode_is_always_due_and_manual_never(mode: str, due: bool) ->
 
 
 @pytest.mark.parametrize(
-    ("config", "rest_s"),
-    [(OnlineConfig(mode="periodic", period_s=10.0), 0.0), (OnlineConfig(), 10.0)],
+    ("config", "waits"),
+    [(OnlineConfig(mode="periodic", period_s=10.0), False), (OnlineConfig(rest_period_s=10.0), True)],
     ids=["periodic", "rest"],
 )
-def test_periods_count_the_datas_own_stamps(config: OnlineConfig, rest_s: float) -> None:
+def test_periods_count_the_datas_own_stamps(config: OnlineConfig, waits: bool) -> None:
     schedule = Schedule(config)
-    assert schedule.due(rest_s)
-    assert moments(schedule, 100.0, 109.9, 110.0, 119.9, 500.0, rest_s=rest_s) == [True, False, True, False, True]
-    assert moments(schedule, 20.0, 20.0, rest_s=rest_s) == [True, False]  # a looping bag begins anew
+    assert schedule.due(waits=waits)
+    assert moments(schedule, 100.0, 109.9, 110.0, 119.9, 500.0, waits=waits) == [True, False, True, False, True]
+    assert moments(schedule, 20.0, 20.0, waits=waits) == [True, False]  # a looping bag begins anew
     schedule.add_frame(seconds(28))
     schedule.start_estimate()  # as a request does: it starts the period anew
-    assert moments(schedule, 32.0, 38.0, rest_s=rest_s) == [False, True]
+    assert moments(schedule, 32.0, 38.0, waits=waits) == [False, True]
 
 
 @pytest.mark.parametrize(("mode", "estimates"), [("manual", 0), ("continuous", 7)])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 
@@ -156,3 +158,16 @@ def test_what_waits_can_be_taken_in_place_of_what_is_worked_on(make) -> None:
     recorder.go.set()
     assert recorder.worker.wait_idle(SOON)
     assert recorder.items == ["old"]
+
+
+def test_an_interpreter_that_ends_waits_for_the_item_under_way_and_says_nothing():
+    """Although nobody has stopped the worker, and it hands what it made to another one."""
+    script = """
+import time
+from calib_ros.online.worker import Worker
+other = Worker("other", print, print)
+worker = Worker("worker", lambda item: [time.sleep(0.3), print("done"), other.put(item)], print)
+worker.put("item")
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=SOON)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "done\n", "")

@@ -329,7 +329,7 @@ def test_a_keyframe_is_replaced_by_its_semantic_features(drive, start):
     assert second.view is not None
     assert recalibrator.segment_keyframe() == ()
     assert list(recalibrator.buffer) == [first, second]
-    assert recalibrator.segmented == 1
+    assert recalibrator.segmented[0] == 1
     took = r"1 keyframes; image_classes \d+\.\d s; cloud_classes \d+\.\d s; image_classes source; cloud_classes source"
     assert re.fullmatch(took, recalibrator.describe_semantics())
 
@@ -414,7 +414,7 @@ def test_points_have_classes_for_another_objective_once_an_estimate_has_left_dou
     config = with_models(update(QUICK, {"refine": {"objective": "thesis"}}), **SOURCE)
     recalibrator = recalibrator_of(drive, start, config)
     for frame, in_doubt, estimated_at in zip(drive, (True, False, True), (None, 1, 1), strict=False):
-        recalibrator._in_doubt, recalibrator._estimated_at = in_doubt, estimated_at
+        recalibrator._in_doubt, recalibrator._seen_motion.newest = in_doubt, estimated_at
         assert recalibrator.ingest(frame)
         assert recalibrator.segments_keyframes
         assert recalibrator.segment_keyframe() == ()
