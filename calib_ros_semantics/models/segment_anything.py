@@ -167,8 +167,8 @@ class Decoder:
 
 
 class SegmentAnything(MaskModel):
-    """Encoder, a graph from an image to an embedding, and decoder, prompted on a grid over the image. ModelError if the encoder is
-    none, or the two do not fit each other."""
+    """Encoder, a graph from an image to an embedding, and decoder, prompted on a grid over the image. ModelError if the encoder
+    is none, or the two do not fit each other."""
 
     needed = f"a predicted IoU of {MIN_IOU:g} and a stability of {MIN_STABILITY:g}"
 
