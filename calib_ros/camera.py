@@ -164,23 +164,32 @@ class Camera:
         """The pinhole camera of the rectified image: same size, with K such that the image has no empty border."""
         if self.is_pinhole:
             return self
-        size = (self.width, self.height)
-        if self.model not in PERSPECTIVE:
-            K = self._central_field()
-        else:
+        if self.model in PERSPECTIVE:
+            size = (self.width, self.height)
             K, _ = cv2.getOptimalNewCameraMatrix(self.K, self.D, size, 0.0, size)
-        return Camera(np.asarray(K, float), self.width, self.height)
+            return Camera(np.asarray(K, float), self.width, self.height)
+        # A wide lens's central field, of the shortest focal length, from 0.8 times the lens's, without empty rim. OpenCV tries
+        # the whole field: a tenth of the focal length, and principal points outside the image.
+        edge, focal = self._border(), 0.8 * float(min(self.focal))
+        for _ in range(40):
+            rays = np.c_[(edge - self.K[:2, 2]) / focal, np.ones(len(edge))]
+            pixels, inside = self.project(rays)
+            if inside.all():
+                break
+            focal *= 1.05
+        else:
+            if np.isnan(pixels).any():
+                raise BadInputError("CameraInfo: the lens shows next to nothing of what is ahead; calibrate again")
+        return Camera(np.array([[focal, 0, self.K[0, 2]], [0, focal, self.K[1, 2]], [0, 0, 1]]), self.width, self.height)
 
     @cached_property
     def field_deg(self) -> float:
         """Degrees from the left to the right border of the image, in the row and on either side of the optical axis."""
-        left, right = self._sides()
-        return float(np.rad2deg(right - left))
-
-    def _sides(self) -> tuple[float, float]:
-        """Angles (rad) from the optical axis of the left and the right border, at most WIDEST to either side."""
         angle = np.linspace(-WIDEST, WIDEST, 561)
-        return _range_inside(angle, self._lens_pixels(np.c_[np.sin(angle), 0 * angle, np.cos(angle)])[:, 0], self.width)
+        pixel = self._lens_pixels(np.c_[np.sin(angle), 0 * angle, np.cos(angle)])[:, 0]
+        with np.errstate(invalid="ignore"):
+            seen = angle[(pixel >= 0) & (pixel <= self.width - 1)]
+        return float(np.rad2deg(float(seen.max(initial=0.0)) - float(seen.min(initial=0.0))))
 
     def unrolled(self) -> Camera:
         """The camera of the image on a sphere about the camera, of all that the lens sees, at its own focal length."""
@@ -193,21 +202,6 @@ class Camera:
         first, last, (fx, fy) = seen.min(axis=0, initial=0.0), seen.max(axis=0, initial=0.0), self.focal
         width, height = (max(round(float(size)), 1) for size in (last - first) * [fx, fy])
         return Camera(np.array([[fx, 0, -fx * first[0]], [0, fy, -fy * first[1]], [0, 0, 1]]), width, height, SPHERE)
-
-    def _central_field(self) -> NDArray[np.float64]:
-        """K (3, 3) of a wide lens's central field: of the shortest focal length, from 0.8 times the lens's, without empty rim."""
-        # OpenCV's estimate tries the whole field: a tenth of the focal length, and principal points outside the image.
-        edge, focal = self._border(), 0.8 * float(min(self.focal))
-        for _ in range(40):
-            rays = np.c_[(edge - self.K[:2, 2]) / focal, np.ones(len(edge))]
-            pixels, inside = self.project(rays)
-            if inside.all():
-                break
-            focal *= 1.05
-        else:
-            if np.isnan(pixels).any():
-                raise BadInputError("CameraInfo: the lens shows next to nothing of what is ahead; calibrate again")
-        return np.array([[focal, 0, self.K[0, 2]], [0, focal, self.K[1, 2]], [0, 0, 1]])
 
 
 def across_meridians(sphere: Camera) -> NDArray[np.float64]:
@@ -224,13 +218,6 @@ def across_meridians(sphere: Camera) -> NDArray[np.float64]:
     u = sphere.K[0, 0] * (outward * x - around * y) / radius
     v = sphere.K[1, 1] * (outward * y + around * x) / radius
     return np.asarray(np.stack([v, -u]) / np.maximum(np.hypot(u, v), 1e-12)).reshape(2, sphere.height, sphere.width)
-
-
-def _range_inside(values: NDArray[np.float64], pixel: NDArray[np.float64], size: int) -> tuple[float, float]:
-    """Least and largest of the values (n,) whose pixel (n,) is one of the image's `size`."""
-    with np.errstate(invalid="ignore"):
-        inside = (pixel >= 0) & (pixel <= size - 1)
-    return float(values[inside].min(initial=0.0)), float(values[inside].max(initial=0.0))
 
 
 class Rectifier:

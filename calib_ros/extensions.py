@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -68,15 +69,12 @@ class NodeService:
 
 @cache
 def _entries(group: str) -> Mapping[str, EntryPoint]:
-    return {entry.name: entry for entry in sorted(entry_points(group=group), key=lambda e: e.name) if _is_there(entry)}
-
-
-def _is_there(entry: EntryPoint) -> bool:
-    """Whether its package is installed: a distribution may leave some of ours out."""
-    try:
-        return find_spec(entry.module.partition(".")[0]) is not None
-    except ImportError:
-        return False
+    found = {}
+    for entry in sorted(entry_points(group=group), key=lambda e: e.name):
+        with suppress(ImportError):  # a distribution may leave some of our packages out
+            if find_spec(entry.module.partition(".")[0]) is not None:
+                found[entry.name] = entry
+    return found
 
 
 def names(group: str) -> list[str]:

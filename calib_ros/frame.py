@@ -121,7 +121,17 @@ class Frame:
     classes: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        self._check_twist()
+        if self.twist is not None:
+            try:
+                twist = np.array(self.twist, float)
+            except (TypeError, ValueError):
+                twist = np.zeros(0)
+            if twist.shape != (6,) or not np.isfinite(twist).all():
+                raise BadInputError(
+                    f"frame {self.name or self.stamp}: a twist must be 6 finite numbers (rx, ry, rz in rad/s, tx, ty, tz in "
+                    f"m/s), got {self.twist!r}"
+                )
+            object.__setattr__(self, "twist", twist)
         if self.classes is not None and self.classes.shape != self.image.shape[:2]:
             raise BadInputError(f"the classes of the pixels are {self.classes.shape}, the image is {self.image.shape[:2]}")
         shape_fits = self.image.ndim == 2 or (self.image.ndim == 3 and self.image.shape[2] == 3)
@@ -135,20 +145,6 @@ class Frame:
                 f"the image is {width}x{height}, but its CameraInfo says {self.camera.width}x{self.camera.height}; "
                 "use the CameraInfo that belongs to this image topic"
             )
-
-    def _check_twist(self) -> None:
-        if self.twist is None:
-            return
-        try:
-            twist = np.array(self.twist, float)
-        except (TypeError, ValueError):
-            twist = np.zeros(0)
-        if twist.shape != (6,) or not np.isfinite(twist).all():
-            raise BadInputError(
-                f"frame {self.name or self.stamp}: a twist must be 6 finite numbers (rx, ry, rz in rad/s, tx, ty, tz in m/s), "
-                f"got {self.twist!r}"
-            )
-        object.__setattr__(self, "twist", twist)
 
     @property
     def moment_of_cloud(self) -> int:

@@ -44,15 +44,10 @@ NO_POINTS = "no LiDAR point falls into the image"
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-def _palette() -> Image:
-    """Colour table BGR (256, 3): turbo without its dark ends, warm = near = high level; the last level is that of edges."""
-    ramp = np.linspace(24, 236, 256).astype(np.uint8)
-    colors = np.array(cv2.applyColorMap(ramp[:, None], cv2.COLORMAP_TURBO), np.uint8)[:, 0]
-    colors[EDGE_LEVEL] = EDGE
-    return colors
-
-
-PALETTE = _palette()
+# Colour table BGR (256, 3): turbo without its dark ends, warm = near = high level; the last level is that of edges.
+_RAMP = np.linspace(24, 236, 256).astype(np.uint8)
+PALETTE: Image = np.array(cv2.applyColorMap(_RAMP[:, None], cv2.COLORMAP_TURBO), np.uint8)[:, 0]
+PALETTE[EDGE_LEVEL] = EDGE
 
 
 def depth_levels(depth: ArrayLike, max_range: float) -> Image:
@@ -182,7 +177,9 @@ def render(
     height, width = frame.image.shape[:2]
     plan = layout(width, height, len(views))
     canvas = np.full((plan.size[1], plan.size[0], 3), BAR, np.uint8)
-    backdrop = _backdrop(frame.image)
+    # The image nearly grey and dimmed, so that bright colours are the LiDAR's; equalised, so that edges in the shade show.
+    gray = cv2.cvtColor(equalize(to_gray(frame.image)), cv2.COLOR_GRAY2BGR)
+    backdrop = cv2.addWeighted(frame.image if frame.image.ndim == 3 else gray, 0.2, gray, 0.45, 0)
     for name, T_view, (x, y) in zip(views, transforms, plan.panels, strict=True):
         panel = canvas[y : y + height, x : x + width]
         panel[:] = backdrop
@@ -194,12 +191,6 @@ def render(
     draw_header(canvas, plan, status, lines)
     draw_legend(canvas, plan, max_range, edges is not None)
     return canvas
-
-
-def _backdrop(image: Image) -> Image:
-    """The image nearly grey and dimmed, so that bright colours are the LiDAR's; equalised, so that edges in the shade show."""
-    gray = cv2.cvtColor(equalize(to_gray(image)), cv2.COLOR_GRAY2BGR)
-    return np.asarray(cv2.addWeighted(image if image.ndim == 3 else gray, 0.2, gray, 0.45, 0), np.uint8)
 
 
 def _draw_points(panel: Image, camera: Camera, T: Transform, xyz: Points, edges: EdgePoints | None, max_range: float) -> bool:

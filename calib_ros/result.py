@@ -241,7 +241,11 @@ def parse(text: str, what: str) -> Result:
     try:
         covariance = None if data.get("covariance") is None else np.array(data["covariance"], float)
         score = math.nan if data.get("score") is None else float(data["score"])
-        offset, offset_sigma = (_number_or_none(data, name) for name in ("time_offset_s", "time_offset_sigma_s"))
+        offset, offset_sigma = (
+            None if data.get(name) is None else float(data[name]) for name in ("time_offset_s", "time_offset_sigma_s")
+        )
+        if not math.isfinite((offset or 0.0) + (offset_sigma or 0.0)):
+            raise ValueError("time_offset_s")
         frames, elapsed = int(data.get("frames_used") or 0), float(data.get("elapsed_s") or 0)
     except (TypeError, ValueError, OverflowError):
         raise BadInputError(f"{what}: covariance, score, frames_used, elapsed_s and time_offset_s must be numbers") from None
@@ -276,16 +280,6 @@ def _stamping(data: dict[str, Any], what: str) -> Stamping | None:
         if stamping.spin in ("clockwise", "counterclockwise", "none") and abs(stamping.azimuth_deg) <= 180:
             return stamping
     raise BadInputError(f"{what}: stamping must have a spin (clockwise, counterclockwise or none) and an azimuth_deg, or be null")
-
-
-def _number_or_none(data: dict[str, Any], name: str) -> float | None:
-    """ValueError for a number that is not finite."""
-    if data.get(name) is None:
-        return None
-    value = float(data[name])
-    if not math.isfinite(value):
-        raise ValueError(name)
-    return value
 
 
 def _text(data: dict[str, Any], name: str, what: str) -> str:

@@ -19,12 +19,8 @@ LONGEST_GAP = 20  # periods; what lasts longer is an interruption, and no loss o
 # Before the periods are known, and their limit: half a revolution of the slowest scanners, 5 Hz, with their jitter.
 FIRST_TOLERANCE, WIDEST_TOLERANCE = 50_000_000, 120_000_000
 JITTER = 0.1  # of a period, by which stamps may lie beside their time; cameras and scanners have up to 5 ms
-
-
 TIME_SCALES = {37: "TAI and UTC", 18: "GPS time and UTC", 19: "TAI and GPS time"}  # s, since 2017
 SAME_DIFFERENCE = 0.3  # s, by which latencies may blur one of these
-
-
 LONGEST_QUEUE_S = 60.0  # that messages wait in; stamps of the same moment that differ by more are of other clocks
 LONG_AGO_S = 1e7
 

@@ -73,7 +73,9 @@ def oriented_edges(gray: NDArray[np.uint8], used: Mask | None = None, across: Ma
     square += gx * gx
     magnitude = np.sqrt(square)
     magnitude[magnitude <= smallest_magnitude(magnitude, used)] = 0
-    full = _percentile(magnitude if used is None else magnitude[used], GRADIENT_PERCENTILE)
+    sample = (magnitude if used is None else magnitude[used]).ravel()[::4]  # a full sort would cost more than all the rest
+    k = _rank(len(sample), GRADIENT_PERCENTILE)
+    full = float(np.partition(sample, k)[k]) if len(sample) else 0.0
     ridge = np.where(np.abs(gx) >= np.abs(gy), _is_ridge(magnitude, 1), _is_ridge(magnitude, 0))
     edge = magnitude * np.float32(1 / (full + 1e-6))
     np.minimum(edge, np.float32(1), out=edge)
@@ -114,17 +116,6 @@ def _parts(size: int, count: int) -> list[tuple[int, int, int]]:
 
 def _rank(count: int, percentile: float) -> int:
     return min(int(count * percentile / 100), count - 1)
-
-
-def _partitioned(values: Map, percentile: float) -> float:
-    k = _rank(len(values), percentile)
-    return float(np.partition(values, k)[k])
-
-
-def _percentile(values: Map, percentile: float) -> float:
-    """Percentile of every fourth value: a full sort would cost more than the rest of the edge map."""
-    sample = values.ravel()[::4]
-    return _partitioned(sample, percentile) if len(sample) else 0.0
 
 
 def _is_ridge(magnitude: Map, axis: int) -> NDArray[np.bool_]:

@@ -24,7 +24,18 @@ FAR_WEIGHT = 1e-3  # of the mean of the whole image, beside used pixels nearby; 
 def used_pixels(config: ImageConfig, width: int, height: int) -> Mask | None:
     """Pixels (height, width) of the recorded image that ``image.mask`` and ``image.ignored_boxes`` leave; None = all. Raises
     BadInputError if the mask cannot be read, has another size than the image, or hardly leaves a pixel."""
-    used = _read(Path(config.mask), width, height) if config.mask else np.ones((height, width), bool)
+    used = np.ones((height, width), bool)
+    if config.mask:
+        path = Path(config.mask)
+        picture = _picture(path)
+        if picture.shape[:2] != (height, width):
+            raise BadInputError(
+                f"image.mask {path} is {picture.shape[1]}x{picture.shape[0]}, the camera's image is {width}x{height}; "
+                "draw it on an image as recorded"
+            )
+        # An opacity says nothing, and JPEG has no pure black.
+        values = picture if picture.ndim == 2 else picture[:, :, :3].max(axis=2)
+        used = np.asarray(values > (0 if path.suffix.lower() in (".png", ".bmp") else 127))
     for left, top, right, bottom in np.reshape(config.ignored_boxes, (-1, 4)):
         x, y = np.rint(np.array([left, right]) * width).astype(int), np.rint(np.array([top, bottom]) * height).astype(int)
         used[y[0] : y[1], x[0] : x[1]] = False
@@ -54,18 +65,6 @@ def _picture(path: Path) -> NDArray[Any]:
     if picture is None:
         raise BadInputError(f"image.mask {path} is no complete PNG, JPEG or BMP picture")
     return picture
-
-
-def _read(path: Path, width: int, height: int) -> Mask:
-    picture = _picture(path)
-    if picture.shape[:2] != (height, width):
-        raise BadInputError(
-            f"image.mask {path} is {picture.shape[1]}x{picture.shape[0]}, the camera's image is {width}x{height}; "
-            "draw it on an image as recorded"
-        )
-    # An opacity says nothing, and JPEG has no pure black.
-    values = picture if picture.ndim == 2 else picture[:, :, :3].max(axis=2)
-    return np.asarray(values > (0 if path.suffix.lower() in (".png", ".bmp") else 127))
 
 
 def without_border(used: Mask, reach: int) -> Mask:

@@ -38,7 +38,10 @@ class Accumulator:
             return frame
         if frame.compensated:
             config = replace(config, spin="none")
-        parts, T, after = [replace(cloud, ring=None, time=_times(frame, config))], np.eye(4), (stamp, _bare(cloud, frame))
+        time = cloud.time  # None where nothing will be moved by them
+        if not (has_times(cloud) or frame.twist is None or frame.compensated):
+            time = scan_times(cloud.xyz, config).astype(np.float32)
+        parts, T, after = [replace(cloud, ring=None, time=time)], np.eye(4), (stamp, _bare(cloud, frame))
         for at, before in earlier:
             gap_s = (after[0] - at) / NANOSECONDS
             if stamp - at >= round(seconds * NANOSECONDS):
@@ -52,7 +55,11 @@ class Accumulator:
             xyz = se3.transform(T, moved(before.xyz, twist, tau)).astype(np.float32)
             parts.append(replace(before, xyz=xyz, ring=None, time=np.zeros(len(xyz), np.float32)))
             after = own
-        return frame if len(parts) == 1 else replace(frame, cloud=_joined(parts))
+        if len(parts) == 1:
+            return frame
+        fields = {name: [getattr(part, name) for part in parts] for name in ("intensity", "time", "label")}
+        joined: dict[str, Any] = {name: None if any(v is None for v in vs) else np.concatenate(vs) for name, vs in fields.items()}
+        return replace(frame, cloud=replace(parts[0], xyz=np.concatenate([part.xyz for part in parts]), **joined))
 
     def _twist(self, before: Stamped, after: Stamped, gap_s: float, config: MotionConfig) -> NDArray[np.float64] | None:
         key = before[0], after[0]
@@ -67,17 +74,3 @@ class Accumulator:
 def _bare(cloud: PointCloud, frame: Frame) -> PointCloud:
     """A cloud as its motion is estimated: of a compensated frame all points are of one moment."""
     return replace(cloud, time=None) if frame.compensated else cloud
-
-
-def _times(frame: Frame, config: MotionConfig) -> NDArray[np.float32] | None:
-    """Times (n,) of a frame's own points; None where nothing will be moved by them."""
-    if has_times(frame.cloud) or frame.twist is None or frame.compensated:
-        return frame.cloud.time
-    return scan_times(frame.cloud.xyz, config).astype(np.float32)
-
-
-def _joined(parts: list[PointCloud]) -> PointCloud:
-    """All points, with the fields that all parts have."""
-    fields = {name: [getattr(part, name) for part in parts] for name in ("intensity", "time", "label")}
-    own: dict[str, Any] = {name: None if any(v is None for v in vs) else np.concatenate(vs) for name, vs in fields.items()}
-    return replace(parts[0], xyz=np.concatenate([part.xyz for part in parts]), **own)

@@ -106,26 +106,19 @@ def moved(xyz: NDArray[np.floating], twist: ArrayLike, tau: NDArray[np.floating]
     """exp(twist tau_i) applied to each point: xyz (n, 3) m, twist (6,) rad/s and m/s, tau (n,) s -> (n, 3). With u = w x p + v, a
     = |w| tau a point moves by tau u + (1 - cos a) / w^2 w x u + (a - sin a) / w^3 w x (w x u)."""
     twist, time = np.asarray(twist, float), np.asarray(tau, float)
-    out = np.empty((len(xyz), 3))
+    out, W, rate = np.empty((len(xyz), 3)), se3.skew(twist[:3]), float(np.linalg.norm(twist[:3]))
     for k in range(0, len(xyz), BLOCK):
-        part = slice(k, k + BLOCK)
-        out[part] = _moved(np.asarray(xyz[part], float), twist, time[part])
+        p, t, own = np.asarray(xyz[k : k + BLOCK], float), time[k : k + BLOCK], out[k : k + BLOCK]
+        u, angle = p @ W.T + twist[3:], rate * t
+        square = angle * angle
+        small = square < SMALL_ANGLE**2
+        second, third = 1 / 2 - square / 24 + square**2 / 720, 1 / 6 - square / 120 + square**2 / 5040
+        if not small.all():
+            with np.errstate(divide="ignore", invalid="ignore"):
+                second = np.where(small, second, (1 - np.cos(angle)) / square)
+                third = np.where(small, third, (angle - np.sin(angle)) / (square * angle))
+        own[:] = t[:, None] * u
+        own += (t * t * second)[:, None] * (u @ W.T)
+        own += (t * t * t * third)[:, None] * (u @ (W @ W).T)
+        own += p
     return out
-
-
-def _moved(p: Floats, twist: Floats, t: Floats) -> Floats:
-    W = se3.skew(twist[:3])
-    u = p @ W.T + twist[3:]
-    angle = float(np.linalg.norm(twist[:3])) * t
-    square = angle * angle
-    small = square < SMALL_ANGLE**2
-    second, third = 1 / 2 - square / 24 + square**2 / 720, 1 / 6 - square / 120 + square**2 / 5040
-    if not small.all():
-        with np.errstate(divide="ignore", invalid="ignore"):
-            second = np.where(small, second, (1 - np.cos(angle)) / square)
-            third = np.where(small, third, (angle - np.sin(angle)) / (square * angle))
-    out = t[:, None] * u
-    out += (t * t * second)[:, None] * (u @ W.T)
-    out += (t * t * t * third)[:, None] * (u @ (W @ W).T)
-    out += p
-    return np.asarray(out)

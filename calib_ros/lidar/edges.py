@@ -1,8 +1,8 @@
 """Edge points of a scan. They do not depend on the extrinsic: found once per scan, projected for every candidate.
 
 Depth discontinuities along the rings (thesis 3.4.3, eq. 3.10), extended by upward jumps, reflectivity steps and edges against
-the sky. `edge_cells` finds the cells of the range image on the near side of an edge; `between_rays` and `between_points` place
-each edge point between the last ray on the near surface and the first ray past it.
+the sky. Of each, the cells of the range image on its near side are found; `between_rays` and `between_points` place each edge
+point between the last ray on the near surface and the first ray past it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from calib_ros.config import LidarConfig
 from calib_ros.lidar.range_image import JUMP_MIN, RangeImage
-from calib_ros.lidar.reflectivity_noise import reflectivity_noise
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose
 
 Mask = NDArray[np.bool_]
@@ -33,6 +32,7 @@ MAX_PARTS = 8
 MAX_CELL_POINTS = 12  # points of a cell that are examined, without rings
 # How many times the noise a reflectivity edge exceeds, share of unusually large steps, noise below which intensities are rounded.
 ABOVE_NOISE, UNUSUAL_SHARE, LEAST_NOISE = 6.4, 0.05, 6e-5
+NOISE_STEPS, NOISE_PARTS = 20_000, 16  # steps of a scan that tell its noise, and parts into which their levels are divided
 MAX_RANGE = 60.0  # m; the points of a thing farther away are too few and too coarse for an edge
 REFLECTIVITY_STEP = 0.12  # share of full scale that makes an edge wherever it exceeds the noise: lane markings of usual paint
 REFLECTIVITY_MAX_RANGE = 40.0  # m; farther, the beam is wider than a lane marking
@@ -90,7 +90,12 @@ class EdgePoints:
 
 def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
     """Edge points of a range image, of every kind that the scan allows."""
-    cells = edge_cells(scan, config)
+    cells = [*_side_edges(scan, config), _top_edges(scan, config)]
+    if scan.layout == "rings":  # a cell of a scanner without rings may be empty by chance, which is no edge against the sky
+        fading = _grazed(scan)
+        cells += [*_sky_side_edges(scan, config, fading), _sky_top_edges(scan, config, fading)]
+    if scan.reflectivity is not None:
+        cells.append(_reflectivity_edges(scan, config))
     locate = between_points if scan.layout == "projection" else between_rays
     samples = [locate(scan, found) for found in cells]
     xyz, index, strength = (np.concatenate(parts) for parts in zip(*samples, strict=True))
@@ -119,18 +124,6 @@ class EdgeCells:
     strength: NDArray[np.float32]
 
 
-def edge_cells(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
-    """Cells on edges, of every kind that the scan allows. Edges against the sky need rings: a cell of a scanner without rings may
-    be empty by chance."""
-    found = [*_side_edges(scan, config), _top_edges(scan, config)]
-    if scan.layout == "rings":
-        fading = _grazed(scan)
-        found += [*_sky_side_edges(scan, config, fading), _sky_top_edges(scan, config, fading)]
-    if scan.reflectivity is not None:
-        found.append(_reflectivity_edges(scan, config))
-    return found
-
-
 def _side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
     """The near side of each left/right range jump from the continued surface; without rings also across one empty cell."""
     R = scan.range
@@ -157,48 +150,40 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     height = np.tan(scan.elevation)[:, None]
     steps = np.ones_like(height)  # ring spacing above over ring spacing below
     steps[1:-1] = (height[:-2] - height[1:-1]) / np.maximum(height[1:-1] - height[2:], 1e-6)
-    above = _above(R, 1)
+    above, far = _above(R, 1), _above(R, 2)
+    # A cell on the surface through the two cells above it does not occlude it: pavement behind a kerb would become edges a whole
+    # ring above the kerb.
+    down = np.ones_like(height)  # ring spacing below over ring spacing above
+    down[2:] = (height[1:-1] - height[2:]) / np.maximum(height[:-2] - height[1:-1], 1e-6)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        continued = 1 / (1 / above + np.maximum(1 / above - 1 / far, 0) * down)
     if scan.layout == "projection":
         lost = np.isnan(above)
-        above[lost] = _above(R, 2)[lost]
+        above[lost] = far[lost]
         steps = steps + lost
     expected = _extrapolated(R, _below(R), steps)
     jump = above - expected
     with np.errstate(invalid="ignore"):
         mask = _measured(scan, config) & (jump > np.maximum(JUMP_MIN, TOP_JUMP_RATIO * expected))
-        mask &= ~(_continued_down(R, height) - R < np.maximum(JUMP_MIN, TOP_JUMP_RATIO * R))
+        mask &= ~(continued - R < np.maximum(JUMP_MIN, TOP_JUMP_RATIO * R))
     return _cells(mask & ~np.isnan(_below(R)), EdgeKind.TOP, 0, _jump_strength(jump))
-
-
-def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Horizontal range at which the surface through the two cells above meets each cell's ring; NaN where one is empty."""
-    # A cell on that surface does not occlude it: pavement behind a kerb would become edges a whole ring above the kerb.
-    above, far = _above(R, 1), _above(R, 2)
-    steps = np.ones_like(height)  # ring spacing below over ring spacing above
-    steps[2:] = (height[1:-1] - height[2:]) / np.maximum(height[:-2] - height[1:-1], 1e-6)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(1 / (1 / above + np.maximum(1 / above - 1 / far, 0) * steps))
 
 
 def _sky_side_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> list[EdgeCells]:
     """Cells, but for fading ones (see _grazed), beside a gap of GAP_STEPS cells that is not the border of the field of view."""
     empty = np.isnan(scan.range)
-    usable = _measured(scan, config) & _inside_field(scan) & ~fading
+    # Columns next to a sector without any return: the end of the field of view, or lost packets.
+    covered = (scan.index >= 0).any(axis=0)
+    near_gap = np.zeros_like(covered)
+    for k in range(1, GAP_STEPS + 1):
+        near_gap |= ~np.roll(covered, k) | ~np.roll(covered, -k)
+    usable = _measured(scan, config) & ~near_gap[None, :] & ~fading
     found = []
     for side in (1, -1):
         gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, GAP_STEPS + 1)])
         solid = ~np.roll(empty, side, 1) & ~np.roll(empty, 2 * side, 1)
         found.append(_cells(usable & gap & solid, EdgeKind.SKY_SIDE, side))
     return found
-
-
-def _inside_field(scan: RangeImage) -> Mask:
-    """False for columns next to a sector without any return: the end of the field of view, or lost packets."""
-    covered = (scan.index >= 0).any(axis=0)
-    near_gap = np.zeros_like(covered)
-    for k in range(1, GAP_STEPS + 1):
-        near_gap |= ~np.roll(covered, k) | ~np.roll(covered, -k)
-    return ~near_gap[None, :]
 
 
 def _sky_top_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> EdgeCells:
@@ -235,30 +220,48 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     value = np.where(scan.index >= 0, scan.reflectivity[np.maximum(scan.index, 0)], np.nan)
     ahead, behind = 0.5 * (value + np.roll(value, -1, 1)), 0.5 * (np.roll(value, 1, 1) + np.roll(value, 2, 1))
     step, level = np.abs(ahead - behind), np.asarray(0.5 * (ahead + behind), np.float32)
+    before = np.roll(R, 1, 1)
     with np.errstate(invalid="ignore"):
-        flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < REFLECTIVITY_MAX_JUMP
+        border = np.abs(R - before) > np.maximum(JUMP_MIN, SIDE_JUMP_RATIO * np.minimum(R, before))
+        border |= np.isnan(R) & np.isnan(before)
+        near = border.copy()
+        for k in range(1, SURFACE_COLUMNS + 1):
+            near |= np.roll(border, k, 1) | np.roll(border, -k, 1)
+        flat = np.maximum(np.abs(before - R), np.abs(np.roll(R, -1, 1) - R)) < REFLECTIVITY_MAX_JUMP
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
         usable = _measured(scan, config, REFLECTIVITY_MAX_RANGE) & flat
-        at_zero, slope = reflectivity_noise(step[usable], level[usable])
+        at_zero, slope = _reflectivity_noise(step[usable], level[usable])
         ratio = step / np.maximum(at_zero + slope * level, np.float32(LEAST_NOISE))
         counted = ratio[usable & ~np.isnan(ratio)]
         unusual = max(ABOVE_NOISE, float(np.quantile(counted, 1 - UNUSUAL_SHARE))) if len(counted) else np.inf
         large = (ratio > unusual) | ((ratio > ABOVE_NOISE) & (step > REFLECTIVITY_STEP))
-        mask = usable & large & peak & ~_near_border(R)
+        mask = usable & large & peak & ~near
         strength = np.maximum(ratio * np.float32(USUAL_STRENGTH / unusual), step)
     return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(strength, np.float32(MAX_STRENGTH)))
 
 
-def _near_border(R: NDArray[np.float32]) -> Mask:
-    """Cells of ranges R (rows, columns) within SURFACE_COLUMNS of a range jump, or of two empty cells, along the ring."""
-    before = np.roll(R, 1, 1)
-    with np.errstate(invalid="ignore"):
-        border = np.abs(R - before) > np.maximum(JUMP_MIN, SIDE_JUMP_RATIO * np.minimum(R, before))
-    border |= np.isnan(R) & np.isnan(before)
-    near = border.copy()
-    for k in range(1, SURFACE_COLUMNS + 1):
-        near |= np.roll(border, k, 1) | np.roll(border, -k, 1)
-    return np.asarray(near)
+def _reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
+    """Noise of a scan's reflectivity, by its steps (n,) and the mean reflectivities (n,) around them: at level 0, and its slope.
+    The highest rising line below the median steps of parts of the levels: edges raise the medians, and nothing lowers them."""
+    every = max(len(steps) // NOISE_STEPS, 1)
+    known = np.flatnonzero(~np.isnan(steps[::every]) & ~np.isnan(levels[::every])) * every
+    parts = np.array_split(known[np.argsort(levels[known], kind="stable")], NOISE_PARTS)
+    medians = np.array([(np.median(levels[part]), np.median(steps[part])) for part in parts if len(part)]).reshape(-1, 2)
+    x, y = medians[medians[:, 1] > 0].T  # where whole numbers hide the noise, they do not tell it
+    if not len(x):
+        return np.float32(0), np.float32(0)
+    # The line a + b x with the least total distance from them solves a linear program, at a corner: a line through two points,
+    # through one and the origin, or level at the lowest.
+    x, y = x.astype(np.float64), y.astype(np.float64)
+    i, j = np.triu_indices(len(x), 1)
+    apart = x[j] != x[i]
+    i, j = i[apart], j[apart]
+    b = np.concatenate([(y[j] - y[i]) / (x[j] - x[i]), y[x > 0] / x[x > 0], [0.0]])
+    b = b[b >= 0]
+    a = (y - b[:, None] * x).min(axis=1)
+    total = np.where(a >= -1e-9 * y.max(), len(x) * a + x.sum() * b, -np.inf)
+    best = int(np.argmax(total))
+    return np.float32(max(a[best], 0.0)), np.float32(b[best])
 
 
 def _cells(mask: Mask, kind: EdgeKind, side: int, strength: NDArray[np.float32] | None = None) -> EdgeCells:
@@ -326,7 +329,9 @@ def between_rays(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
     P = _in_scanner(scan, index)
     even = (part + (row * R2_STEPS[0] + column * R2_STEPS[1]) % 1) / parts
     share = OUTWARD_SHIFT + TOP_SPREAD * (even - 0.5)
-    P[:, 2] += share * _ring_step(scan, row, np.hypot(P[:, 0], P[:, 1]))
+    cones = np.vstack([2 * scan.cones[:1] - scan.cones[1:2], scan.cones])
+    gap = cones[row] - cones[row + 1]  # to the next ring above
+    P[:, 2] += share * (gap[:, 0] + gap[:, 1] * np.hypot(P[:, 0], P[:, 1]))
     return _samples(scan, P, index, strength)
 
 
@@ -343,13 +348,6 @@ def _samples(scan: RangeImage, P: NDArray[np.float64], index: NDArray[np.integer
 def upward_parts(spacing: float) -> int:
     """Number of points that share the strength of an upward edge, of rings so far apart (rad): fewer where they are close."""
     return int(np.clip(round(spacing / PART_HEIGHT), 1, MAX_PARTS))
-
-
-def _ring_step(scan: RangeImage, row: NDArray[np.intp], distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height (m,) in m of the next ring above ring `row`, at distances (m,) from the axis."""
-    cones = np.vstack([2 * scan.cones[:1] - scan.cones[1:2], scan.cones])
-    gap = cones[row] - cones[row + 1]
-    return np.asarray(gap[:, 0] + gap[:, 1] * distance)
 
 
 def between_points(scan: RangeImage, found: EdgeCells) -> EdgeSamples:

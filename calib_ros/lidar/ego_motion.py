@@ -35,12 +35,10 @@ MIN_CURVATURE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason. matched: share
-    of the points with a match in the other scan."""
+    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason."""
 
     twist: Floats | None
     reason: str = ""
-    matched: float = 0.0
 
 
 def needs_ego_motion(frame: Frame, config: MotionConfig) -> bool:
@@ -117,26 +115,7 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats) -> Motion:
             return Motion(None, "the alignment of the scans diverged")
         # T_before_now of a LiDAR with a constant twist is exp(twist gap).
         twist = se3.log(T) / gap_s
-    return _validated(twist, found, len(scan[0]))
-
-
-def align(target: Floats, source: Floats, T: Floats, reach_m: float) -> Any:
-    """small_gicp's result of GICP from T_target_source (4, 4): points (n, 3) m, matched up to reach_m apart. Its H is of a right
-    twist. Raises MissingDependencyError without the library."""
-    gicp = _library()
-    clouds = [gicp.PointCloud(points) for points in (target, source)]
-    trees = [gicp.KdTree(cloud, 1) for cloud in clouds]
-    for cloud, tree in zip(clouds, trees, strict=True):
-        gicp.estimate_covariances(cloud, tree, NEIGHBOURS, 1)
-    # One thread: sums in another order would make results differ from run to run.
-    return gicp.align(
-        *clouds, trees[0], init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach_m,
-        num_threads=1, max_iterations=30, rotation_epsilon=MIN_STEP, translation_epsilon=MIN_STEP,
-    )  # fmt: skip
-
-
-def _validated(twist: Floats, found: Any, n: int) -> Motion:
-    matched = found.num_inliers / n
+    matched = found.num_inliers / len(scan[0])
     speed, rate = float(np.linalg.norm(twist[3:])), float(np.linalg.norm(twist[:3]))
     curvature = float(np.linalg.eigvalsh(found.H[3:, 3:])[0]) / max(found.num_inliers, 1)
     problem = ""
@@ -148,12 +127,22 @@ def _validated(twist: Floats, found: Any, n: int) -> Motion:
         problem = "nothing in sight stands upright: the scans slide along each other"
     elif speed > MAX_SPEED or rate > MAX_TURN_RATE:
         problem = f"{speed:.1f} m/s and {rate:.2f} rad/s are beyond {MAX_SPEED:g} and {MAX_TURN_RATE:g}"
-    return Motion(None if problem else twist, problem, matched)
+    return Motion(None if problem else twist, problem)
 
 
-def _library() -> Any:
+def align(target: Floats, source: Floats, T: Floats, reach_m: float) -> Any:
+    """small_gicp's result of GICP from T_target_source (4, 4): points (n, 3) m, matched up to reach_m apart. Its H is of a right
+    twist. Raises MissingDependencyError without the library."""
     try:
-        import small_gicp
+        import small_gicp as gicp
     except ImportError:
         raise MissingDependencyError(MISSING) from None
-    return small_gicp
+    clouds = [gicp.PointCloud(points) for points in (target, source)]
+    trees = [gicp.KdTree(cloud, 1) for cloud in clouds]
+    for cloud, tree in zip(clouds, trees, strict=True):
+        gicp.estimate_covariances(cloud, tree, NEIGHBOURS, 1)
+    # One thread: sums in another order would make results differ from run to run.
+    return gicp.align(
+        *clouds, trees[0], init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach_m,
+        num_threads=1, max_iterations=30, rotation_epsilon=MIN_STEP, translation_epsilon=MIN_STEP,
+    )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +86,7 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
         pose, own = pose.turned_over(), own * np.array([1, -1, -1], np.float32)
     azimuth, elevation = angles(own)
     if ring is None and config.layout != "rings":
-        return _project(cloud, Samples(azimuth, elevation, distance), pose)
+        return _project(cloud, azimuth, elevation, distance, pose)
     return _from_rings(cloud, own, even_rows(elevation) if ring is None else ring, azimuth, elevation, distance, pose)
 
 
@@ -142,8 +142,12 @@ def isolated_returns(ranges: Ranges) -> Mask:
     for aside in (-2, 2):
         diagonal |= _near(R, ranges[row, (column + aside) % columns], own)
     left, right = ranges[row, (column + 1) % columns], ranges[row, (column - 1) % columns]
+    middle, step = (
+        0.5 * (1 / left + 1 / right),
+        np.abs(1 / left - 1 / right),
+    )  # inverse ranges: linear on a plane, in small angles
     with np.errstate(invalid="ignore"):
-        mixed = ((left - R) * (right - R) < 0) & ~_on_one_plane(R, left, right)
+        mixed = ((left - R) * (right - R) < 0) & ~(np.abs(1 / R - middle) < 0.2 * step)
     alone[row, column] = ~upright & (mixed | ~diagonal)
     return alone
 
@@ -173,7 +177,10 @@ def _from_rings(
     hit = index >= 0
     ranges[hit] = distance[index[hit]]
     index[isolated_returns(ranges)] = -1
-    _fill_single_holes(ranges)
+    left, right = np.roll(ranges, 1, 1), np.roll(ranges, -1, 1)
+    with np.errstate(invalid="ignore"):
+        hole = np.isnan(ranges) & (np.abs(left - right) < HOLE_JUMP)
+    ranges[hole] = 0.5 * (left[hole] + right[hole])
     cones = ring_cones(row, own, len(row_elevation))
     return RangeImage(ranges, index, row_elevation, step, cloud, reflectivity(cloud.intensity), cones, None, pose)
 
@@ -190,13 +197,6 @@ def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> 
     return row_of_name[np.searchsorted(names, ring)], medians[from_top]
 
 
-def _fill_single_holes(ranges: NDArray[np.float32]) -> None:
-    left, right = np.roll(ranges, 1, 1), np.roll(ranges, -1, 1)
-    with np.errstate(invalid="ignore"):
-        hole = np.isnan(ranges) & (np.abs(left - right) < HOLE_JUMP)
-    ranges[hole] = 0.5 * (left[hole] + right[hole])
-
-
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Points of a scan: azimuth, elevation (n,) rad, distance (n,) m; order, start: the points of each cell, nearest first."""
@@ -204,8 +204,8 @@ class Samples:
     azimuth: Angles
     elevation: Angles
     distance: Angles
-    order: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
-    start: NDArray[np.intp] = field(default_factory=lambda: np.zeros(1, np.intp))
+    order: NDArray[np.intp]
+    start: NDArray[np.intp]
 
     def inside(self, cell: NDArray[np.intp], most: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Points (m, most) of cells (m,), given as row * columns + column, and the mask (m, most) of entries that are points."""
@@ -214,9 +214,8 @@ class Samples:
         return self.order[np.minimum(at, len(self.order) - 1)], valid
 
 
-def _project(cloud: PointCloud, samples: Samples, pose: ScannerPose) -> RangeImage:
+def _project(cloud: PointCloud, azimuth: Angles, elevation: Angles, distance: Angles, pose: ScannerPose) -> RangeImage:
     """Range image of a scanner without rings: the nearest return wins a cell, single holes are interpolated."""
-    azimuth, elevation, distance = samples.azimuth, samples.elevation, samples.distance
     step = cell_size(azimuth, elevation)
     columns = max(round(2 * np.pi / step), 3)
     step = 2 * np.pi / columns
@@ -231,12 +230,12 @@ def _project(cloud: PointCloud, samples: Samples, pose: ScannerPose) -> RangeIma
     index = np.where(hit, order[start[:-1].clip(max=len(order) - 1)], -1).astype(np.int32).reshape(rows, columns)
     centre = np.asarray(top - (np.arange(rows) + 0.5) * step, np.float64)
     measured = np.where(index >= 0, distance[index], np.nan).astype(np.float32)
+    samples = Samples(azimuth, elevation, distance, order, start)
     ranges = _range_at_centre(measured, index, samples, centre, step)
     index[isolated_returns(ranges)] = -1
     _fill(ranges)
     cones = np.stack([np.zeros(rows), np.tan(centre)], axis=1)
-    own = Samples(azimuth, elevation, distance, order, start)
-    return RangeImage(ranges, index, centre, step, cloud, reflectivity(cloud.intensity), cones, own, pose)
+    return RangeImage(ranges, index, centre, step, cloud, reflectivity(cloud.intensity), cones, samples, pose)
 
 
 def cell_size(azimuth: Angles, elevation: Angles) -> float:
@@ -322,12 +321,6 @@ def _fill(ranges: Ranges) -> None:
 def _near(a: Ranges, b: Ranges, limit: Ranges) -> Mask:
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(a - b) < limit)
-
-
-def _on_one_plane(R: Ranges, left: Ranges, right: Ranges) -> Mask:
-    """Whether three neighbours lie on one plane, along which the inverse range is linear in small angles."""
-    middle, step = 0.5 * (1 / left + 1 / right), np.abs(1 / left - 1 / right)
-    return np.asarray(np.abs(1 / R - middle) < 0.2 * step)
 
 
 def _too_few(usable: int) -> TooFewFeaturesError:

@@ -5,14 +5,13 @@ Drivers differ in what they say about rings, so each property is estimated from 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.scanner_pose import CLOUD_FRAME, RingFit, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit, stays
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit, stays
 
 Angles = NDArray[np.floating]
 MIN_RINGS, MAX_RINGS = 4, 256
@@ -56,9 +55,11 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
     if len(xyz) < FEWEST_POINTS:
         return ring, CLOUD_FRAME
     known = None if ring is None else ring_fit(xyz, ring)
-    if ring is not None and known is not None and (_in_own_frame(known) or stays(xyz, ring, MUCH_SHARPER * known.spread)):
-        return ring, CLOUD_FRAME
-    for candidate, apart in ((_ring_field(cloud), FIELD_APART), (_runs(*angles(xyz)), RUNS_APART)):
+    if ring is not None and known is not None:
+        in_own_frame = known.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * known.spacing)
+        if in_own_frame or stays(xyz, ring, MUCH_SHARPER * known.spread):
+            return ring, CLOUD_FRAME
+    for candidate, apart in ((_ring_field(cloud), FIELD_APART), (rings_by_order(*angles(xyz), posed=False), RUNS_APART)):
         if candidate is not None:
             fit = fitted_pose(xyz, candidate)
             sharper = fit.spread < MUCH_SHARPER * ring_fit(xyz, candidate).spread
@@ -72,10 +73,6 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
     return ring, CLOUD_FRAME
 
 
-def _in_own_frame(fit: RingFit) -> bool:
-    return fit.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * fit.spacing)
-
-
 def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], ScannerPose] | None:
     """Rings and pose that agree with each other, from a rough pose; None if there are none."""
     count, runs = 0, None
@@ -86,7 +83,7 @@ def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], S
         ring = _ring_field(cloud)
         if ring is not None and keeps_elevation(ring, elevation):
             return ring, pose
-        runs = _runs(azimuth, elevation)
+        runs = rings_by_order(azimuth, elevation, posed=False)
         fit = None if runs is None else fitted_pose(cloud.xyz, runs, pose)
         if runs is None or fit is None or not fit.apart:
             runs = rings_by_elevation(own, elevation)
@@ -142,52 +139,33 @@ def keeps_elevation(ring: NDArray[np.int32], elevation: Angles) -> bool:
     return _ring_spread(compact, elevation) <= MAX_RING_SPREAD * _mean_deviation(elevation)
 
 
-def rings_by_order(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
+def rings_by_order(azimuth: Angles, elevation: Angles, posed: bool = True) -> NDArray[np.int32] | None:
     """Rings as runs of monotonic azimuth, (n,) int32; None if the points are not stored ring after ring. Of the starts tried, the
-    one whose runs spread least in elevation wins."""
-    turn, sign = _turns(azimuth)
-    if turn is None:
-        return None
-    limit = MAX_RUN_SPREAD * _mean_deviation(elevation)
-    every = max(len(azimuth) // HISTOGRAM_POINTS, 1) | 1
-    starts = (0.0, np.pi, float(azimuth[0]) - sign * 1e-3)
-    return _best_runs(azimuth, sign, starts, lambda ring: _ring_spread(ring[::every], elevation[::every]), limit)
-
-
-def _runs(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
-    """Runs of monotonic azimuth, (n,) int32, as seen from a wrong pose; None if the points are not stored in such."""
-    turn, sign = _turns(azimuth)
-    if turn is None:
-        return None
-    # They end where the elevation jumps to another ring's. Its spread does not tell: a start half a turn aside mixes evenly.
-    step = np.abs(np.diff(elevation))
-    starts = (0.0, np.pi, float(azimuth[0]) - sign * 1e-3, _cut(azimuth, step, sign * float(np.median(np.abs(turn)))))
-    return _best_runs(azimuth, sign, starts, lambda ring: -float(np.median(step[np.diff(ring) > 0])), np.inf)
-
-
-def _best_runs(
-    azimuth: Angles, sign: float, starts: Sequence[float], cost: Callable[[NDArray[np.int32]], float], limit: float
-) -> NDArray[np.int32] | None:
-    """Of the runs of azimuths that begin at each of the starts, those of the least cost below the limit."""
-    tried = [ring for start in starts if (ring := _runs_from(start, sign, azimuth)) is not None]
-    least, best = min(((cost(ring), k) for k, ring in enumerate(tried)), default=(np.inf, 0))
-    return tried[best] if least < limit else None
-
-
-def _turns(azimuth: Angles) -> tuple[Angles | None, float]:
-    """Steps (n - 1,) of the azimuth and the sign of most; None if too many go the other way."""
+    one whose runs spread least in elevation wins. posed: False = as seen from a wrong pose."""
     turn = np.diff(azimuth)
     turn -= (2 * np.pi * np.rint(turn / (2 * np.pi))).astype(turn.dtype)
     sign = 1.0 if np.count_nonzero(turn > 0) >= np.count_nonzero(turn < 0) else -1.0
-    return (None if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn) else turn), sign
-
-
-def _runs_from(start: float, sign: float, azimuth: Angles) -> NDArray[np.int32] | None:
-    """Number (n,) of the run of azimuths that begin at `start` and turn by `sign`; None if there are too few or too many."""
-    angle = np.mod(sign * (azimuth - start), 2 * np.pi)
-    span = float(np.ptp(angle))
-    ring = np.concatenate([[0], np.cumsum(np.diff(angle) < -0.5 * span)]).astype(np.int32)
-    return ring if MIN_RINGS <= int(ring[-1]) + 1 <= MAX_RINGS and span >= 0.1 else None
+    if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn):
+        return None
+    starts = [0.0, np.pi, float(azimuth[0]) - sign * 1e-3]
+    every, best = max(len(azimuth) // HISTOGRAM_POINTS, 1) | 1, None
+    if posed:
+        least = MAX_RUN_SPREAD * _mean_deviation(elevation)
+    else:
+        step, least = np.abs(np.diff(elevation)), np.inf
+        starts.append(_cut(azimuth, step, sign * float(np.median(np.abs(turn)))))
+    for start in starts:
+        angle = np.mod(sign * (azimuth - start), 2 * np.pi)
+        span = float(np.ptp(angle))
+        ring = np.concatenate([[0], np.cumsum(np.diff(angle) < -0.5 * span)]).astype(np.int32)
+        if not (MIN_RINGS <= int(ring[-1]) + 1 <= MAX_RINGS and span >= 0.1):
+            continue
+        # From a wrong pose the spread does not tell, since a start half a turn aside mixes evenly; but runs end where the
+        # elevation jumps to another ring's.
+        cost = _ring_spread(ring[::every], elevation[::every]) if posed else -float(np.median(step[np.diff(ring) > 0]))
+        if cost < least:
+            least, best = cost, ring
+    return best
 
 
 def _cut(azimuth: Angles, step: Angles, turn: float) -> float:
@@ -211,7 +189,11 @@ def rings_by_elevation(xyz: NDArray[np.floating], elevation: Angles) -> NDArray[
     peaks. xyz: (n, 3) m."""
     sample = xyz[:: max(len(xyz) // HISTOGRAM_POINTS, 1)].astype(np.float64)
     distance, height = np.hypot(sample[:, 0], sample[:, 1]), sample[:, 2]
-    sharp = [_histogram_sharpness(np.arctan2(height - z, distance)) for z in APEX_HEIGHTS]
+    sharp = []
+    for z in APEX_HEIGHTS:
+        count = np.bincount(((np.arctan2(height - z, distance) + np.pi / 2) / HISTOGRAM_BIN).astype(np.intp))
+        smooth = np.convolve(count, [0.25, 0.5, 0.25])  # a ring on the border of two bins is as sharp as one within a bin
+        sharp.append(float((smooth**2).sum()))
     best = int(np.argmax(sharp))
     if sharp[best] < MIN_SHARPENING * sharp[len(APEX_HEIGHTS) // 2]:
         return _histogram_peaks(elevation)
@@ -259,12 +241,6 @@ def _ring_spread(ring: NDArray[np.int32], elevation: Angles) -> float:
     mean = np.bincount(ring, elevation) / np.maximum(count, 1)
     deviation = np.bincount(ring, np.abs(elevation - mean[ring])) / np.maximum(count, 1)
     return float(np.median(np.repeat(deviation, count)))
-
-
-def _histogram_sharpness(elevation: Angles) -> float:
-    count = np.bincount(((elevation + np.pi / 2) / HISTOGRAM_BIN).astype(np.intp))
-    smooth = np.convolve(count, [0.25, 0.5, 0.25])  # a ring on the border of two bins is as sharp as one within a bin
-    return float((smooth**2).sum())
 
 
 def _histogram_peaks(elevation: Angles) -> NDArray[np.int32] | None:

@@ -113,18 +113,22 @@ def fitted_pose(xyz: NDArray[np.floating], ring: NDArray[np.int32], start: Scann
     Robust Gauss-Newton on the elevation, from several axes and heights; along directions that the scan does not show the centre
     stays near the origin. start: a pose that is near, if one is known.
     """
-    P, row = _far_half(*_sample(xyz, ring, 2 * FIRST_POINTS))
+    P, row = _sample(xyz, ring, 2 * FIRST_POINTS)
+    # A centre that is metres off turns the elevations of the nearest half by tens of degrees: the fit would have local optima.
+    distance = np.linalg.norm(P, axis=1)
+    far = distance >= np.median(distance)
+    P, row = P[far], np.unique(row[far], return_inverse=True)[1].astype(np.intp).ravel()
     starts = [ScannerPose(height * np.eye(3)[2], upright(np.eye(3)[axis])) for axis, height in STARTS]
     best: RingFit | None = None
     for begin in starts if start is None else [start]:
-        fit = _measured(P, row, _gauss_newton(P, _Rings(row), begin))
+        fit = _measured(P, row, _gauss_newton(P, row, begin))
         if best is None or fit.spread < best.spread:
             best = fit
         if best.apart:
             break
     assert best is not None
     P, row = _sample(xyz, ring, FIT_POINTS)
-    return _measured(P, row, _upward(_gauss_newton(P, _Rings(row), best.pose)))
+    return _measured(P, row, _upward(_gauss_newton(P, row, best.pose)))
 
 
 def pose_by_neighbours(xyz: NDArray[np.floating]) -> ScannerPose | None:
@@ -137,7 +141,7 @@ def pose_by_neighbours(xyz: NDArray[np.floating]) -> ScannerPose | None:
     P = np.concatenate([np.repeat(xyz[some], NEIGHBOURS, axis=0), xyz[near.ravel()]]).astype(np.float64)
     limit = MUCH_ALIKE * _unlikeness(P, CLOUD_FRAME)
     for axis in np.eye(3)[[2, 0, 1]]:
-        pose = _gauss_newton(P, _Pairs(), ScannerPose(rotation=upright(axis)))
+        pose = _gauss_newton(P, None, ScannerPose(rotation=upright(axis)))
         if _unlikeness(P, pose) < limit and np.abs(pose.centre).max() < MAX_CENTRE:
             return _upward(pose)
     return None
@@ -145,7 +149,8 @@ def pose_by_neighbours(xyz: NDArray[np.floating]) -> ScannerPose | None:
 
 def _unlikeness(P: Floats, pose: ScannerPose) -> float:
     """Median difference of the elevations of pairs of points, rad, as seen from a pose."""
-    return float(np.median(np.abs(_Pairs().robust(_elevation(pose.to_scanner(P))))))
+    own = pose.to_scanner(P)
+    return float(np.median(np.abs(_against(None, np.arctan2(own[:, 2], np.hypot(own[:, 0], own[:, 1]))))))
 
 
 def hangs_upside_down(xyz: NDArray[np.floating]) -> bool:
@@ -155,29 +160,24 @@ def hangs_upside_down(xyz: NDArray[np.floating]) -> bool:
     if np.count_nonzero(near[:, 2] > 0) <= len(near) / 2:
         return False
     some = near[:: max(len(near) // GROUND_POINTS, 1)]
-    above, below = (_plane_share(some[side * some[:, 2] > MIN_HEIGHT], len(some)) for side in (1, -1))
-    return above > GROUND_SHARE and below < MAX_BELOW * above
-
-
-def _plane_share(xyz: NDArray[np.floating], points: int) -> float:
-    """Share of so many points that lie in the horizontal plane with the most of (n, 3)."""
-    plane = fit_ground(xyz.astype(np.float32), GROUND_THICKNESS, GROUND_PLANES, MAX_SLOPE_DEG, 0.0, 0)
-    return 0.0 if plane is None else float(np.count_nonzero(np.abs(plane.distance(xyz)) < GROUND_THICKNESS)) / points
+    shares = []  # of the points in the horizontal plane with the most of them, above and below
+    for side in (1, -1):
+        part = some[side * some[:, 2] > MIN_HEIGHT]
+        plane = fit_ground(part.astype(np.float32), GROUND_THICKNESS, GROUND_PLANES, MAX_SLOPE_DEG, 0.0, 0)
+        inside = 0 if plane is None else np.count_nonzero(np.abs(plane.distance(part)) < GROUND_THICKNESS)
+        shares.append(inside / max(len(some), 1))
+    return shares[0] > GROUND_SHARE and shares[1] < MAX_BELOW * shares[0]
 
 
 def _upward(pose: ScannerPose) -> ScannerPose:
     return pose if pose.axis[2] >= 0 else ScannerPose(pose.centre, upright(-pose.axis))
 
 
-def _elevation(xyz: NDArray[np.floating]) -> Floats:
-    return np.asarray(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])), np.float64)
-
-
 def stays(xyz: NDArray[np.floating], ring: NDArray[np.int32], spread: float) -> bool:
     """Whether the fit of rings (n,) of points (n, 3) stays near the cloud's frame, with more than this spread: compensated scans
     are blurred, but not seen from elsewhere."""
     P, row = _sample(xyz, ring, FIRST_POINTS)
-    fit = _measured(P, row, _gauss_newton(P, _Rings(row), CLOUD_FRAME))
+    fit = _measured(P, row, _gauss_newton(P, row, CLOUD_FRAME))
     return bool(np.linalg.norm(fit.pose.centre) < NEAR_M and fit.pose.tilt_deg < NEAR_DEG and fit.spread > spread)
 
 
@@ -214,16 +214,8 @@ def _sample(xyz: NDArray[np.floating], ring: NDArray[np.int32], points: int) -> 
     return xyz[::every].astype(np.float64), row.astype(np.intp).ravel()
 
 
-def _far_half(P: Floats, row: NDArray[np.intp]) -> tuple[Floats, NDArray[np.intp]]:
-    """The farther half of points (n, 3) with their compact ring numbers (n,)."""
-    # A centre that is metres off turns the elevations of the nearest by tens of degrees: the fit would have local optima.
-    distance = np.linalg.norm(P, axis=1)
-    far = distance >= np.median(distance)
-    return P[far], np.unique(row[far], return_inverse=True)[1].astype(np.intp).ravel()
-
-
-def _gauss_newton(P: Floats, compare: _Rings | _Pairs, start: ScannerPose) -> ScannerPose:
-    """The pose at which the elevations of the points (n, 3) that `compare` sets against each other are equal."""
+def _gauss_newton(P: Floats, row: NDArray[np.intp] | None, start: ScannerPose) -> ScannerPose:
+    """The pose at which the elevations of the points (n, 3) of each row are equal; without rows, of neighbours (`_against`)."""
     R, c = start.rotation, start.centre
     for _ in range(FIT_STEPS):
         u = (P - c) @ R
@@ -235,10 +227,10 @@ def _gauss_newton(P: Floats, compare: _Rings | _Pairs, start: ScannerPose) -> Sc
         J[:, :3] = -gradient @ R.T
         J[:, 3] = gradient[:, 1] * u[:, 2] - gradient[:, 2] * u[:, 1]
         J[:, 4] = gradient[:, 2] * u[:, 0] - gradient[:, 0] * u[:, 2]
-        residual = compare.robust(elevation)
+        residual = _against(row, elevation)
         scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), MIN_SCALE)
         weight = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
-        residual, *columns = (compare.weighted(values, weight) for values in (elevation, *J.T))
+        residual, *columns = (_against(row, values, weight) for values in (elevation, *J.T))
         J = np.stack(columns, axis=1)
         prior = np.diag(np.r_[np.full(3, (scale / CENTRE_SIGMA) ** 2), np.full(2, 1e-9)])
         weighted = J * weight[:, None]
@@ -253,34 +245,16 @@ def _gauss_newton(P: Floats, compare: _Rings | _Pairs, start: ScannerPose) -> Sc
     return ScannerPose(c, R)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rings:
-    """Sets every point against the others of its row (n,)."""
-
-    row: NDArray[np.intp]
-
-    def robust(self, values: Floats) -> Floats:
-        """Deviations (n,) of values (n,) from the median of their row."""
-        return np.asarray(values - _medians(self.row, values, int(self.row.max()) + 1)[self.row])
-
-    def weighted(self, values: Floats, weight: Floats) -> Floats:
-        """Deviations (n,) of values (n,) from the weighted mean of their row."""
-        mean = np.bincount(self.row, weight * values) / np.maximum(np.bincount(self.row, weight), 1e-12)
-        return np.asarray(values - mean[self.row])
-
-
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Sets points against one neighbour each; the neighbours are the second half of the points."""
-
-    def robust(self, values: Floats) -> Floats:
-        """Differences (n / 2,) of values (n,)."""
+def _against(row: NDArray[np.intp] | None, values: Floats, weight: Floats | None = None) -> Floats:
+    """Deviations (n,) of values (n,) from the median of their row, with weights from its mean; row None: differences (n / 2,)
+    from the second half, of neighbours."""
+    if row is None:
         half = len(values) // 2
         return values[:half] - values[half:]
-
-    def weighted(self, values: Floats, weight: Floats) -> Floats:
-        """The same."""
-        return self.robust(values)
+    if weight is None:
+        return np.asarray(values - _medians(row, values, int(row.max()) + 1)[row])
+    mean = np.bincount(row, weight * values) / np.maximum(np.bincount(row, weight), 1e-12)
+    return np.asarray(values - mean[row])
 
 
 def _measured(P: Floats, row: NDArray[np.intp], pose: ScannerPose) -> RingFit:

@@ -94,7 +94,12 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
     while _neighbours(points, eps) > MAX_NEIGHBOURS:
         voxel = max(2 * voxel, eps / 32)
         points, weight, member = _downsampled(xyz, voxel)
-    return _largest_first(np.asarray(_dbscan(points, weight, eps, min_points)[member], np.int32))
+    labels = _dbscan(points, weight, eps, min_points)[member]
+    count = np.bincount(labels[labels >= 0])
+    rank = np.empty(len(count) + 1, np.int32)
+    rank[np.argsort(-count, kind="stable")] = np.arange(len(count), dtype=np.int32)  # of equally large ones by the earlier point
+    rank[-1] = NOISE
+    return rank[labels]
 
 
 def connected_parts(pairs: NDArray[np.intp], n: int) -> NDArray[np.intp]:
@@ -138,12 +143,3 @@ def _neighbours(points: Floats, eps: float) -> float:
         return 0.0
     sample = points[:: len(points) // NEIGHBOUR_SAMPLE + 1]
     return float(np.mean(KDTree(points).query_ball_point(sample, eps, return_length=True)) * len(points))
-
-
-def _largest_first(labels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Clusters numbered by size; of equally large ones, that of the earlier point comes first."""
-    count = np.bincount(labels[labels >= 0])
-    rank = np.empty(len(count) + 1, np.int32)
-    rank[np.argsort(-count, kind="stable")] = np.arange(len(count), dtype=np.int32)
-    rank[-1] = NOISE
-    return rank[labels]

@@ -52,34 +52,29 @@ class SweepOffset:
         if times is None:
             self._offset = 0.0
         elif len(times) >= MIN_POINTS:
-            self._blind = 0
-            self._learn(times)
+            self._blind, known = 0, self._offset
+            middle = float(
+                np.partition(times, (len(times) - 1) // 2)[(len(times) - 1) // 2]
+            )  # a time that occurs: no mean of two
+            if known is None or np.abs(times - middle).mean() < CLOSER * np.abs(times - known).mean():
+                self._offset = middle
         elif self._offset is None:
             self._blind += 1
             self._offset = 0.0 if self._blind >= BLIND_CLOUDS else None
-
-    def _learn(self, times: Floats) -> None:
-        middle = float(np.partition(times, (len(times) - 1) // 2)[(len(times) - 1) // 2])  # a time that occurs: no mean of two
-        known = self._offset
-        if known is None or np.abs(times - middle).mean() < CLOSER * np.abs(times - known).mean():
-            self._offset = middle
 
 
 def view_times(cloud: PointCloud, camera: Camera, T_camera_lidar: NDArray[np.floating], config: MotionConfig) -> Floats | None:
     """Times (n,), s after the cloud's stamp, at which points in the camera's view were measured, of some thousand points. None if
     all points count as measured at the stamp."""
-    if config.deskew == "off" or not (has_times(cloud) or states_stamping(config)):
+    # Whether the user has stated how a driver without point times stamps its scans: drivers differ, the default is a guess.
+    usual = MotionConfig()
+    stated = config.from_scans == "always" or any(
+        getattr(config, name) != getattr(usual, name) for name in ("spin", "stamp_azimuth_deg", "stamp_at")
+    )
+    if config.deskew == "off" or not (has_times(cloud) or stated):
         return None
     # An odd step, so that all rings remain in a scan stored firing by firing.
     part = cloud.select(np.arange(0, len(cloud), (len(cloud) // MAX_POINTS) | 1)).finite()
     part = part.select(camera.project(se3.transform(T_camera_lidar, part.xyz))[1])
     times = part.time.astype(np.float64) if has_times(cloud) and part.time is not None else scan_times(part.xyz, config)
     return times[np.abs(times) <= MAX_TIME]
-
-
-def states_stamping(config: MotionConfig) -> bool:
-    """Whether the user has stated how a driver without point times stamps its scans. Drivers differ: the default is a guess."""
-    usual = MotionConfig()
-    return config.from_scans == "always" or any(
-        getattr(config, name) != getattr(usual, name) for name in ("spin", "stamp_azimuth_deg", "stamp_at")
-    )

@@ -23,7 +23,7 @@ from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import RefinedCamera
 from calib_ros.registration.acceptance.checks import Acceptance, leaves_doubt
-from calib_ros.registration.acceptance.refusal import MAYBE_RAW, joined, semantic_note
+from calib_ros.registration.acceptance.refusal import MAYBE_RAW, SUSPECT_INTRINSICS, joined
 from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.camera_rounds import refined_with_camera
 from calib_ros.registration.classes import ALL, Segmentation, class_models
@@ -33,12 +33,14 @@ from calib_ros.registration.features import FeatureExtractor, FrameFeatures, Sca
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import JointSearch
-from calib_ros.registration.motion_guess.registration import Guesser, best_registration
+from calib_ros.registration.motion_guess.registration import best_registration, from_anything, from_motion
 from calib_ros.registration.nuisance.refinement import joint_optimum
 from calib_ros.registration.objective import ObjectiveMaker
-from calib_ros.registration.progress import SILENT, Callback, Observer, Progress
+from calib_ros.registration.progress import SILENT, Callback, Progress
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result
+
+LACKS_EVIDENCE = (RefusalCode.NOT_SIGNIFICANT, RefusalCode.TOO_UNCERTAIN)
 
 
 class Calibrator:
@@ -52,8 +54,6 @@ class Calibrator:
         All settings.
     segmentation : Segmentation, optional
         The models of ``config.semantics``, where they are loaded already.
-    observer : Observer, optional
-        Watches the optimisation of every estimate and does not change it.
     given : Camera, optional
         The intrinsics that were stated, where `camera` corrects them: what they leave open is then told by the joint estimate.
     scans : ScanEdges, optional
@@ -65,7 +65,6 @@ class Calibrator:
         camera: Camera,
         config: Config | None = None,
         segmentation: Segmentation | None = None,
-        observer: Observer | None = None,
         given: Camera | None = None,
         scans: ScanEdges | None = None,
     ) -> None:
@@ -73,7 +72,7 @@ class Calibrator:
         self._given = given
         self.extract = FeatureExtractor(camera, self.config, scans)
         self.segmentation = segmentation or models_of(self.config.semantics)
-        self.objectives = ObjectiveMaker(self.config, camera, observer)
+        self.objectives = ObjectiveMaker(self.config, camera)
 
     def calibrate(
         self,
@@ -126,23 +125,22 @@ class Calibrator:
 
         def near(camera: Camera, T: Transform) -> Result:
             again = self._with_camera(camera)
-            used, _ = usable_frames(_seen_by(camera, frames), again.extract, None, SILENT)
+            used, _ = usable_frames([replace(frame, camera=camera) for frame in frames], again.extract, None, SILENT)
             return again.estimate([features for _, features in used], T, anchor=anchor)
 
         def whole(camera: Camera) -> Result:
             start = nominal() if first.initial is None else first.initial
-            return self._with_camera(camera)._calibrated(_seen_by(camera, frames), start, box, progress, ())
+            seen = [replace(frame, camera=camera) for frame in frames]
+            return self._with_camera(camera)._calibrated(seen, start, box, progress, ())
 
-        # Of other objectives the edges confirm the place, not the covariance; see Acceptance._check_uncertainty.
+        # Of other objectives the edges confirm the place, not the covariance; see Acceptance.refusal.
         asked = not box.is_empty and other_objective(self.config) is None
         limits = self.config.refine if asked else None
         result = refined_with_camera(first, self.extract.source_camera, near, whole, self.config.camera, limits)
         return replace(result, origin=first.origin, elapsed_s=first.elapsed_s + time.perf_counter() - started)
 
     def _with_camera(self, camera: Camera) -> Calibrator:
-        return Calibrator(
-            camera, self.config, self.segmentation, self.objectives.observer, self.extract.source_camera, self.extract.scans
-        )
+        return Calibrator(camera, self.config, self.segmentation, self.extract.source_camera, self.extract.scans)
 
     def _calibrated(
         self,
@@ -164,8 +162,8 @@ class Calibrator:
             def register(start: Matrix | str, box: SearchBox | None) -> Result:
                 return self._calibrated(frames, start, box, progress, ())
 
-            guesser = Guesser(register, len(frames), consecutive or frames, self.extract, search, self.segmentation.active)
-            result = guesser.from_motion() if initial == MOTION else guesser.from_anything()
+            given = register, len(frames), consecutive or frames, self.extract, search
+            result = from_motion(*given) if initial == MOTION else from_anything(*given, self.segmentation.active)
             return replace(result, elapsed_s=time.perf_counter() - started)
         wait = T0 is not None and self.classes_in_doubt_only
         segmentation = self.segmentation if self.segmentation.active and not wait else None
@@ -203,8 +201,12 @@ class Calibrator:
         result, tried = best_registration(
             hypotheses, lambda T, around: self.estimate(features, T, around, progress, notes), box or SEMANTIC_BOX
         )
-        reason = joined([result.reason, semantic_note(len(views), len(features), tried)])
-        return replace(result, reason=reason, elapsed_s=time.perf_counter() - started, origin=InitialSource.SEMANTIC)
+        note = (
+            f"first guess from the classes of {len(views)} of {len(features)} frames; registered from {tried} of its hypotheses"
+        )
+        return replace(
+            result, reason=joined([result.reason, note]), elapsed_s=time.perf_counter() - started, origin=InitialSource.SEMANTIC
+        )
 
     def estimate(
         self,
@@ -236,15 +238,17 @@ class Calibrator:
             acceptance = Acceptance(self.config, self.extract.source_camera.width, box)
             evidence = acceptance.evidence(objective, alignment, optimised.search)
             inflated = inflation(evidence.disagreement)
-            pose = observable_pose(objective, alignment.T, start, box, inflated, optimised.nearby)
+            pose = observable_pose(
+                objective, alignment.T, start, box, inflated, optimised.search.nearby if optimised.search else ()
+            )
             intrinsics = acceptance.intrinsics(objective, alignment, evidence)
-            found = Estimate(initial, start, optimised, alignment, evidence, pose, intrinsics)
-            nuisance = found.nuisance(self.config, intrinsics if self._given is None else ())
+            found = Estimate(initial, start, optimised, alignment, evidence, *pose, intrinsics)
+            shared, clocks = found.nuisance(self.config, intrinsics if self._given is None else ())
             # Accept, or say why not.
             refusal = acceptance.refusal(found, watch)
-            if refusal is not None and refusal.suspects_intrinsics and self.extract.source_camera.said_rectified:
+            if refusal is not None and refusal.code in SUSPECT_INTRINSICS and self.extract.source_camera.said_rectified:
                 notes = [MAYBE_RAW, *notes]
-            result = found.result(nuisance, refusal, self.config.motion, notes)
+            result = found.result(shared, clocks, refusal, self.config.motion, notes)
             if self.config.camera.intrinsics == REFINE:
                 result = replace(result, refined_camera=self._refined(found, acceptance))
             self.objectives.keep_maps(objective)
@@ -257,7 +261,7 @@ class Calibrator:
         objective, camera, limits = found.objective, self.extract.source_camera, found.objective.constraints.limits
         inflated, search = inflation(found.evidence.disagreement), acceptance.box is not None and self._given is None
         score, prior, T = objective.edges.score, objective.constraints.prior, found.alignment.T
-        extrinsic = found.pose.covariance
+        extrinsic = found.covariance
         return joint_optimum(score, T, limits, prior, camera, self.config.camera, inflated, extrinsic, search, self._given)
 
     def estimate_in_doubt(
@@ -278,16 +282,11 @@ class Calibrator:
         if all(new is old for new, old in zip(features, plain, strict=True)):
             return replace(result, reason=joined([result.reason, *more]))
         again = self.estimate(features, initial, box, progress, [*notes, *more])
-        if result.converged and self._lacks_evidence_at(again, result.T_camera_lidar):
-            return replace(result, reason=joined([result.reason, *more]))
+        if result.converged and again.refusal in LACKS_EVIDENCE and again.optimum is not None:
+            deg, m = se3.error(result.T_camera_lidar, again.optimum)  # as exactly as the extrinsic has to be known
+            if deg <= self.config.refine.tolerance_deg and m <= self.config.refine.tolerance_m:
+                return replace(result, reason=joined([result.reason, *more]))
         return again
-
-    def _lacks_evidence_at(self, result: Result, T: Transform) -> bool:
-        """Whether an estimate is refused for want of evidence, its optimum being T (4, 4) as exactly as one has to be known."""
-        if result.refusal not in (RefusalCode.NOT_SIGNIFICANT, RefusalCode.TOO_UNCERTAIN) or result.optimum is None:
-            return False
-        off = se3.rotation_error_deg(T, result.optimum), se3.translation_error_m(T, result.optimum)
-        return off[0] <= self.config.refine.tolerance_deg and off[1] <= self.config.refine.tolerance_m
 
     @property
     def classes_in_doubt_only(self) -> bool:
@@ -302,11 +301,6 @@ class Calibrator:
         if other is not None and other.uses:
             return other.uses
         return () if self.config.semantics.in_doubt_only else ALL
-
-
-def _seen_by(camera: Camera, frames: Sequence[Frame]) -> list[Frame]:
-    """The same pictures, as if they were taken by another camera."""
-    return [replace(frame, camera=camera) for frame in frames]
 
 
 def _changed_reference(frames: Sequence[Frame]) -> list[str]:

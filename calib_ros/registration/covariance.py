@@ -42,7 +42,6 @@ TAKES_PART = 0.4  # share of the largest component of a direction, in units of t
 def covariance(
     score: PointScore,
     T: Transform,
-    level: int = -1,
     systematic_error: Matrix = SYSTEMATIC_ERROR,
     constraints: PoseConstraints | None = None,
     inflation: float = 1.0,
@@ -62,10 +61,10 @@ def covariance(
     if not len(axes):
         return C
     units = np.outer(UNKNOWN[axes], UNKNOWN[axes])
-    bread = noise_covariance(score, T, level, axes, noise=1.0)
-    noise = noise_level(score, T, level, bread, axes)
-    inner = inflation * _profiled(score, T, level, axes, noise * bread, noise)
-    inner += _spread(score, T, level, others, inflation * noise)[np.ix_(axes, axes)]
+    bread = inverse_curvature(score, T, axes)
+    noise = noise_level(score, T, bread, axes)
+    inner = inflation * _profiled(score, T, axes, noise * bread, noise)
+    inner += _spread(score, T, others, inflation * noise)[np.ix_(axes, axes)]
     values, vectors = np.linalg.eigh(inner / units)
     inner = units * ((vectors * np.clip(values, 0, 1)) @ vectors.T) + np.diag(systematic_error[axes] ** 2)
     if constraints and constraints.prior:
@@ -74,10 +73,10 @@ def covariance(
     return C
 
 
-def _profiled(score: PointScore, T: Transform, level: int, axes: NDArray[np.intp], C: Matrix, noise: float) -> Matrix:
+def _profiled(score: PointScore, T: Transform, axes: NDArray[np.intp], C: Matrix, noise: float) -> Matrix:
     """The covariance C (k, k) of the axes (k,), the standard deviation of every principal direction where the score has fallen by
     half of its noise, as on a profile of the likelihood: the curvature at the very top is that of its finest structure."""
-    part = score.subset(POINTS, np.random.default_rng(0)).at(level)
+    part = score.subset(POINTS, np.random.default_rng(0)).at(-1)
     k = len(axes)
     scale = part.linearise(T)[1][np.ix_(axes, axes)] + np.diag(max(noise, NO_NOISE) / UNKNOWN[axes] ** 2)
     whitened = np.linalg.inv(np.linalg.cholesky(scale)).T  # unit steps along its columns move all points alike
@@ -96,40 +95,47 @@ def _profiled(score: PointScore, T: Transform, level: int, axes: NDArray[np.intp
     return np.asarray((directions * sigma**2) @ directions.T)
 
 
-def _spread(score: PointScore, T: Transform, level: int, others: Sequence[Matrix], noise: float) -> Covariance:
+def _spread(score: PointScore, T: Transform, others: Sequence[Matrix], noise: float) -> Covariance:
     """Second moment (6, 6) about T (4, 4) of optima nearby; one that scores less by the noise is exp(-1) times as probable."""
-    top, moment, weight = score.at(level).value(T), np.zeros((6, 6)), 1.0
+    top, moment, weight = score.at(-1).value(T), np.zeros((6, 6)), 1.0
     kept = [np.zeros(6)]
     for other in others:
         xi = se3.log(other @ se3.inverse(T))
         if any((np.abs(xi - own) < STEP).all() for own in kept):
             continue
         kept.append(xi)
-        own_weight = float(np.exp(min(score.at(level).value(other) - top, 0.0) / max(noise, NO_NOISE)))
+        own_weight = float(np.exp(min(score.at(-1).value(other) - top, 0.0) / max(noise, NO_NOISE)))
         moment, weight = moment + own_weight * np.outer(xi, xi), weight + own_weight
     return np.asarray(moment / weight)
 
 
-def noise_covariance(score: PointScore, T: Transform, level: int, axes: NDArray[np.intp], noise: float | None = None) -> Matrix:
-    """The part of the covariance (k, k) of some axes that more scenes average out, by the curvature at the top alone.
-
-    noise: None = by `noise_level`."""
+def inverse_curvature(score: PointScore, T: Transform, axes: NDArray[np.intp]) -> Matrix:
+    """Inverse (k, k) of how the score bends down at its top T (4, 4) along some axes: by central differences of its gradient over
+    STEP. Times the noise, it is the part of the covariance that more scenes average out."""
+    part = score.subset(POINTS, np.random.default_rng(0))
+    before, after = part.gradients(_steps() @ T, score.n_levels - 1).reshape(2, 6, 6)
+    H = (before - after) / (2 * STEP[:, None])
+    H = 0.5 * (H + H.T)
     units = np.outer(UNKNOWN[axes], UNKNOWN[axes])
-    scale = score.at(level).linearise(T)[1][np.ix_(axes, axes)] * units
-    least = USUAL_NOISE / len(score.frames)
-    bread = units * _inverse(curvature(score, T, level)[np.ix_(axes, axes)] * units, scale, least)
-    return bread * (noise_level(score, T, level, bread, axes) if noise is None else noise)
+    # It may be indefinite: its eigenvalues relative to the Gauss-Newton scale rise to LEAST_CURVATURE.
+    values, vectors = np.linalg.eigh(score.at(-1).linearise(T)[1][np.ix_(axes, axes)] * units)
+    root = vectors / np.sqrt(np.maximum(values, 0) + USUAL_NOISE / len(score.frames))
+    values, vectors = np.linalg.eigh(root.T @ (H[np.ix_(axes, axes)] * units) @ root)
+    half = root @ vectors
+    return np.asarray(units * ((half / np.maximum(values, LEAST_CURVATURE)) @ half.T))
 
 
-def noise_level(score: PointScore, T: Transform, level: int, bread: Matrix, axes: NDArray[np.intp]) -> float:
+def noise_level(score: PointScore, T: Transform, bread: Matrix, axes: NDArray[np.intp]) -> float:
     """Noise of the score at its optimum T (4, 4), in units of its curvature: the dispersion of the slopes of cells, the regions
     of all frames, pooled over all directions, of which the sandwich H^-1 (sum g g^T) H^-1 (White 1980) has some far too small.
 
     bread: inverse curvature (k, k) of the axes (k,). Frames of one place count as fewer.
     """
     frames = score.frames
-    cell = np.searchsorted(frames, score.frame) * REGIONS + _regions(score, T)
-    J = (score.jacobian(T, level % score.n_levels) * score.weights)[axes]
+    p = T[:3, :3] @ score.points + T[:3, 3:]
+    region = share_of_weight(np.arctan2(p[0], p[2]), score.weights, REGIONS)  # from left to right in the image
+    cell = np.searchsorted(frames, score.frame) * REGIONS + region
+    J = (score.jacobian(T, score.n_levels - 1) * score.weights)[axes]
     slopes = np.stack([np.bincount(cell, row, len(frames) * REGIONS) for row in J], axis=1)
     cells = int(np.count_nonzero(np.bincount(cell)))
     dispersion = cells / max(cells - 1, 1) * float(np.einsum("ij,jk,ik->", slopes, bread, slopes)) / len(axes)
@@ -156,12 +162,6 @@ def effective_frames(score: PointScore) -> float:
     return float(len(frames) ** 2 / correlation[np.ix_(frames, frames)].sum())
 
 
-def _regions(score: PointScore, T: Transform) -> NDArray[np.intp]:
-    """Region (n,) of every point, 0..REGIONS - 1 from left to right in the image."""
-    p = T[:3, :3] @ score.points + T[:3, 3:]
-    return share_of_weight(np.arctan2(p[0], p[2]), score.weights, REGIONS)
-
-
 def share_of_weight(values: Matrix, weights: NDArray[np.float32], parts: int) -> NDArray[np.intp]:
     """Part (n,) of every value when they are sorted and divided into so many parts of equal weight."""
     order = np.argsort(values, kind="stable")
@@ -169,14 +169,6 @@ def share_of_weight(values: Matrix, weights: NDArray[np.float32], parts: int) ->
     below = np.cumsum(weights[order], dtype=np.float64)
     out[order] = np.minimum((below / below[-1] * parts).astype(np.intp), parts - 1)
     return out
-
-
-def curvature(score: PointScore, T: Transform, level: int = -1) -> Matrix:
-    """How the score bends down (6, 6) around T (4, 4) per left twist, by central differences of its gradient over STEP."""
-    part = score.subset(POINTS, np.random.default_rng(0))
-    before, after = part.gradients(_steps() @ T, level % score.n_levels).reshape(2, 6, 6)
-    H = (before - after) / (2 * STEP[:, None])
-    return np.asarray(0.5 * (H + H.T))
 
 
 @cache
@@ -194,7 +186,9 @@ class Direction:
     sigma: tuple[float, ...]
 
     def __str__(self) -> str:
-        return " with ".join(f"{AXIS_NAMES[k]} ({_amount(k, s)})" for k, s in zip(self.axes, self.sigma, strict=True))
+        known = zip(self.axes, self.sigma, strict=True)
+        sizes = [(k, s < 0.5, f"{np.rad2deg(s):.2f} deg") if k < 3 else (k, s < 3, f"{100 * s:.0f} cm") for k, s in known]
+        return " with ".join(f"{AXIS_NAMES[k]} ({size if shown else 'unknown'})" for k, shown, size in sizes)
 
 
 def unobservable_directions(covariance: Covariance, max_deg: float, max_m: float) -> list[Direction]:
@@ -212,12 +206,6 @@ def unobservable_directions(covariance: Covariance, max_deg: float, max_m: float
         axes = [k for k in range(6) if abs(v[k]) >= TAKES_PART * np.abs(v).max()]
         out.append(Direction(tuple(axes), tuple(float(sigma[k]) for k in axes)))
     return out
-
-
-def _amount(axis: int, sigma: float) -> str:
-    if axis < 3:
-        return f"{np.rad2deg(sigma):.2f} deg" if sigma < 0.5 else "unknown"
-    return f"{100 * sigma:.0f} cm" if sigma < 3 else "unknown"
 
 
 def free_axes(covariance: Covariance) -> NDArray[np.bool_]:
@@ -245,12 +233,3 @@ def _information(covariance: Covariance) -> Matrix:
     free = free_axes(covariance)
     sigma = np.where(free, np.sqrt(np.maximum(np.diag(covariance), LEAST_VARIANCE)), np.inf)
     return np.asarray(np.linalg.pinv(covariance / np.outer(sigma, sigma), rcond=1e-12, hermitian=True) / np.outer(sigma, sigma))
-
-
-def _inverse(H: Matrix, scale: Matrix, least: float) -> Matrix:
-    """Inverse of a curvature that may be indefinite: its eigenvalues relative to `scale` plus `least` rise to LEAST_CURVATURE."""
-    values, vectors = np.linalg.eigh(scale)
-    root = vectors / np.sqrt(np.maximum(values, 0) + least)
-    values, vectors = np.linalg.eigh(root.T @ H @ root)
-    half = root @ vectors
-    return np.asarray((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)

@@ -10,8 +10,7 @@ import numpy as np
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.config import Config, MotionConfig
 from calib_ros.errors import CalibrationError
-from calib_ros.intrinsics import IntrinsicEstimate
-from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, Refusal, joined, outliers_note, unobservable_note
+from calib_ros.registration.acceptance.refusal import KEPT, LEFT_OUT, NO_INTENSITY, ONE_FRAME, Refusal, joined
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate
@@ -37,35 +36,18 @@ class Alignment:
 
 
 @dataclass(frozen=True, eq=False)
-class ObservablePose:
-    """An extrinsic T (4, 4), its covariance (6, 6), and the directions that no scene shows, along which T is the start."""
-
-    T: Transform
-    covariance: Covariance
-    unobservable: tuple[Direction, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Nuisance:
-    """What intrinsics and clocks leave open of an optimum, however many such scenes there are.
-
-    covariance: (6, 6). clocks: effect of an offset as large as motion.max_time_offset_s; None where the motion is not known.
-    """
-
-    covariance: Covariance
-    clocks: Effect | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class Estimate:
-    """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it."""
+    """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it. T: the
+    extrinsic (4, 4), with its covariance (6, 6), and the directions that no scene shows, along which it is the start."""
 
     initial: Transform
     start: Transform
     optimised: Optimised
     alignment: Alignment
     evidence: Evidence
-    pose: ObservablePose
+    T: Transform
+    covariance: Covariance
+    unobservable: tuple[Direction, ...]
     intrinsics: Sequence[NuisanceEstimate]
 
     @property
@@ -73,33 +55,37 @@ class Estimate:
         """Of the features that the optimum is one of."""
         return self.optimised.objective
 
-    def nuisance(self, config: Config, intrinsics: Sequence[NuisanceEstimate]) -> Nuisance:
-        """What these intrinsics and the clocks leave open of the optimum."""
-        T, covariance, constraints = self.pose.T, self.pose.covariance, self.objective.constraints
+    def nuisance(self, config: Config, intrinsics: Sequence[NuisanceEstimate]) -> tuple[Covariance, Effect | None]:
+        """What these intrinsics and the clocks leave open of the optimum, however many such scenes there are: covariance (6, 6),
+        and the effect of an offset as large as motion.max_time_offset_s; None where the motion is not known."""
+        T, covariance, constraints = self.T, self.covariance, self.objective.constraints
         score = self.objective.smooth_score(T)
         sigma_s, clocks = self.optimised.clocks(config.motion)
         active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         shared = np.zeros((6, 6))
         if not limits.open_axes.any():
-            return Nuisance(shared)
+            return shared, None
         for estimate in intrinsics:
             shared += estimate.added_covariance(constraints, covariance)
         moving = with_known_motion(self.optimised.features, score)
         if moving is None:
-            return Nuisance(shared)
+            return shared, None
         known, offset = clocks is not None, ClockOffset(sigma_s, moving[1])
         if clocks is None or active.any():  # else it is that of the same optimum
             clocks = offset.effect(moving[0], T, limits)
         effect = replace(clocks, information=0.0) if known else clocks  # these scenes count only once
         shared += effect.constrained(constraints, covariance, sigma_s).covariance(sigma_s)
-        return Nuisance(shared, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s))
+        return shared, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s)
 
-    def result(self, nuisance: Nuisance, refusal: Refusal | None, motion: MotionConfig, notes: Sequence[str]) -> Result:
-        """The Result, with the extrinsic that it started from where it is refused. notes: for its reason."""
+    def result(
+        self, shared: Covariance, clocks: Effect | None, refusal: Refusal | None, motion: MotionConfig, notes: Sequence[str]
+    ) -> Result:
+        """The Result, with the extrinsic that it started from where it is refused. shared, clocks: see nuisance. notes: for its
+        reason."""
         objective, features, search = self.objective, self.optimised.features, self.optimised.search
         names = [f.name or str(k) for k, f in enumerate(features)]
-        outliers, clocks, largest_s = [names[k] for k in self.alignment.outliers], nuisance.clocks, motion.max_time_offset_s
+        outliers = [names[k] for k in self.alignment.outliers]
         used = len(features) - len(outliers)
         offset = self.optimised.offset
         known = None if refusal or offset is None or not offset.observable(motion) else self.optimised
@@ -107,13 +93,13 @@ class Estimate:
             str(refusal) if refusal else "",
             *notes,
             objective.remark,
-            outliers_note(outliers) if outliers else "",
-            unobservable_note(self.pose.unobservable) if self.pose.unobservable else "",
+            LEFT_OUT.format(", ".join(outliers)) if outliers else "",
+            KEPT.format(", ".join(map(str, self.unobservable))) if self.unobservable else "",
             "" if all(f.has_reflectivity for f in features) else NO_INTENSITY,
             ONE_FRAME if used == 1 else "",
         ]
         return Result(
-            self.initial if refusal else self.pose.T,
+            self.initial if refusal else self.T,
             REFUSED if refusal else CONVERGED,
             joined(reasons),
             frames_used=used,
@@ -122,28 +108,23 @@ class Estimate:
             frames_left_out=tuple(outliers),
             refusal=refusal.code if refusal else None,
             refusal_figures=refusal.figures if refusal else {},
-            optimum=self.pose.T if refusal else None,
-            optimum_covariance=self.pose.covariance if refusal else None,
+            optimum=self.T if refusal else None,
+            optimum_covariance=self.covariance if refusal else None,
             data_stamp=max(f.stamp for f in features),
-            score=objective.value(self.pose.T),
+            score=objective.value(self.T),
             initial_score=objective.value(self.start),
             evidence=self.evidence,
-            frame_scores=tuple(float(s) for s in objective.frame_scores(self.pose.T)),
+            frame_scores=tuple(float(s) for s in objective.frame_scores(self.T)),
             starts=None if search is None else (search.agreed, search.optimised),
-            intrinsics={e.parameter.name: _intrinsic(e) for e in self.intrinsics},
-            covariance=None if refusal else self.pose.covariance + nuisance.covariance,
-            shared_covariance=None if refusal else nuisance.covariance,
+            intrinsics={e.parameter.name: e.in_files for e in self.intrinsics},
+            covariance=None if refusal else self.covariance + shared,
+            shared_covariance=None if refusal else shared,
             clock_direction=None if refusal or clocks is None else clocks.direction,
-            clock_sigma_s=None if refusal or clocks is None else clocks.sigma(largest_s),
+            clock_sigma_s=None if refusal or clocks is None else clocks.sigma(motion.max_time_offset_s),
             time_offset_s=None if known is None else motion.time_offset_s + known.seconds,
             time_offset_sigma_s=None if known is None else known.clocks(motion)[0],
             stamping=None if known is None else known.stamping,
         )
-
-
-def _intrinsic(estimate: NuisanceEstimate) -> IntrinsicEstimate:
-    unit = estimate.parameter.unit
-    return IntrinsicEstimate(unit * estimate.value, unit * estimate.sigma, estimate.is_observable)
 
 
 def insufficient(error: CalibrationError, initial: Transform, frames: int, notes: Sequence[str] = ()) -> Result:
@@ -182,8 +163,8 @@ def refine_start(objective: Objective, alignment: Alignment, start: Transform, p
 
 def observable_pose(
     objective: Objective, T: Transform, start: Transform, box: SearchBox | None, inflated: float, others: Sequence[Matrix] = ()
-) -> ObservablePose:
-    """The optimum T (4, 4) with its covariance; directions that no scene shows are kept from the start.
+) -> tuple[Matrix, Covariance, tuple[Direction, ...]]:
+    """The optimum T (4, 4) with its covariance, and the directions that no scene shows, which are kept from the start.
 
     box: that was searched, whose half widths are the standard deviations of a start that is fused. inflated: factor of the
     variance. others: optima (4, 4) nearby.
@@ -198,14 +179,13 @@ def observable_pose(
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         constraints = replace(constraints, limits=limits)
         C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
-    optimum = ObservablePose(T, C + np.diag(held))
     unobservable = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
     if not unobservable:
-        return optimum
+        return T, C + np.diag(held), ()
     deg, m = box.reach if box is not None else (0.0, 0.0)
     reach = [np.deg2rad(deg or REFINEMENT_DEG)] * 3 + [m or REFINEMENT_M] * 3
     kept, narrower = fused(T, C, start, np.diag(np.square(reach) * constraints.limits.open_axes))
     kept = objective.constraints.limits.clip(kept)  # composed rotations and translations exceed them by terms of second order
     if penalised(objective, kept) < penalised(objective, start):  # the score does observe them farther from the optimum
-        return optimum
-    return ObservablePose(kept, narrower + np.diag(held), tuple(unobservable))
+        return T, C + np.diag(held), ()
+    return kept, narrower + np.diag(held), tuple(unobservable)

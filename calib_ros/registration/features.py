@@ -192,9 +192,15 @@ class FeatureExtractor:
     def _with_semantics(
         self, features: FrameFeatures, frame: Frame, image: NDArray[np.uint8], semantics: FrameSemantics
     ) -> FrameFeatures:
+        """Features with semantic edges and weights of classes, as far as they are known. image: (h, w[, 3]) of the camera."""
+        points, levels, models = features.points, features.levels, class_models()
         edges = self.semantic_edges(semantics) if semantics.edges_of == OF_MASKS else None
-        out = with_semantics(features, image, edges, self.config, self.used, self.across)
-        models = class_models()
+        if points.label is not None:
+            points = replace(points, strength=points.strength * edge_weights(points.label))
+        if edges is not None:
+            focal = float(features.camera.K[0, 0])
+            levels = edge_levels(image, focal, edges, EDGE_SHARE, self.used, self.across)
+        out = replace(features, points=points, levels=levels, plain=features)
         if models is None or semantics.classes is None or frame.cloud.label is None:
             return out
         cloud = deskewed_frame(frame, self.config.motion).cloud
@@ -220,24 +226,6 @@ class FeatureExtractor:
         if (values.shape[1], values.shape[0]) == size:
             return values
         return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST if nearest else cv2.INTER_AREA))
-
-
-def with_semantics(
-    plain: FrameFeatures,
-    image: NDArray[np.uint8],
-    edges: Map | None,
-    config: Config,
-    used: NDArray[np.bool_] | None = None,
-    across: Map | None = None,
-) -> FrameFeatures:
-    """Features with semantic edges and weights of classes, as far as they are known. image: (h, w[, 3]) of plain.camera. edges:
-    (2, h, w) in 0..1 of masks in that image. used, across: see FeatureExtractor."""
-    points, levels = plain.points, plain.levels
-    if points.label is not None:
-        points = replace(points, strength=points.strength * edge_weights(points.label))
-    if edges is not None:
-        levels = edge_levels(image, float(plain.camera.K[0, 0]), edges, EDGE_SHARE, used, across)
-    return replace(plain, points=points, levels=levels, plain=plain)
 
 
 def views_of(features: Sequence[FrameFeatures]) -> list[Any]:

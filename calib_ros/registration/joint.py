@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_ros.arrays import Matrix, Transform
+from calib_ros.arrays import Transform
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import ESTIMATE
 from calib_ros.registration.features import FrameFeatures, at_time_offset, other_objective
@@ -46,11 +46,6 @@ class Optimised:
     seconds: float = 0.0
     stamping: Stamping | None = None
 
-    @property
-    def nearby(self) -> Sequence[Matrix]:
-        """Other optima (4, 4) that the search found near this one."""
-        return self.search.nearby if self.search is not None else ()
-
     def clocks(self, motion: MotionConfig) -> tuple[float, Effect | None]:
         """Standard deviation, s, of the clocks' offset; and its effect, if it is known."""
         if self.offset is None:
@@ -80,12 +75,19 @@ class JointSearch:
         return replace(found, objective=objective, T=objective.optimise(found.T, searched=True, progress=self.progress))
 
     def _at_any_offset(self, features: Sequence[FrameFeatures]) -> Optimised:
-        config, found = self.config, self._near(features)
-        if found.search is None or not estimates_offset(features, config) or not _move_apart(features, config):
+        config, period_s, found = self.config, self.config.motion.scan_period_s, self._near(features)
+        if found.search is None or not estimates_offset(features, config):
+            return found
+        twists = np.array([f.twist for f in features if f.twist is not None])
+        way = np.abs(twists - twists.mean(axis=0)).max(axis=0) * period_s
+        if way[:3].max() <= APART_RAD and way[3:].max() <= APART_M:
             return found
         tried, best, highest = 1, found, _z_score(found)
-        for seconds in (-config.motion.scan_period_s, config.motion.scan_period_s):
-            if _is_significant(highest, best, tried, config):
+        for seconds in (-period_s, period_s):
+            search = best.search
+            if search is None or highest >= UNDOUBTED_Z:
+                break
+            if p_value(highest, search.decoy_z, tried * search.rounds) <= config.refine.max_p_value:
                 break
             tried += 1
             found = self._near(_moved(features, seconds))
@@ -150,18 +152,5 @@ def _moved(features: Sequence[FrameFeatures], seconds: float) -> list[FrameFeatu
     return [at_time_offset(f, seconds) for f in features]
 
 
-def _move_apart(features: Sequence[FrameFeatures], config: Config) -> bool:
-    """Would a scan period move the frames' own optima apart?"""
-    twists = np.array([f.twist for f in features if f.twist is not None])
-    way = np.abs(twists - twists.mean(axis=0)).max(axis=0) * config.motion.scan_period_s
-    return bool(way[:3].max() > APART_RAD or way[3:].max() > APART_M)
-
-
 def _z_score(found: Optimised) -> float:
     return null_distribution(found.objective.edges.score, found.T).z_score
-
-
-def _is_significant(z_score: float, found: Optimised, tried: int, config: Config) -> bool:
-    if found.search is None or z_score >= UNDOUBTED_Z:
-        return True
-    return p_value(z_score, found.search.decoy_z, tried * found.search.rounds) <= config.refine.max_p_value

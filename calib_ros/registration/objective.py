@@ -16,7 +16,7 @@ from calib_ros.config import Config
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.classes import consistency_score
 from calib_ros.registration.features import FrameFeatures, other_objective, views_of
-from calib_ros.registration.progress import SILENT, Observer, Progress
+from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.score.point_score import MARGIN, PointScore, SmoothScore
@@ -99,8 +99,8 @@ def search_margin(camera: Camera, box: SearchBox | None) -> float:
 class FastObjective:
     """The method's own objective: oriented edges of sparse points (FastScore).
 
-    features: of one camera. T_prior: (4, 4), decides which points are near the image. constraints: None = none. atlas: of the
-    edge maps, if there is one already. observer: watches all evaluations. TooFewFeaturesError with too few points near the image.
+    features: of one camera. T_prior: (4, 4), decides which points are near the image. atlas: of the edge maps, if there is one
+    already. TooFewFeaturesError with too few points near the image.
     """
 
     systematic_error = SYSTEMATIC_ERROR
@@ -112,13 +112,11 @@ class FastObjective:
         features: Sequence[FrameFeatures],
         T_prior: Transform,
         config: Config,
-        constraints: PoseConstraints | None = None,
+        constraints: PoseConstraints,
         atlas: Atlas | None = None,
-        observer: Observer | None = None,
     ) -> None:
         self.features, self.config = list(features), config
-        self.constraints = constraints or PoseConstraints(unlimited(T_prior))
-        self.observer = observer
+        self.constraints = constraints
         self.score: PointScore = self._score_near(T_prior, atlas)
         self._excluded: list[int] = []
 
@@ -136,7 +134,7 @@ class FastObjective:
     def search(self, T: Transform, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
         """See search.search; with the points that may come into view anywhere in the box."""
         margin = search_margin(self.score.camera, box)
-        result = global_search(
+        return global_search(
             self._score_near(T, self.score.atlas, margin),
             T,
             box,
@@ -147,14 +145,17 @@ class FastObjective:
             progress.of("search"),
             consistency_score(views_of(self.features)),
         )
-        self._reached(result.T)
-        return result
 
     def optimise(self, T: Transform, searched: bool = False, progress: Progress = SILENT) -> Transform:
         """Level by level, from each of NEAR unless after a search: the coarser one lifts successes from 14 to 19 of 20 on KITTI,
         but a scene seen again and again may have its optimum elsewhere there."""
         few = self.score.subset(MIDDLE_POINTS, np.random.default_rng(self.config.search.seed))
-        ends = [self._coarse_levels(few, first, T) for first in ((AFTER_SEARCH,) if searched else NEAR)]
+        ends = []
+        for first in (AFTER_SEARCH,) if searched else NEAR:
+            end = T
+            for level in range(first, self.score.n_levels - 1):  # the coarser of them with a few points
+                end = self._level(few if level <= LAST_OF_FEW else self.score, level, end)
+            ends.append(end)
         T = max(ends, key=lambda end: penalised(self, end))
         # Which points are near the image, and so their weights, must not depend on where the optimisation began.
         self.score = self._score_near(T, self.score.atlas)
@@ -179,24 +180,12 @@ class FastObjective:
 
     def _score_near(self, T: Transform, atlas: Atlas | None, margin: float | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T; see FastScore."""
-        return FastScore(self.features, T, self.config.score, margin, atlas, self.observer)
-
-    def _coarse_levels(self, few: PointScore, first: int, T: Transform) -> Transform:
-        """From level `first` up to the last but one; the coarser of them with a few points."""
-        for level in range(first, self.score.n_levels - 1):
-            T = self._level(few if level <= LAST_OF_FEW else self.score, level, T)
-        return T
+        return FastScore(self.features, T, self.config.score, margin, atlas)
 
     def _level(self, score: PointScore, level: int, T: Transform) -> Transform:
         """The optimum on one level."""
         tolerance = TOLERANCE_DEG if level == score.n_levels - 1 else COARSE_TOLERANCE_DEG
-        T = optimise_smooth(score.at(level), T, FIRST_STEP_DEG / 2**level, self.config, self.constraints, tolerance)
-        self._reached(T)
-        return T
-
-    def _reached(self, T: Transform) -> None:
-        if self.observer is not None:
-            self.observer.reached(T)
+        return optimise_smooth(score.at(level), T, FIRST_STEP_DEG / 2**level, self.config, self.constraints, tolerance)
 
 
 def optimise_smooth(
@@ -223,30 +212,11 @@ def trust_region(box: SearchBox | None = None) -> tuple[float, float]:
     return max(BEYOND_BOX * deg, REFINEMENT_DEG), max(BEYOND_BOX * m, REFINEMENT_M)
 
 
-def seen_by_rows(features: FrameFeatures, T: Transform, camera: Camera, readout_s: float) -> FrameFeatures:
-    """Features whose points are where the rows of the image see them at T_camera_lidar (4, 4); the same where the shutter is
-    global, the LiDAR's velocity is not known, or another objective keeps points of its own. camera: of the recorded images.
-
-    The row t seconds after the middle one sees a static point at exp(-twist t) p in the LiDAR frame. Which row depends on
-    the extrinsic, but weakly: that of the start tells it well enough for a search, its result for the final optimum.
-    """
-    points = features.points
-    if not readout_s or features.twist is None or features.own is not None:
-        return features
-    row = camera.project(se3.transform(T, points.xyz))[0][:, 1]
-    share = (np.clip(row, 0, camera.height - 1) + 0.5) / camera.height - 0.5
-    time = np.nan_to_num(share) * readout_s  # beside the image as on its border, behind it as in its middle
-    return replace(features, points=replace(points, xyz=moved(points.xyz, features.twist, -time).astype(np.float32)))
-
-
 class ObjectiveMaker:
-    """Makes the configured objective of frames of one camera, as they were recorded; the maps of the last frames are kept.
+    """Makes the configured objective of frames of one camera, as they were recorded; the maps of the last frames are kept."""
 
-    observer: gets every evaluation.
-    """
-
-    def __init__(self, config: Config, camera: Camera, observer: Observer | None) -> None:
-        self.config, self._camera, self.observer = config, camera, observer
+    def __init__(self, config: Config, camera: Camera) -> None:
+        self.config, self._camera = config, camera
         self._last: Atlas | None = None  # whose memory is lent to the next one; other threads meanwhile lay out their own
 
     def __call__(
@@ -269,8 +239,8 @@ class ObjectiveMaker:
             atlas = Atlas([f.levels for f in features], features[0].camera, last)
         seen = self._seen_by_rows(features, T_prior if T_rows is None else T_rows)
         if other is None:
-            return FastObjective(seen, T_prior, config, constraints, atlas, self.observer)
-        edges = FastObjective(seen, T_prior, self._of_edges, constraints, atlas, self.observer)
+            return FastObjective(seen, T_prior, config, constraints, atlas)
+        edges = FastObjective(seen, T_prior, self._of_edges, constraints, atlas)
         objective: Objective = other(edges, T_prior, config)
         return objective
 
@@ -279,10 +249,10 @@ class ObjectiveMaker:
 
         anchor: None = constraints do not count. The maps that are kept are left to estimates: this is for another thread.
         """
-        config = self.config
-        constraints = pose_constraints(T_prior if anchor is None else anchor, config.constraints, max(len(features), 1))
         if anchor is None:
             constraints = PoseConstraints(unlimited(T_prior))
+        else:
+            constraints = pose_constraints(anchor, self.config.constraints, max(len(features), 1))
         constraints = constraints.within_trust_region(T_prior, *trust_region())
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
         plain = [(f.plain or f).edges_only for f in features]
@@ -295,7 +265,21 @@ class ObjectiveMaker:
         return config if other is None else replace(config, refine=replace(config.refine, optimizer="auto"))
 
     def _seen_by_rows(self, features: Sequence[FrameFeatures], T: Transform) -> list[FrameFeatures]:
-        return [seen_by_rows(f, T, self._camera, self.config.motion.readout_s) for f in features]
+        """Features whose points are where the rows of the image see them at T_camera_lidar (4, 4); the same where the shutter is
+        global, the LiDAR's velocity is not known, or another objective keeps points of its own.
+
+        The row t seconds after the middle one sees a static point at exp(-twist t) p in the LiDAR frame. Which row depends on
+        the extrinsic, but weakly: that of the start tells it well enough for a search, its result for the final optimum.
+        """
+        readout_s, height, out = self.config.motion.readout_s, self._camera.height, list(features)
+        for k, f in enumerate(features):
+            if not readout_s or f.twist is None or f.own is not None:
+                continue
+            row = self._camera.project(se3.transform(T, f.points.xyz))[0][:, 1]
+            share = (np.clip(row, 0, height - 1) + 0.5) / height - 0.5
+            time = np.nan_to_num(share) * readout_s  # beside the image as on its border, behind it as in its middle
+            out[k] = replace(f, points=replace(f.points, xyz=moved(f.points.xyz, f.twist, -time).astype(np.float32)))
+        return out
 
     def keep_maps(self, objective: Objective) -> None:
         """Keep the maps of an objective that is done with: the next one may be of mostly the same frames."""

@@ -1,13 +1,9 @@
-"""Watching an estimate: progress for whoever waits for it, and an observer for studies of the optimisation."""
+"""Progress of an estimate, for whoever waits for it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 Callback = Callable[[str, float], None]
 """Takes the name of a stage and the share of it that is done, 0..1. It may raise, which ends the estimate."""
@@ -39,16 +35,3 @@ class Progress:
 
 
 SILENT = Progress()
-
-
-class Observer(Protocol):
-    """Watches an optimisation from the thread of the estimate, where ``search.threads`` is not used, and does not change it."""
-
-    def evaluated(self, count: int) -> None:
-        """The score of so many extrinsics has been computed."""
-
-    def linearised(self) -> None:
-        """The slope of the score and its Gauss-Newton matrix have been computed at one extrinsic."""
-
-    def reached(self, T: NDArray[np.float64]) -> None:
-        """The search, or one level of the optimisation, has ended at T_camera_lidar (4, 4)."""

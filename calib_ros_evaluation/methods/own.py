@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.fast_score import FastScore
-from calib_ros.registration.score.point_score import LevelScore
+from calib_ros.registration.score.point_score import LevelScore, PointScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.method import Extracting, Outcome
 
@@ -42,28 +43,34 @@ class Own(Extracting):
             self.score(features, T)
         except TooFewFeaturesError as error:
             return Outcome(T, 0, str(error))
-        count = _Count()
-        calibrator = Calibrator(features[0].camera, self._extractors.config, self._segmentation, count)
-        if calibrator.classes_in_doubt_only:
-            plain = [f.plain or f for f in features]
-            result = calibrator.estimate_in_doubt(plain, lambda: (features, ()), T, reach)
-        else:
-            result = calibrator.estimate(features, T, reach)
-        return Outcome(result.T_camera_lidar, count.evaluations, "" if result.converged else result.reason)
+        calibrator = Calibrator(features[0].camera, self._extractors.config, self._segmentation)
+        with counted() as count:
+            if calibrator.classes_in_doubt_only:
+                plain = [f.plain or f for f in features]
+                result = calibrator.estimate_in_doubt(plain, lambda: (features, ()), T, reach)
+            else:
+                result = calibrator.estimate(features, T, reach)
+        return Outcome(result.T_camera_lidar, count[0], "" if result.converged else result.reason)
 
 
-class _Count:
-    """An observer that counts evaluations."""
+@contextmanager
+def counted() -> Iterator[list[int]]:
+    """Counts evaluations of fast scores meanwhile: a list of their number."""
+    count = [0]
 
-    evaluations = 0
+    def counting(name: str, cost: int) -> Callable[..., Any]:
+        def call(score: FastScore, transforms: Matrix, *args: Any) -> Any:
+            count[0] += cost * (len(transforms) if transforms.ndim == 3 else 1)
+            return getattr(PointScore, name)(score, transforms, *args)
 
-    def evaluated(self, count: int) -> None:
-        """See Observer."""
-        self.evaluations += count
+        return call
 
-    def linearised(self) -> None:
-        """See Observer."""
-        self.evaluations += LINEARISATION
-
-    def reached(self, T: Matrix) -> None:
-        """See Observer."""
+    slopes = dict.fromkeys(("jacobian", "linearise", "gradients"), LINEARISATION)
+    costs = {**dict.fromkeys(("sample", "values", "frame_values"), 1), **slopes}
+    for name, cost in costs.items():
+        setattr(FastScore, name, counting(name, cost))
+    try:
+        yield count
+    finally:
+        for name in costs:
+            delattr(FastScore, name)

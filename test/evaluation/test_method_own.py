@@ -18,7 +18,7 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
-from calib_ros_evaluation.methods.own import LINEARISATION, Own, _Count
+from calib_ros_evaluation.methods.own import LINEARISATION, Own, counted
 from calib_ros_evaluation.methods.registry import methods
 from calib_ros_evaluation.methods.thesis import Thesis
 from calib_ros_thesis.score import ThesisScore
@@ -66,23 +66,25 @@ def test_score_of_ours_is_the_finest_fast_score(scene: Scene):
 
 def test_evaluations_are_counted_one_by_one(scene: Scene):
     score = FastScore(scene.features, scene.truth, Config().score)
-    count = _Count()
-    counted = FastScore(scene.features, scene.truth, Config().score, observer=count)
-    some = counted.subset(500, np.random.default_rng(0))
+    some = score.subset(500, np.random.default_rng(0))
     many = np.stack([scene.truth] * 7)
-    for call, more in (
-        (lambda: counted.at(0).value(scene.truth), 1),
-        (lambda: counted.at(-1).linearise(scene.truth), LINEARISATION),
-        (lambda: some.at(0).value(scene.truth), 1),
-        (lambda: some.values(many, 2), 7),
-        (lambda: counted.values(many, 2), 7),
-        (lambda: counted.frame_values(many, 2), 7),
-        (lambda: counted.frame_scores(scene.truth), 1),
-    ):
-        before = count.evaluations
-        call()
-        assert count.evaluations - before == more
-    assert counted.at(-1).value(scene.truth) == score.at(-1).value(scene.truth)
+    with counted() as count:
+        for call, more in (
+            (lambda: score.at(0).value(scene.truth), 1),
+            (lambda: score.at(-1).linearise(scene.truth), LINEARISATION),
+            (lambda: some.at(0).value(scene.truth), 1),
+            (lambda: some.values(many, 2), 7),
+            (lambda: score.values(many, 2), 7),
+            (lambda: score.frame_values(many, 2), 7),
+            (lambda: score.frame_scores(scene.truth), 1),
+        ):
+            before = count[0]
+            call()
+            assert count[0] - before == more
+        value = score.at(-1).value(scene.truth)
+    before = count[0]
+    assert score.at(-1).value(scene.truth) == value
+    assert count[0] == before
 
 
 def test_ours_refuses_images_that_do_not_belong_to_the_scans(scene: Scene):

@@ -10,7 +10,7 @@ import numpy as np
 from calib_ros.config import Config
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.objective import FastObjective
-from calib_ros.registration.search.constraints import PoseConstraints
+from calib_ros.registration.search.constraints import PoseConstraints, unlimited
 from calib_ros_thesis.objective import ThesisObjective
 
 
@@ -19,4 +19,4 @@ def thesis_objective(
 ) -> ThesisObjective:
     """features: extracted for it."""
     of_edges = replace(config, refine=replace(config.refine, optimizer="auto"))
-    return ThesisObjective(FastObjective(features, T, of_edges, constraints), T, config)
+    return ThesisObjective(FastObjective(features, T, of_edges, constraints or PoseConstraints(unlimited(T))), T, config)

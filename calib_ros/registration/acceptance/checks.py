@@ -38,7 +38,7 @@ from calib_ros.registration.objective import Objective, penalised, trust_region
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, UNDOUBTED_Z, null_extrinsics, p_value
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.constraints import NEARLY, SearchBox
 from calib_ros.registration.search.search import SearchResult, search_decoy
 from calib_ros.result import Evidence, RefusalCode, Result
 
@@ -78,22 +78,30 @@ class Acceptance:
 
     def refusal(self, found: Estimate, progress: Progress) -> Refusal | None:
         """Why the extrinsic of an estimate is not to be used: the first check that fails."""
-        objective, T, start, limits = found.objective, found.pose.T, found.start, found.objective.constraints.limits
+        objective, T, start, limits = found.objective, found.T, found.start, found.objective.constraints.limits
         if penalised(objective, T) < penalised(objective, start):
             return worse_than_start(objective.value(T), objective.value(start))
         wrong = self._check_intrinsics_and_clocks(found)
         if wrong is not None:
             return wrong
         reached, region = found.alignment.T, limits.trust_region
-        if region is not None and limits.at_trust_region(reached):  # at its end the score still rises
-            off = se3.error(found.initial, reached)
-            return too_far_from_start(*off, float(np.rad2deg(region.half[0])), float(region.half[3]))
+        # At its end the score still rises: no optimum, or one that the start does not justify.
+        if region is not None:
+            moved = np.abs(se3.log(reached @ se3.inverse(region.T)))
+            if (moved >= NEARLY * region.half)[limits.open_axes].any():
+                off = se3.error(found.initial, reached)
+                return too_far_from_start(*off, float(np.rad2deg(region.half[0])), float(region.half[3]))
         wrong = self._check_match(found)
         # Only of a search: a refinement has a start to rely on, and is fused with it. What intrinsics and clocks leave open is
         # not asked: more scenes would not help.
         if wrong is None and self.searched and objective.agreement is None:
-            wrong = check_uncertainty(found.pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
-        return wrong or _check_agreement(objective, T, progress)
+            wrong = check_uncertainty(found.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
+        if wrong is None and objective.agreement is not None:
+            # If the edges, begun at the optimum of another objective, end far away, one of the two is wrong.
+            deg, m = se3.error(T, objective.edges.optimise(T, False, progress))
+            if not (deg <= objective.agreement[0] and m <= objective.agreement[1]):
+                return objectives_disagree(deg, m)
+        return wrong
 
     def _check_match(self, found: Estimate) -> Refusal | None:
         """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
@@ -147,15 +155,6 @@ class Acceptance:
         if too_far or unobservable or offset.suspected(motion):
             return wrong_times(optimised.seconds if unobservable else offset.seconds, offset.gain)
         return None
-
-
-def _check_agreement(objective: Objective, T: Transform, progress: Progress) -> Refusal | None:
-    """If the edges, begun at the optimum T (4, 4) of another objective, end far away, one of the two is wrong."""
-    if objective.agreement is None:
-        return None
-    other = objective.edges.optimise(T, False, progress)
-    deg, m = se3.rotation_error_deg(T, other), se3.translation_error_m(T, other)
-    return None if deg <= objective.agreement[0] and m <= objective.agreement[1] else objectives_disagree(deg, m)
 
 
 def leaves_doubt(result: Result) -> bool:

@@ -10,12 +10,17 @@ from calib_ros.registration.covariance import Direction
 from calib_ros.result import RefusalCode
 
 # What a Result notes whether or not it is refused.
+LEFT_OUT = (
+    "left out, matching no better than chance where the others match: {}; wrongly paired, a covered lens, or a scene that shows "
+    "nothing"
+)
+KEPT = "not shown by the scenes, and kept from the start: {}"
 NO_INTENSITY = "the cloud has no intensity: reflectivity edges are off"
 ONE_FRAME = "one frame only: a direction that it does not show may be wrong; use more scenes"
 AS_RAW = "give --no-rectified, or image_is_rectified: false to the node"
 # And where intrinsics may be at fault, of a Camera.said_rectified.
 MAYBE_RAW = f"the images are taken for rectified, but camera_info has a distortion: if straight lines are bent in them, {AS_RAW}"
-_SUSPECT_INTRINSICS = (RefusalCode.WRONG_INTRINSICS, RefusalCode.NOT_SIGNIFICANT, RefusalCode.LOW_SCORE)
+SUSPECT_INTRINSICS = (RefusalCode.WRONG_INTRINSICS, RefusalCode.NOT_SIGNIFICANT, RefusalCode.LOW_SCORE)
 
 
 @dataclass(frozen=True)
@@ -28,11 +33,6 @@ class Refusal:
 
     def __str__(self) -> str:
         return self.text
-
-    @property
-    def suspects_intrinsics(self) -> bool:
-        """Whether a wrong camera may be the reason."""
-        return self.code in _SUSPECT_INTRINSICS
 
 
 def _refusal(code: RefusalCode, text: str, **figures: float) -> Refusal:
@@ -142,24 +142,6 @@ def wrong_times(seconds: float, deviations: float) -> Refusal:
         "motion.time_offset_s"
     )
     return _refusal(RefusalCode.WRONG_TIMES, text, seconds=seconds, deviations=deviations)
-
-
-def outliers_note(names: Sequence[str]) -> str:
-    """Which frames were rejected as outliers."""
-    return (
-        f"left out, matching no better than chance where the others match: {', '.join(names)}; wrongly paired, a covered lens, "
-        "or a scene that shows nothing"
-    )
-
-
-def unobservable_note(directions: Sequence[Direction]) -> str:
-    """Which directions of the start were kept."""
-    return f"not shown by the scenes, and kept from the start: {', '.join(map(str, directions))}"
-
-
-def semantic_note(with_classes: int, frames: int, tried: int) -> str:
-    """How a first guess from the classes came about."""
-    return f"first guess from the classes of {with_classes} of {frames} frames; registered from {tried} of its hypotheses"
 
 
 def joined(parts: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
-from calib_ros.registration.covariance import noise_covariance, noise_level, share_of_weight
+from calib_ros.registration.covariance import inverse_curvature, noise_level, share_of_weight
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
@@ -39,17 +39,15 @@ def disagreement(score: PointScore, T: Transform, limits: Limits) -> float:
     if not len(axes):
         return 1.0
     # A half of the weight has twice the noise of all.
-    level = part.n_levels - 1
-    bread = noise_covariance(part, T, level, axes, noise=1.0)
-    noise = 2 * noise_level(part, T, level, bread, axes)
+    noise = 2 * noise_level(part, T, inverse_curvature(part, T, axes), axes)
     systematic = np.diag((2 * SYSTEMATIC_ERROR[axes]) ** 2)
     factors = []
     for half in _halvings(part, T):
         both = [part.select(np.flatnonzero(half == k)) for k in (False, True)]
         ends = [T, T]
-        for own_level, (k, own) in product(LEVELS, enumerate(both)):
-            ends[k] = levenberg_marquardt(own.at(own_level), ends[k], limits=limits, tolerance_deg=0.005, near=True)[0]
-        expected = sum((noise_covariance(own, T, level, axes, noise) for own in both), systematic)
+        for level, (k, own) in product(LEVELS, enumerate(both)):
+            ends[k] = levenberg_marquardt(own.at(level), ends[k], limits=limits, tolerance_deg=0.005, near=True)[0]
+        expected = sum((noise * inverse_curvature(own, T, axes) for own in both), systematic)
         gap = se3.log(ends[0] @ se3.inverse(ends[1]))[axes]
         factors.append(float(gap @ np.linalg.solve(expected, gap)) / len(axes))
     return float(np.minimum(factors, MOST).mean()) if factors else 1.0

@@ -7,18 +7,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.motion_guess.hand_eye import CLOCK_S, SAME_DEG, Fit, HandEye, distinct
 from calib_ros.registration.motion_guess.tracks import Run, Tracks, lidar_runs, tracked_points
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, SearchBox
-
-Matrix = NDArray[np.float64]
 
 LEAST_M, LEAST_RAD = 0.5, np.deg2rad(3.0)  # of travel or of turning; tracked points and aligned scans wander a tenth of it
 MIN_TRACKS, MIN_PAIRS = 100, 3
@@ -86,7 +84,15 @@ def motion_guess(frames: Sequence[Frame], extract: FeatureExtractor, seed: int =
             "stamps do not tell the motion"
         )
     runs, reasons = lidar_runs(frames, extract.config.motion)
-    _check_motion(runs, reasons)
+    if not runs:
+        why = f" ({reasons[0]})" if reasons else ""
+        raise TooFewFeaturesError(f"the LiDAR's motion is known between no two frames{why}: give frames that follow each other")
+    travelled, turned = _path(runs)
+    if travelled < LEAST_M and turned < LEAST_RAD:
+        raise TooFewFeaturesError(
+            f"the vehicle stands still ({travelled:.2f} m, {np.rad2deg(turned):.1f} deg in all frames): a guess from motion "
+            "needs a few seconds of driving, best with a bend"
+        )
     return guess_from_tracks(tracked_points(frames, runs, extract), runs, seed)
 
 
@@ -103,9 +109,19 @@ def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> Mot
         )
     solver = HandEye(tracks, runs, seed)
     fits = solver.hypotheses(HYPOTHESES)
-    _check_agreement(fits[0], solver.turn())
+    motions = solver.motions()
+    # Root mean square about every axis between two pictures.
+    turns = np.sqrt((Rotation.from_matrix(motions[:, :3, :3]).as_rotvec() ** 2).mean())
+    wrong, turn = np.rad2deg([fits[0].turn_error, float(turns)])
+    if fits[0].unexplained > MAX_UNEXPLAINED or (wrong > MAX_TURN_ERROR_DEG and wrong > MAX_TURN_SHARE * turn):
+        raise TooFewFeaturesError(
+            f"the images do not move as the LiDAR does (turns {wrong:.2f} deg apart, of {turn:.2f} deg; "
+            f"{fits[0].unexplained:.0%} of the way of points unexplained): check that images and clouds are of the same time and "
+            "vehicle, and the intrinsics"
+        )
     hidden = _hidden_axes(fits[0].covariance[:3, :3], HIDDEN_DEG)
-    travel = fits[0].R @ _travel(solver)
+    moved = -motions[:, :3, 3]  # the mean direction in which the LiDAR moves; of length 1 if it is always the same
+    travel = fits[0].R @ np.asarray(moved.sum(axis=0) / max(float(np.linalg.norm(moved, axis=1).sum()), 1e-9))
     fits = [_with_upright(solver, fit) for fit in fits]
     covariance = fits[0].covariance[:3, :3] + np.deg2rad(FLOOR_DEG) ** 2 * np.eye(3)
     if len(_hidden_axes(covariance, LOST_DEG)):
@@ -122,40 +138,11 @@ def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> Mot
     return MotionGuess(hypotheses, covariance, hidden, offset, sigma if known else None, note)
 
 
-def _check_motion(runs: Sequence[Run], reasons: Sequence[str]) -> None:
-    """TooFewFeaturesError where the LiDAR's motion is unknown, or too small."""
-    if not runs:
-        why = f" ({reasons[0]})" if reasons else ""
-        raise TooFewFeaturesError(f"the LiDAR's motion is known between no two frames{why}: give frames that follow each other")
-    travelled, turned = _path(runs)
-    if travelled < LEAST_M and turned < LEAST_RAD:
-        raise TooFewFeaturesError(
-            f"the vehicle stands still ({travelled:.2f} m, {np.rad2deg(turned):.1f} deg in all frames): a guess from motion "
-            "needs a few seconds of driving, best with a bend"
-        )
-
-
-def _check_agreement(fit: Fit, turn: float) -> None:
-    """TooFewFeaturesError where the pictures do not move as the LiDAR does. turn: rad about every axis between two pictures."""
-    wrong, turn = np.rad2deg([fit.turn_error, turn])
-    if fit.unexplained > MAX_UNEXPLAINED or (wrong > MAX_TURN_ERROR_DEG and wrong > MAX_TURN_SHARE * turn):
-        raise TooFewFeaturesError(
-            f"the images do not move as the LiDAR does (turns {wrong:.2f} deg apart, of {turn:.2f} deg; {fit.unexplained:.0%} of "
-            "the way of points unexplained): check that images and clouds are of the same time and vehicle, and the intrinsics"
-        )
-
-
 def _path(runs: Sequence[Run]) -> tuple[float, float]:
     """Largest distance in m and turn in rad of the LiDAR from where a run began."""
     poses = np.concatenate([run.poses for run in runs])
     turns = Rotation.from_matrix(poses[:, :3, :3]).magnitude()
     return float(np.linalg.norm(poses[:, :3, 3], axis=1).max()), float(turns.max())
-
-
-def _travel(solver: HandEye) -> Matrix:
-    """Mean direction (3,) in which the LiDAR moves, in its own frame; length 1 if it is always the same."""
-    moved = -solver.motions()[:, :3, 3]
-    return np.asarray(moved.sum(axis=0) / max(float(np.linalg.norm(moved, axis=1).sum()), 1e-9))
 
 
 def _hidden_axes(covariance: Matrix, limit_deg: float) -> Matrix:
@@ -171,21 +158,16 @@ def _with_upright(solver: HandEye, fit: Fit) -> Fit:
         return fit
     hidden = _hidden_axes(own, LOST_DEG)
     R, up = fit.R, UPRIGHT[0]
-    if len(hidden):
-        R = _turned_upright(R, hidden[0])
+    if len(hidden):  # turned about it so that the LiDAR's z axis points up in the image as far as it can
+        axis, z = hidden[0], R[:, 2]
+        angle = np.arctan2(up @ np.cross(axis, z), up @ z - (axis @ z) * (axis @ up))
+        R = np.asarray(Rotation.from_rotvec(angle * axis).as_matrix() @ R)
     else:
         up = UPRIGHT[np.argmax(UPRIGHT @ R[:, 2])]
         reach = np.deg2rad(SIGMAS * np.hypot(UPRIGHT_DEG, WEAK_DEG)) + SIGMAS * np.sqrt(np.linalg.eigvalsh(own)[-1])
         if np.arccos(np.clip(up @ R[:, 2], -1, 1)) > reach:
             return fit
     return solver.fit(R, (up, np.deg2rad(UPRIGHT_DEG)))
-
-
-def _turned_upright(R: Matrix, axis: Matrix) -> Matrix:
-    """R (3, 3) turned about an axis (3,) of the camera so that the LiDAR's z axis points up in the image as far as it can."""
-    z, up = R[:, 2], UPRIGHT[0]
-    angle = np.arctan2(up @ np.cross(axis, z), up @ z - (axis @ z) * (axis @ up))
-    return np.asarray(Rotation.from_rotvec(angle * axis).as_matrix() @ R)
 
 
 def _note(runs: Sequence[Run], covariance: Matrix, hidden: Matrix, travel: Matrix, offset: float | None, sigma: float) -> str:

@@ -12,14 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.registration.initial_guess import rotation_distance_deg
 from calib_ros.registration.motion_guess.tracks import Run, Tracks
-
-Matrix = NDArray[np.float64]
 
 NEAREST_M = 0.5  # nothing that can be tracked is nearer
 NOISE_PX = 0.3  # of a tracked point, at least
@@ -58,21 +56,6 @@ class Fit:
     turn_error: float
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """R (3, 3), centre (3,), clock, and the errors (m, 6) of the LiDAR's motion between the pictures of every pair."""
-
-    R: Matrix
-    centre: Matrix
-    clock: float
-    errors: Matrix
-
-    def moved(self, step: Matrix, errors: Matrix) -> _State:
-        """After a step (7,), with steps (m, 6) of the errors."""
-        clock = float(np.clip(self.clock + step[6], CLOCKS_S[0], CLOCKS_S[-1]))
-        return _State(Rotation.from_rotvec(step[:3]).as_matrix() @ self.R, self.centre + step[3:6], clock, self.errors + errors)
-
-
 Errors = Callable[[Matrix], tuple[Matrix, Matrix]]  # steps (m, 6) of the errors that belong to a step (7,), and their variances
 
 
@@ -93,10 +76,6 @@ class HandEye:
                 out[own] = run.relative(t.start[own] + clock_s, t.end[own] + clock_s)
         return out
 
-    def turn(self) -> float:
-        """Root mean square of the LiDAR's turn about every axis between the pictures of a pair, rad."""
-        return float(np.sqrt((Rotation.from_matrix(self.motions()[:, :3, :3]).as_rotvec() ** 2).mean()))
-
     def hypotheses(self, limit: int) -> list[Fit]:
         """Rotations that explain the tracks, best first: local optima of the robust cost over all rotations, at most `limit`."""
         rng = np.random.default_rng(self._seed)
@@ -113,44 +92,44 @@ class HandEye:
         plausible = [k for k in distinct(refined, costs, SAME_DEG) if costs[k] <= MAX_COST_RATIO * costs.min()]
         fits = [self.fit(refined[k]) for k in plausible[:limit]]
         smallest = min(fit.scale for fit in fits)
-        fits = [replace(fit, cost=self.cost(fit, smallest)) for fit in fits]
+        for k, fit in enumerate(fits):
+            r = _residuals(fit.R, fit.centre, self.motions(fit.clock_s), self.tracks)
+            fits[k] = replace(fit, cost=_cost(r, smallest))
         order = distinct(np.array([f.R for f in fits]), np.array([f.cost for f in fits]), SAME_DEG)
         return [fits[k] for k in order]
-
-    def cost(self, fit: Fit, scale: float) -> float:
-        """Mean robust cost at a scale (rad)."""
-        return _cost(_residuals(fit.R, fit.centre, self.motions(fit.clock_s), self.tracks), scale)
 
     def fit(self, R: Matrix, upright: tuple[Matrix, float] | None = None) -> Fit:
         """The optimum next to a rotation (3, 3) in rotation, centre, clocks, and the errors of the LiDAR's motion, which are
         eliminated pair by pair (Schur complement). upright: a prior, the LiDAR's z axis (3,) in the camera and its sigma, rad."""
         prior = np.r_[np.zeros(3), np.full(3, CENTRE_M**-2.0), CLOCK_S**-2.0]
-        state = _State(R, np.zeros(3), self._clock(R), np.zeros((len(self.tracks.start), 6)))
+        centre, clock, wrong = np.zeros(3), self._clock(R), np.zeros((len(self.tracks.start), 6))
         sigma = np.r_[MOTION_RAD[0], MOTION_M[0]]
         for _ in range(LAST_ROUNDS):
-            r, J = self._linear(state)
+            r, J = self._linear(R, centre, clock, wrong)
             scale = _scale(r, self._floor)
             weight = 1 / (scale**2 + (r * r).sum(axis=1))
-            reduced, gradient, errors_at = self._reduced(r, J, weight, state.errors, np.repeat(sigma**-2.0, 3))
+            reduced, gradient, errors_at = self._reduced(r, J, weight, wrong, np.repeat(sigma**-2.0, 3))
             information = reduced + np.diag(prior)
-            gradient[3:] += prior[3:] * np.r_[state.centre, state.clock]
+            gradient[3:] += prior[3:] * np.r_[centre, clock]
             if upright is not None:
-                d, G = _upright(state.R, *upright)
+                up, sigma_up = upright  # where the LiDAR's z axis points to in the camera
+                d, G = (R[:, 2] - up) / sigma_up, -se3.skew(R[:, 2]) / sigma_up
                 information[:3, :3] += G.T @ G
                 gradient[:3] += G.T @ d
             step = -np.linalg.solve(information + 1e-6 * np.eye(7), gradient)
             step *= min(1.0, 0.3 / max(float(np.linalg.norm(step[:3])), 1e-9))
             errors, spread = errors_at(step)
-            state = state.moved(step, errors)
+            R, centre, wrong = Rotation.from_rotvec(step[:3]).as_matrix() @ R, centre + step[3:6], wrong + errors
+            clock = float(np.clip(clock + step[6], CLOCKS_S[0], CLOCKS_S[-1]))
             # As expectation maximisation has it: the spread of the errors found, and what is left open of each.
-            found = np.sqrt([np.mean(state.errors[:, s] ** 2 + spread[:, s]) for s in (slice(0, 3), slice(3, 6))])
+            found = np.sqrt([np.mean(wrong[:, s] ** 2 + spread[:, s]) for s in (slice(0, 3), slice(3, 6))])
             sigma = np.maximum(found, [MOTION_RAD[1], MOTION_M[1]])
             if np.abs(step[:3]).max() < CONVERGED_RAD:
                 break
         covariance = OVERLAP * np.linalg.inv(information + 1e-6 * np.eye(7))
-        measured = _residuals(state.R, state.centre, self.motions(state.clock), self.tracks)
+        measured = _residuals(R, centre, self.motions(clock), self.tracks)
         unexplained = float(np.median(np.linalg.norm(measured, axis=1)) / np.median(self._flow(self.tracks)))
-        return Fit(state.R, state.centre, state.clock, _cost(r, scale), scale, covariance, unexplained, float(sigma[0]))
+        return Fit(R, centre, clock, _cost(r, scale), scale, covariance, unexplained, float(sigma[0]))
 
     def _reduced(self, r: Matrix, J: Matrix, weight: Matrix, errors: Matrix, precision: Matrix) -> tuple[Matrix, Matrix, Errors]:
         """Normal equations of residuals r (n, 2), J (n, 2, 13), without the errors (m, 6) of the pairs, of precision (6,)."""
@@ -195,18 +174,17 @@ class HandEye:
                 break
         return R
 
-    def _linear(self, state: _State) -> tuple[Matrix, Matrix]:
+    def _linear(self, R: Matrix, c: Matrix, clock: float, errors: Matrix) -> tuple[Matrix, Matrix]:
         """Residuals (n, 2) rad and their derivatives (n, 2, 13) by rotation, centre, clock, and error of the pair's motion."""
-        R, c, tracks = state.R, state.centre, self.tracks
-        known = self.motions(state.clock)
-        motions = se3.exp_many(state.errors) @ known
+        tracks, known = self.tracks, self.motions(clock)
+        motions = se3.exp_many(errors) @ known
         r = _residuals(R, c, motions, tracks)
         moved = [_residuals(turn @ R, c, motions, tracks) for turn in _TURNS]
         moved += [_residuals(R, c + STEP * axis, motions, tracks) for axis in np.eye(3)]
-        later = se3.exp_many(state.errors) @ self.motions(state.clock + CLOCK_STEP_S)
+        later = se3.exp_many(errors) @ self.motions(clock + CLOCK_STEP_S)
         moved.append(r + (_residuals(R, c, later, tracks) - r) * (STEP / CLOCK_STEP_S))
         for axis in np.eye(6):
-            moved.append(_residuals(R, c, se3.exp_many(state.errors + STEP * axis) @ known, tracks))
+            moved.append(_residuals(R, c, se3.exp_many(errors + STEP * axis) @ known, tracks))
         return r, np.stack([(m - r) / STEP for m in moved], axis=2)
 
     def _flow(self, tracks: Tracks) -> Matrix:
@@ -254,12 +232,6 @@ def _normal(r: Matrix, J: Matrix, weight: Matrix) -> tuple[Matrix, Matrix]:
     rows, values = J.reshape(-1, J.shape[2]), r.ravel()
     w = np.repeat(weight, 2)
     return np.asarray((rows * w[:, None]).T @ rows), np.asarray(rows.T @ (w * values))
-
-
-def _upright(R: Matrix, up: Matrix, sigma: float) -> tuple[Matrix, Matrix]:
-    """Residual (3,) and its derivative (3, 3) by a turn, of the prior that the LiDAR's z axis points to `up` in the camera."""
-    z = R[:, 2]
-    return (z - up) / sigma, -se3.skew(z) / sigma
 
 
 def _all_rotations(n: int) -> Matrix:

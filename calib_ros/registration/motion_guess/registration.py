@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.acceptance.refusal import joined
@@ -19,7 +19,6 @@ from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, Result
 
-Matrix = NDArray[np.float64]
 # To the best score; a hypothesis near the truth had 0.92 or more (in 75 of 80 sets of 1 to 10 KITTI frames, 68 times first).
 MIN_SCORE_RATIO = 0.8
 ROUNDS = 4  # of the search around a hypothesis, of which most are wrong: what they do not show, more rounds hardly do
@@ -57,44 +56,36 @@ def better(results: Sequence[Result]) -> Result:
     return max(results, key=lambda r: (r.converged, np.nan_to_num(r.score, nan=-np.inf)))
 
 
-@dataclass(frozen=True, eq=False)
-class Guesser:
-    """Registers frames of which nothing is known.
+Register = Callable[[Matrix | str, SearchBox | None], Result]  # an initial extrinsic (4, 4) or the name of a guess, and its box
 
-    register: an initial extrinsic (4, 4) or the name of a guess, and the box around it, to a Result. frames: their number.
-    consecutive: those whose motion is used. box: None = as each guess proposes. has_classes: whether SEMANTIC may be tried.
-    """
 
-    register: Callable[[Matrix | str, SearchBox | None], Result]
-    frames: int
-    consecutive: Sequence[Frame]
-    extract: FeatureExtractor
-    box: SearchBox | None
-    has_classes: bool
+def from_motion(
+    register: Register, frames: int, consecutive: Sequence[Frame], extract: FeatureExtractor, box: SearchBox | None
+) -> Result:
+    """Registers so many frames from the hypotheses of the motion in consecutive ones. box: None = as the guess proposes. Raises
+    MissingDependencyError as `motion_guess`."""
+    try:
+        guess = motion_guess(consecutive, extract, extract.config.search.seed)
+    except TooFewFeaturesError as error:
+        return insufficient(error, nominal(), frames)
+    hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
+    result, _ = best_registration(hypotheses, register, box or guess.box)
+    return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
 
-    def from_motion(self) -> Result:
-        """From the hypotheses of the motion. Raises MissingDependencyError as `motion_guess`."""
-        try:
-            guess = motion_guess(self.consecutive, self.extract, self.extract.config.search.seed)
-        except TooFewFeaturesError as error:
-            return insufficient(error, nominal(), self.frames)
-        hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
-        result, _ = best_registration(hypotheses, self.register, self.box or guess.box)
-        return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
 
-    def from_anything(self) -> Result:
-        """The first that converges from motion, from classes where there are some, and from the nominal extrinsic; else the
-        best."""
-        tried = {}
-        try:
-            tried[MOTION] = self.from_motion()
-        except (BadInputError, MissingDependencyError) as error:
-            tried[MOTION] = insufficient(error, nominal(), self.frames)
-        if not tried[MOTION].converged and self.has_classes:
-            tried[SEMANTIC] = self.register(SEMANTIC, self.box)
-        if not any(result.converged for result in tried.values()):
-            start = self.register(nominal(), self.box or NOMINAL_BOX)
-            tried["nominal"] = replace(start, origin=InitialSource.NOMINAL)
-        best = better(list(tried.values()))
-        others = [f"not by {name}: {result.reason}" for name, result in tried.items() if result is not best]
-        return replace(best, reason=joined([best.reason, *others]))
+def from_anything(
+    register: Register, frames: int, consecutive: Sequence[Frame], extract: FeatureExtractor, box: SearchBox | None, classes: bool
+) -> Result:
+    """The first that converges from motion, from classes where there are some, and from the nominal extrinsic; else the best."""
+    tried = {}
+    try:
+        tried[MOTION] = from_motion(register, frames, consecutive, extract, box)
+    except (BadInputError, MissingDependencyError) as error:
+        tried[MOTION] = insufficient(error, nominal(), frames)
+    if not tried[MOTION].converged and classes:
+        tried[SEMANTIC] = register(SEMANTIC, box)
+    if not any(result.converged for result in tried.values()):
+        tried["nominal"] = replace(register(nominal(), box or NOMINAL_BOX), origin=InitialSource.NOMINAL)
+    best = better(list(tried.values()))
+    others = [f"not by {name}: {result.reason}" for name, result in tried.items() if result is not best]
+    return replace(best, reason=joined([best.reason, *others]))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix
 from calib_ros.config import MotionConfig
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.image.enhance import to_gray
@@ -19,7 +20,6 @@ from calib_ros.lidar.deskew import has_times
 from calib_ros.lidar.ego_motion import MAX_GAP_S, estimate_motion
 from calib_ros.registration.features import FeatureExtractor
 
-Matrix = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 # Pictures are compared whose cameras have moved enough that points at usual distances move by several degrees.
@@ -158,13 +158,15 @@ def tracked_points(frames: Sequence[Frame], runs: Sequence[Run], extract: Featur
     mask = None if used is None else used.astype(np.uint8) * 255
     firsts, seconds, numbers = [np.empty((0, 2))], [np.empty((0, 2))], [np.empty(0, np.intp)]
     moments: list[tuple[float, float, int]] = []
+    equalise = cv2.createCLAHE(CLIP, TILES)  # shadows have corners, too
     for r, run in enumerate(runs):
         pairs = picture_pairs(run)
         grays: dict[int, Gray] = {}
         for a, b in pairs:
             for k in range(a, b + 1):
                 if k not in grays:
-                    grays[k] = tracking_image(frames[run.first + k], extract)
+                    gray = to_gray(extract.working_image(frames[run.first + k].image))
+                    grays[k] = np.asarray(equalise.apply(gray), np.uint8)
             for k in [k for k in grays if k < a]:
                 del grays[k]
             start, end = track([grays[k] for k in range(a, b + 1)], mask)
@@ -197,12 +199,6 @@ def _moved(before: Matrix, after: Matrix) -> bool:
     R = before[:3, :3].T @ after[:3, :3]
     turn = np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))
     return bool(np.linalg.norm(after[:3, 3] - before[:3, 3]) >= STEP_M or turn >= STEP_RAD)
-
-
-def tracking_image(frame: Frame, extract: FeatureExtractor) -> Gray:
-    """Rectified grey image (h, w) of extract.camera, locally equalised so that shadows have corners, too."""
-    gray = to_gray(extract.working_image(frame.image))
-    return np.asarray(cv2.createCLAHE(CLIP, TILES).apply(gray), np.uint8)
 
 
 def track(pictures: Sequence[Gray], mask: Gray | None = None) -> tuple[Matrix, Matrix]:

@@ -16,9 +16,10 @@ from scipy.special import ndtr, stdtr
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.intrinsics import IntrinsicEstimate
 from calib_ros.registration.acceptance.refusal import Refusal, left_open
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
-from calib_ros.registration.covariance import NO_NOISE, REGIONS, effective_frames, noise_covariance, noise_level
+from calib_ros.registration.covariance import NO_NOISE, REGIONS, effective_frames, inverse_curvature, noise_level
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints
 from calib_ros.registration.search.optimizers import levenberg_marquardt
@@ -143,6 +144,12 @@ class NuisanceEstimate:
     def is_observable(self) -> bool:
         """Whether the scenes tell more of it than is known in advance."""
         return self.sigma < self.parameter.sigma
+
+    @property
+    def in_files(self) -> IntrinsicEstimate:
+        """The same in the unit of files."""
+        unit = self.parameter.unit
+        return IntrinsicEstimate(unit * self.value, unit * self.sigma, self.is_observable)
 
     @property
     def deviations(self) -> float:
@@ -278,8 +285,8 @@ def wrong_parameter(estimates: Sequence[NuisanceEstimate], tolerance_deg: float,
 
 def noise_of(score: PointScore, T: Transform, limits: Limits) -> float:
     """Noise of the score at its optimum T (4, 4): twice what is lost by one standard deviation; see `noise_level`."""
-    level, axes = score.n_levels - 1, np.flatnonzero(limits.open_axes)
-    return max(noise_level(score, T, level, noise_covariance(score, T, level, axes, noise=1.0), axes), NO_NOISE)
+    axes = np.flatnonzero(limits.open_axes)
+    return max(noise_level(score, T, inverse_curvature(score, T, axes), axes), NO_NOISE)
 
 
 def refined(

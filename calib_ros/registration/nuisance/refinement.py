@@ -102,38 +102,15 @@ def _grid(shift: Matrix) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Doubted:
-    """What is known in advance of changes (n,) about `centre` (n,): each usual, or, with probability DOUBT, plainly wrong."""
-
-    parameters: Sequence[LensParameter]
-    centre: Matrix
-
-    def _densities(self, change: Matrix) -> tuple[Matrix, Matrix]:
-        """Of both kinds (2, n), each times its probability; and their standard deviations (2, n)."""
-        sigma = np.array([[own.usual for own in self.parameters], [own.gross for own in self.parameters]])
-        share = np.array([[1 - DOUBT], [DOUBT]])
-        return share / sigma * np.exp(-0.5 * ((change - self.centre) / sigma) ** 2) + 1e-300, sigma
-
-    def cost(self, change: Matrix) -> float:
-        """Less the logarithm of the density, 0 where it is highest."""
-        here, most = self._densities(change)[0].sum(axis=0), self._densities(self.centre)[0].sum(axis=0)
-        return float(np.log(most / here).sum())
-
-    def information(self, change: Matrix) -> Matrix:
-        """Slope of the cost (n,) per distance from the centre: the information of the normal distribution that is as steep."""
-        densities, sigma = self._densities(change)
-        return np.asarray((densities / sigma**2).sum(axis=0) / densities.sum(axis=0))
-
-
-@dataclass(frozen=True, eq=False)
 class _Joint:
-    """The score in 6 + n unknowns. limits, prior: of the extrinsic. advance: of the intrinsics, weighed by `noise`."""
+    """The score in 6 + n unknowns. limits, prior: of the extrinsic. What is known in advance of the intrinsics is weighed by
+    `noise`: changes about `centre` (n,) are usual each, or, with probability DOUBT, plainly wrong."""
 
     score: PointScore
     parameters: Sequence[LensParameter]
     limits: Limits
     prior: Prior | None
-    advance: _Doubted
+    centre: Matrix
     noise: float
 
     def seen(self, T: Transform, change: Matrix) -> JointView:
@@ -162,8 +139,21 @@ class _Joint:
 
     def known(self, change: Matrix) -> tuple[float, Matrix, Matrix]:
         """Cost of a change (n,) by what is known in advance, to subtract from the score, its slope and its information (n,)."""
-        information = self.noise * self.advance.information(change)
-        return self.noise * self.advance.cost(change), information * (change - self.advance.centre), information
+        here, most = self._densities(change)[0].sum(axis=0), self._densities(self.centre)[0].sum(axis=0)
+        information = self.noise * self.information(change)
+        # Less the logarithm of the density, 0 where it is highest.
+        return self.noise * float(np.log(most / here).sum()), information * (change - self.centre), information
+
+    def information(self, change: Matrix) -> Matrix:
+        """Slope of the cost (n,) per distance from the centre: the information of the normal distribution that is as steep."""
+        densities, sigma = self._densities(change)
+        return np.asarray((densities / sigma**2).sum(axis=0) / densities.sum(axis=0))
+
+    def _densities(self, change: Matrix) -> tuple[Matrix, Matrix]:
+        """Of both kinds of changes (2, n), each times its probability; and their standard deviations (2, n)."""
+        sigma = np.array([[own.usual for own in self.parameters], [own.gross for own in self.parameters]])
+        share = np.array([[1 - DOUBT], [DOUBT]])
+        return share / sigma * np.exp(-0.5 * ((change - self.centre) / sigma) ** 2) + 1e-300, sigma
 
 
 def joint_optimum(
@@ -190,10 +180,8 @@ def joint_optimum(
         return None
     part = score.subset(POINTS if given is None else FINE_POINTS, np.random.default_rng(0))
     limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
-    advance = _Doubted(
-        parameters, np.array([-change_between(given or camera, camera, own.name) / own.unit for own in parameters])
-    )
-    joint = _Joint(part, parameters, limits, prior, advance, 0.0)
+    centre = np.array([-change_between(given or camera, camera, own.name) / own.unit for own in parameters])
+    joint = _Joint(part, parameters, limits, prior, centre, 0.0)
     free, as_it_is = Limits(np.eye(4), np.where(limits.open_axes, np.inf, 0.0)), (T, np.zeros(len(parameters)))
     begin = as_it_is
     if search or given is not None:  # by the scenes alone: at an optimum of wrong intrinsics, nothing tells their noise
@@ -207,10 +195,10 @@ def joint_optimum(
     if begin is not as_it_is:
         inflated = min(inflated, inflation(disagreement(part, np.eye(4), free)))
     joint = replace(joint, noise=inflated * noise_of(part, np.eye(4), free))
-    starts = [as_it_is] if begin is as_it_is else [begin, as_it_is, *_as_usual(*begin, part.camera, advance)]
+    starts = [as_it_is] if begin is as_it_is else [begin, as_it_is, *_as_usual(*begin, joint)]
     top, change, best = max((joint.ascend(*start, NEAR_LEVELS) for start in starts), key=lambda end: end[2])
     covariance, directions = _spread(joint, top, change, best)
-    known = np.sqrt(1 / advance.information(change))
+    known = np.sqrt(1 / joint.information(change))
     observable = np.asarray(np.sqrt(np.diag(covariance)) < OBSERVABLE * known)
     if not observable.all():  # these stay as they are
         kept = np.where(observable, change, 0.0)
@@ -227,48 +215,8 @@ def joint_optimum(
 
 
 def _spread(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
-    """Covariance (n, n) of a change at the optimum T (4, 4), and the twist of the extrinsic (6, n) per unit of it."""
-    H, directions = _profile(joint, T, change, top)
-    known = 1 / np.sqrt(joint.advance.information(change))
-    values, vectors = np.linalg.eigh(H / joint.noise * np.outer(known, known))
-    covariance = (vectors / (np.maximum(values, 0) + 1)) @ vectors.T * np.outer(known, known)  # bent upward, it tells nothing
-    covariance += np.diag(_systematic(joint.score.camera, joint.parameters) ** 2)
-    return 0.5 * (covariance + covariance.T), directions
-
-
-def _starts(T: Transform, camera: Camera, parameters: Sequence[LensParameter]) -> Iterator[tuple[Matrix, Matrix]]:
-    """Where to begin: as it is, and other values of each parameter, with the rotation that another principal point looks like."""
-    yield T, np.zeros(len(parameters))
-    for k, own in enumerate(parameters):
-        for value in own.alternatives:
-            change = np.zeros(len(parameters))
-            change[k] = value
-            yield _turned(T, change, camera, parameters), change
-
-
-def _as_usual(T: Transform, change: Matrix, camera: Camera, advance: _Doubted) -> Iterator[tuple[Matrix, Matrix]]:
-    """The same with some of the values as they were given: with what is known in advance they may score higher."""
-    groups = [[k for k, own in enumerate(advance.parameters) if own.name in names] for names in (CENTRE, (RADIAL,))]
-    for some in (groups[0], groups[1], groups[0] + groups[1]):
-        if some:
-            usual = change.copy()
-            usual[some] = advance.centre[some]
-            yield _turned(T, usual - change, camera, advance.parameters), usual
-
-
-def _turned(T: Transform, change: Matrix, camera: Camera, parameters: Sequence[LensParameter]) -> Matrix:
-    """T (4, 4) with the rotation that looks like a change (n,) of the principal point, undone."""
-    turn = np.zeros(6)
-    for own, value in zip(parameters, change, strict=True):
-        if own.name in CENTRE:
-            angle = value * camera.width / camera.K[0, 0]
-            turn[:2] += (0.0, -angle) if own.name == CENTRE[0] else (angle, 0.0)
-    return np.asarray(se3.exp(turn) @ T)
-
-
-def _profile(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
-    """How the score bends down (n, n) around a change, the extrinsic refined anew for each, by differences of STEP, without the
-    prior of the change; and the twist of the extrinsic (6, n) per unit of each."""
+    """Covariance (n, n) of a change at the optimum T (4, 4), and the twist of the extrinsic (6, n) per unit of it: by how the
+    score bends down around it, the extrinsic refined anew for each, by differences of STEP, without the prior of the change."""
     n = len(change)
 
     def costs(T: Transform, change: Matrix) -> tuple[float, float]:
@@ -290,13 +238,44 @@ def _profile(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[M
         H[k, k] = (2 * top - high - low) / STEP**2
     for i, j in combinations(range(n), 2):
         off = axes[i] + axes[j]
-        values = [at(sign * off, se3.exp(sign * directions @ off) @ T)[1] for sign in (1, -1)]
-        along = (2 * top - sum(values)) / STEP**2
+        ends = [at(sign * off, se3.exp(sign * directions @ off) @ T)[1] for sign in (1, -1)]
+        along = (2 * top - sum(ends)) / STEP**2
         H[i, j] = H[j, i] = 0.5 * (along - H[i, i] - H[j, j])
-    return H, directions
-
-
-def _systematic(camera: Camera, parameters: Sequence[LensParameter]) -> Matrix:
-    """Standard deviations (n,) that shift the border of the image as far as the systematic error of a rotation does."""
+    known, camera = 1 / np.sqrt(joint.information(change)), joint.score.camera
+    values, vectors = np.linalg.eigh(H / joint.noise * np.outer(known, known))
+    covariance = (vectors / (np.maximum(values, 0) + 1)) @ vectors.T * np.outer(known, known)  # bent upward, it tells nothing
+    # What shifts the border of the image as far as the systematic error of a rotation does.
     px = SYSTEMATIC_ERROR[0] * camera.K[0, 0]
-    return np.array([px / camera.width * (1.0 if own.name in CENTRE else 2.0) for own in parameters])
+    systematic = np.array([px / camera.width * (1.0 if own.name in CENTRE else 2.0) for own in joint.parameters])
+    covariance += np.diag(systematic**2)
+    return 0.5 * (covariance + covariance.T), directions
+
+
+def _starts(T: Transform, camera: Camera, parameters: Sequence[LensParameter]) -> Iterator[tuple[Matrix, Matrix]]:
+    """Where to begin: as it is, and other values of each parameter, with the rotation that another principal point looks like."""
+    yield T, np.zeros(len(parameters))
+    for k, own in enumerate(parameters):
+        for value in own.alternatives:
+            change = np.zeros(len(parameters))
+            change[k] = value
+            yield _turned(T, change, camera, parameters), change
+
+
+def _as_usual(T: Transform, change: Matrix, joint: _Joint) -> Iterator[tuple[Matrix, Matrix]]:
+    """The same with some of the values as they were given: with what is known in advance they may score higher."""
+    groups = [[k for k, own in enumerate(joint.parameters) if own.name in names] for names in (CENTRE, (RADIAL,))]
+    for some in (groups[0], groups[1], groups[0] + groups[1]):
+        if some:
+            usual = change.copy()
+            usual[some] = joint.centre[some]
+            yield _turned(T, usual - change, joint.score.camera, joint.parameters), usual
+
+
+def _turned(T: Transform, change: Matrix, camera: Camera, parameters: Sequence[LensParameter]) -> Matrix:
+    """T (4, 4) with the rotation that looks like a change (n,) of the principal point, undone."""
+    turn = np.zeros(6)
+    for own, value in zip(parameters, change, strict=True):
+        if own.name in CENTRE:
+            angle = value * camera.width / camera.K[0, 0]
+            turn[:2] += (0.0, -angle) if own.name == CENTRE[0] else (angle, 0.0)
+    return np.asarray(se3.exp(turn) @ T)

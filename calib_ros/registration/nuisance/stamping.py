@@ -10,14 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.config import MotionConfig
 from calib_ros.lidar.deskew import moved, scan_times
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.result import Stamping
 
-Matrix = NDArray[np.float64]
 AHEAD, BEHIND = 0.0, 180.0  # deg, azimuth half a turn away from where a scan begins and ends
 CONVENTIONS = (
     Stamping("clockwise", AHEAD),

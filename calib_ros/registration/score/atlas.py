@@ -48,7 +48,9 @@ class Atlas:
         # Which frames these are is told without keeping them alive.
         self._frames = [weakref.ref(own[0]) for own in levels]
         self._form = [(level.packed.shape[1:], level.scale, level.sigma) for level in levels[0]]
-        kept = last if last is not None and self._like(last) else None
+        form, K = (self._form, self.n_frames, self.channels), camera.K
+        fits = last is not None and form == (last._form, last.n_frames, last.channels) and np.array_equal(last.camera.K, K)
+        kept = last if fits else None
         self.levels: list[AtlasLevel] = (
             kept.levels if kept else [_laid_out(levels[0][k], len(levels), self.channels, camera) for k in range(len(levels[0]))]
         )
@@ -91,11 +93,6 @@ class Atlas:
         out = copy.copy(self)
         out.levels = levels
         return out
-
-    def _like(self, last: Atlas) -> bool:
-        """Can the images of the other be filled with these frames?"""
-        size, size_of_last = (self.n_frames, self.channels), (last.n_frames, last.channels)
-        return self._form == last._form and size == size_of_last and np.array_equal(last.camera.K, self.camera.K)
 
 
 def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:

@@ -10,7 +10,6 @@ from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.progress import Observer
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, PointScore, ScoredPoints, near_image
 
@@ -26,7 +25,7 @@ class FastScore(PointScore):
     """The score of the method: sparse edge points of several frames on oriented edge maps.
 
     features: of one camera. T_prior: (4, 4); edge points that it projects farther than `margin` (share of the image width; None =
-    MARGIN) outside the image are left out. atlas: of the same features, if there is one already. observer: gets every evaluation.
+    MARGIN) outside the image are left out. atlas: of the same features, if there is one already.
     Raises TooFewFeaturesError when fewer than MIN_POINTS edge points remain.
     """
 
@@ -37,7 +36,6 @@ class FastScore(PointScore):
         config: ScoreConfig,
         margin: float | None = None,
         atlas: Atlas | None = None,
-        observer: Observer | None = None,
     ) -> None:
         if not features:
             raise TooFewFeaturesError("no frame can be used; give others")
@@ -56,7 +54,7 @@ class FastScore(PointScore):
             frame,
             np.concatenate([_channels(p, T_prior) for p in kept]),
         )
-        super().__init__(points, atlas or Atlas([f.levels for f in features], camera), observer)
+        super().__init__(points, atlas or Atlas([f.levels for f in features], camera))
 
 
 def _channels(points: EdgePoints, T_prior: Transform) -> NDArray[np.intp]:

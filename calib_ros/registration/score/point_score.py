@@ -13,7 +13,6 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.lens import angles_of_rays
-from calib_ros.registration.progress import Observer
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.sampler import MIN_DEPTH, Sampler
 
@@ -85,11 +84,9 @@ class ScoredPoints:
 
 
 class PointScore:
-    """Weighted mean of the map values under the points, at several resolutions. observer: gets every evaluation of this score and
-    of those selected from it."""
+    """Weighted mean of the map values under the points, at several resolutions."""
 
-    def __init__(self, points: ScoredPoints, atlas: Atlas, observer: Observer | None = None) -> None:
-        self.observer = observer
+    def __init__(self, points: ScoredPoints, atlas: Atlas) -> None:
         self.atlas, self.camera, self.n_frames = atlas, atlas.camera, atlas.n_frames
         self.points, self.weights, self.frame = points.xyz, points.weight, points.frame
         self._tiles = np.asarray(atlas.channels * points.frame + points.channel, np.int32)
@@ -157,21 +154,14 @@ class PointScore:
 
     def sample(self, T: Transform, level: int) -> Map:
         """Map value under every point (n,) at T."""
-        self._evaluated(1)
         return self._sampler.samples(T, level)
-
-    def _evaluated(self, count: int) -> None:
-        if self.observer is not None:
-            self.observer.evaluated(count)
 
     def values(self, transforms: Matrix, level: int) -> Matrix:
         """The score (k,) of many extrinsics (k, 4, 4) at once: for the starts of a search, where calls would cost most."""
-        self._evaluated(len(transforms))
         return self._sampler.values(transforms, level)
 
     def frame_values(self, transforms: Matrix, level: int) -> Matrix:
         """The same frame by frame (k, n_frames); NaN for a frame without points."""
-        self._evaluated(len(transforms))
         present = self.frames
         first = np.searchsorted(self.frame, present)
         out = np.full((len(transforms), self.n_frames), np.nan)
@@ -181,23 +171,15 @@ class PointScore:
 
     def jacobian(self, T: Transform, level: int) -> Map:
         """Derivative of every sample by a left twist at T, (6, n)."""
-        self._linearised(1)
         return self._sampler.jacobian(T, level)
 
     def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
         """Gradients (k, 6) at each of (k, 4, 4), and the weighted outer products of the point derivatives (k, 6, 6)."""
-        self._linearised(len(transforms))
         return self._sampler.linearise(transforms, level)
 
     def gradients(self, transforms: Matrix, level: int) -> Matrix:
         """The gradients (k, 6) alone."""
-        self._linearised(len(transforms))
         return self._sampler.gradients(transforms, level)
-
-    def _linearised(self, count: int) -> None:
-        if self.observer is not None:
-            for _ in range(count):
-                self.observer.linearised()
 
     def frame_scores(self, T: Transform, level: int = -1) -> Matrix:
         """Score of every frame alone (n_frames,); NaN for a frame without points."""

@@ -89,10 +89,8 @@ class Sampler:
 
     def _view(self, level: int) -> ctypes._Pointer[_View]:
         """The view of a level, made when it is asked for: few samplers are used on all of them."""
-        made = self._made.get(level)
-        return made if made is not None else self._made.setdefault(level, ctypes.pointer(self._new_view(level)))
-
-    def _new_view(self, level: int) -> _View:
+        if (made := self._made.get(level)) is not None:
+            return made
         own, row = self._atlas.levels[level], self._points.strides[0]
         points, K = self._points.ctypes.data, own.K
         left, top = (np.ascontiguousarray(edge[self._tiles], np.float32) for edge in own.corner.T)
@@ -106,7 +104,7 @@ class Sampler:
             unit=UNIT, sphere=self._atlas.camera.is_sphere,
         )  # fmt: skip
         view.corners = left, top  # which live as long as the view
-        return view
+        return self._made.setdefault(level, ctypes.pointer(view))
 
     def samples(self, T: Transform, level: int) -> Map:
         """Map value (n,) under every point; 0 outside the frame."""

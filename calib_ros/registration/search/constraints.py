@@ -85,13 +85,6 @@ class Limits:
         xi = se3.log(T @ self._inverse)
         return np.asarray(free & (self.half > 0) & ~((np.abs(xi) >= self.half * (1 - 1e-9)) & (gradient * xi > 0)))
 
-    def at_trust_region(self, T: Transform) -> bool:
-        """True if T (4, 4) lies at the end of the trust region: no optimum, or one that the start does not justify."""
-        if self.trust_region is None:
-            return False
-        xi = se3.log(T @ se3.inverse(self.trust_region.T))
-        return bool((np.abs(xi) >= NEARLY * self.trust_region.half)[self.open_axes].any())
-
 
 def unlimited(T: Transform) -> Limits:
     """No limits at all."""

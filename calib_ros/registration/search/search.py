@@ -93,9 +93,8 @@ def search(
     another score that ranks starts of a strategy of its own.
     Deterministic for a given config.seed, whatever config.threads.
     """
-    with _workers(score, config) as workers:
-        space = SearchSpace(score, T_prior, box, config, limits, user_prior, guide, workers)
-        optima = Optima(space)
+    with Workers(config.threads) as workers:
+        optima = Rounds(score, T_prior, box, config, limits, user_prior, guide, workers)
         decoy_z: float | None = None
         for number in range(box.rounds or config.rounds):
             optima.add_round(progress.part(1 - 0.5**number, 1 - 0.5 ** (number + 1)))
@@ -131,30 +130,34 @@ def search_decoy(
 ) -> float:
     """z-score of the best extrinsic that a round of the same search finds in a decoy, the mirrored maps: no true alignment."""
     decoy = score.mirrored()
-    with _workers(score, config) as workers:
-        optima = Optima(SearchSpace(decoy, T, box, config, limits, user_prior, workers=workers))
+    with Workers(config.threads) as workers:
+        optima = Rounds(decoy, T, box, config, limits, user_prior, workers=workers)
         optima.add_round()
         return null_distribution(decoy, optima.best()[0]).z_score
 
 
-def _workers(score: PointScore, config: SearchConfig) -> Workers:
-    """One thread where somebody watches: an observer is told of every evaluation when it is made, one after the other."""
-    return Workers(config.threads if score.observer is None else 1)
+# Of seeding: starts are ranked by the first score, the best of them by the second, on the level, from which they are optimised.
+Strategy = tuple[PointScore, PointScore, int]
 
 
-@dataclass(frozen=True, eq=False)
-class SeedingStrategy:
-    """Starts are ranked by a level of `ranking`, the best of them by that of `score`, and optimised from that level on."""
+@dataclass(eq=False)
+class Optimum:
+    """An optimum of the coarse levels, polished once it is among the best. count: starts that ended here. coarse_T: where it was
+    before it was polished; None until it is. final: with all points, and its penalised score; None until it is a finalist."""
 
-    ranking: PointScore
-    score: PointScore
-    level: int
+    value: float
+    T: Transform
+    count: int = 1
+    coarse_T: Transform | None = None
+    final: tuple[Matrix, float] | None = None
 
 
-class SearchSpace:
-    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from.
+class Rounds:
+    """A search, round by round: the box, the score on fewer and fewer points, the Sobol sequence that all starts are drawn from,
+    and the optima so far.
 
-    strategies: by the edges on every seed level, and by the guide if there is one.
+    strategies: by the edges on every seed level, and by the guide if there is one. optimised: starts followed to the end. nearby:
+    optima (4, 4) around the best.
     """
 
     def __init__(
@@ -174,20 +177,25 @@ class SearchSpace:
         self.coarse, self.middle = score.subset(COARSE_POINTS, rng), score.subset(MIDDLE_POINTS, rng)
         ranking = self._fewer(self.first, RANKING_POINTS)
         levels = WIDE_SEED_LEVELS if is_wide(box) else SEED_LEVELS
-        self.strategies = [SeedingStrategy(ranking, self.first, level) for level in levels]
+        self.strategies: list[Strategy] = [(ranking, self.first, level) for level in levels]
         if guide is not None:
             guide = self._fewer(guide, GUIDE_POINTS)
-            self.strategies.append(SeedingStrategy(self._fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL))
+            self.strategies.append((self._fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL))
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
         self.user_prior, self._inverse_prior = user_prior, se3.inverse(T_prior)
         self._sobol = Sobol(6, seed=config.seed)
+        self.optimised = self._rounds = 0
+        self._all: list[Optimum] = []
+        self._polished: list[Optimum] = []
+        self.nearby: tuple[Matrix, ...] = ()
+        self._near: tuple[Matrix, Matrix] | None = None  # a finalist, and the best extrinsic near it
 
     def _fewer(self, score: PointScore, points: int) -> PointScore:
         return score.subset(points, np.random.default_rng(self.config.seed))
 
-    def draw(self) -> Matrix:
+    def _draw(self) -> Matrix:
         """The next starts (n, 6) in units of the box, -1..1; n a power of two, at which Sobol's sequence is balanced."""
         searched = self.half > 0
         times = float(np.sqrt(np.prod(self.half[searched] / BASE_BOX[searched])))
@@ -199,39 +207,14 @@ class SearchSpace:
         excess = np.maximum(np.abs(se3.log(T @ self._inverse_prior)) / self.width - 1.1, 0)
         return BOX_STRENGTH * float(excess @ excess) + (self.user_prior.cost(T)[0] if self.user_prior else 0.0)
 
-
-@dataclass(eq=False)
-class Optimum:
-    """An optimum of the coarse levels, polished once it is among the best. count: starts that ended here. coarse_T: where it was
-    before it was polished; None until it is. final: with all points, and its penalised score; None until it is a finalist."""
-
-    value: float
-    T: Transform
-    count: int = 1
-    coarse_T: Transform | None = None
-    final: tuple[Matrix, float] | None = None
-
-
-class Optima:
-    """The optima of a search, round by round. optimised: starts followed to the end. nearby: optima (4, 4) around the best."""
-
-    def __init__(self, space: SearchSpace) -> None:
-        self.optimised = self._rounds = 0
-        self._space = space
-        self._all: list[Optimum] = []
-        self._polished: list[Optimum] = []
-        self.nearby: tuple[Matrix, ...] = ()
-        self._near: tuple[Matrix, Matrix] | None = None  # a finalist, and the best extrinsic near it
-
     def add_round(self, progress: Progress = SILENT) -> None:
         """Starts of every strategy, their optima, and the best of these polished."""
-        strategies = self._space.strategies
-        for k, strategy in enumerate(strategies):
-            own = progress.part(0.6 * k / len(strategies), 0.6 * (k + 1) / len(strategies))
-            starts = seed_starts(self._space, strategy, self._rounds == 0, own.part(0, 0.25))
-            self.optimised += optimise_starts(self._space, starts, strategy.level, self._all, own.part(0.25, 1))
+        for k, strategy in enumerate(self.strategies):
+            own = progress.part(0.6 * k / len(self.strategies), 0.6 * (k + 1) / len(self.strategies))
+            starts = self.seed_starts(strategy, self._rounds == 0, own.part(0, 0.25))
+            self._optimise(starts, strategy[2], own.part(0.25, 1))
         waiting = sorted((o for o in self._all if o.coarse_T is None), key=lambda o: -o.value)[:POLISHED]
-        for k, _ in enumerate(self._space.workers.map(self._polish, waiting)):
+        for k, _ in enumerate(self.workers.map(self._polish, waiting)):
             progress(0.6 + 0.3 * (k + 1) / len(waiting))
         self._polished += waiting
         self._polished.sort(key=lambda o: -o.value)
@@ -239,119 +222,110 @@ class Optima:
 
     def _polish(self, optimum: Optimum) -> None:
         """On the middle levels, by simplex: it is robust where the slope misleads."""
-        space, optimum.coarse_T = self._space, optimum.T
+        optimum.coarse_T = optimum.T
         for level, step in SIMPLEX_DEG.items():
-            score = space.middle.at(level)
-            optimum.T, optimum.value = nelder_mead(score, optimum.T, step, SIMPLEX_EVALUATIONS, space.penalty, space.limits)
+            score = self.middle.at(level)
+            optimum.T, optimum.value = nelder_mead(score, optimum.T, step, SIMPLEX_EVALUATIONS, self.penalty, self.limits)
 
     def best(self) -> tuple[Matrix, int]:
         """The best extrinsic (4, 4) so far, and how many starts ended there."""
         unfinished = [o for o in self._polished[:FINALISTS] if o.final is None]
-        for k, final in enumerate(self._space.workers.map(lambda o: finish(self._space, o.T), unfinished)):
+        for k, final in enumerate(self.workers.map(lambda o: self._finish(o.T), unfinished)):
             unfinished[k].final = final
         # Starts of later rounds may have ended there, too.
         finalists = [(*o.final, o.count) for o in self._polished if o.final is not None]
         top, value, _ = max(finalists, key=lambda f: f[1])
         if self._near is None or self._near[0] is not top:  # often the last round's, whose neighbourhood is known
-            found, ends = search_nearby(self._space, top, value)
+            found, ends = self._search_nearby(top, value)
             self._near, self.nearby = (top, found), (*(T for T, _, _ in finalists), *ends)
         best = self._near[1]
         return best, sum(count for T, _, count in finalists if _same(T, best) or _same(T, top))
 
+    def seed_starts(self, strategy: Strategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
+        """The best starts by a strategy that differ. with_prior: the centre of the box is among the candidates."""
+        (ranking, score, level), unit = strategy, self._draw()
+        if len(unit) > BEST_RANKED:
+            ranked = self._score_starts(ranking, level, unit, progress.part(0, 0.7))
+            unit = unit[np.sort(np.argsort(-ranked, kind="stable")[:BEST_RANKED])]
+        if with_prior:
+            unit = np.vstack([np.zeros(6), unit])
+        scores = self._score_starts(score, level, unit, progress.part(0.7, 1))
+        picked: list[int] = []
+        for k in np.argsort(-scores, kind="stable"):
+            if not picked or (np.abs(unit[k] - unit[picked]).max(axis=1) > SAME_START).all():
+                picked.append(int(k))
+                if len(picked) == DISTINCT:
+                    break
+        return [self.limits.clip(se3.exp(unit[k] * self.half) @ self.T_prior) for k in picked]
 
-def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
-    """The best starts by a strategy that differ. with_prior: the centre of the box is among the candidates."""
-    unit = space.draw()
-    if len(unit) > BEST_RANKED:
-        ranked = score_starts(space, strategy.ranking, strategy.level, unit, progress.part(0, 0.7))
-        unit = unit[np.sort(np.argsort(-ranked, kind="stable")[:BEST_RANKED])]
-    if with_prior:
-        unit = np.vstack([np.zeros(6), unit])
-    scores = score_starts(space, strategy.score, strategy.level, unit, progress.part(0.7, 1))
-    picked: list[int] = []
-    for k in np.argsort(-scores, kind="stable"):
-        if not picked or (np.abs(unit[k] - unit[picked]).max(axis=1) > SAME_START).all():
-            picked.append(int(k))
-            if len(picked) == DISTINCT:
-                break
-    return [space.limits.clip(se3.exp(unit[k] * space.half) @ space.T_prior) for k in picked]
+    def _score_starts(self, score: PointScore, level: int, unit: Matrix, progress: Progress = SILENT) -> Matrix:
+        """Scores (n,) of starts (n, 6) in units of the box."""
 
+        def scores_of(k: int) -> Matrix:
+            return score.values(se3.exp_many(unit[k : k + BATCH] * self.half) @ self.T_prior, level)
 
-def score_starts(space: SearchSpace, score: PointScore, level: int, unit: Matrix, progress: Progress = SILENT) -> Matrix:
-    """Scores (n,) of starts (n, 6) in units of the box."""
+        batches, scores = range(0, len(unit), BATCH), np.empty(len(unit))
+        for k, batch in zip(batches, self.workers.map(scores_of, batches), strict=True):
+            scores[k : k + BATCH] = batch
+            progress(k / len(unit))
+        return scores
 
-    def scores_of(k: int) -> Matrix:
-        return score.values(se3.exp_many(unit[k : k + BATCH] * space.half) @ space.T_prior, level)
+    def _optimise(self, starts: Sequence[Matrix], level: int, progress: Progress) -> None:
+        """Add the optima of the coarse levels that the starts lead to, the worse part of them dropped after the first level."""
 
-    batches, scores = range(0, len(unit), BATCH), np.empty(len(unit))
-    for k, batch in zip(batches, space.workers.map(scores_of, batches), strict=True):
-        scores[k : k + BATCH] = batch
-        progress(k / len(unit))
-    return scores
+        def first(start: Transform) -> tuple[float, Matrix]:
+            T = self._coarse_optimum(self.first, level, start, tolerance_deg=0.05)
+            return self.coarse.at(1).value(T) - self.penalty(T), T
 
+        def climbed(T: Transform) -> tuple[float, Matrix]:
+            for own in range(max(level, 1), 3):
+                T = self._coarse_optimum(self.coarse, own, T, tolerance_deg=0.02)
+            return self.coarse.at(2).value(T) - self.penalty(T), T
 
-def optimise_starts(
-    space: SearchSpace, starts: Sequence[Matrix], level: int, optima: list[Optimum], progress: Progress = SILENT
-) -> int:
-    """Add the optima of the coarse levels that the starts lead to, the worse part of them dropped after the first level.
-    Returns how many starts were followed to the end."""
+        ends: list[tuple[float, Matrix]] = []
+        for end in self.workers.map(first, starts):
+            ends.append(end)
+            progress(0.5 * len(ends) / len(starts))
+        ends.sort(key=lambda end: -end[0])
+        kept = [T for _, T in ends[:CLIMBED]]
+        for k, (value, T) in enumerate(self.workers.map(climbed, kept)):
+            for other in self._all:
+                if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
+                    other.count += 1
+                    if value > other.value and other.coarse_T is None:
+                        other.value, other.T = value, T
+                    break
+            else:
+                self._all.append(Optimum(value, T))
+            progress(0.5 + 0.5 * (k + 1) / len(kept))
+        self.optimised += len(kept)
 
-    def first(start: Transform) -> tuple[float, Matrix]:
-        T = _coarse_optimum(space, space.first, level, start, tolerance_deg=0.05)
-        return space.coarse.at(1).value(T) - space.penalty(T), T
+    def _finish(self, T: Transform) -> tuple[Matrix, float]:
+        """On the fine levels with all points: the extrinsic, and its penalised score."""
+        value = 0.0
+        for level in FINE_LEVELS:
+            T, value = levenberg_marquardt(self.score.at(level), T, 20, self.user_prior, self.limits, tolerance_deg=0.01)
+        return T, value - self.penalty(T)
 
-    def climbed(T: Transform) -> tuple[float, Matrix]:
-        for own in range(max(level, 1), 3):
-            T = _coarse_optimum(space, space.coarse, own, T, tolerance_deg=0.02)
-        return space.coarse.at(2).value(T) - space.penalty(T), T
+    def _search_nearby(self, top: Transform, value: float) -> tuple[Matrix, list[Matrix]]:
+        """Something better near the best finalist (4, 4), beyond a ridge, else itself; and all optima that were met."""
+        best, ends = top, [top]
+        half = np.where(self.half > 0, NEARBY, 0.0)
+        candidates = se3.exp_many(Sobol(6, seed=self.config.seed).next(NEARBY_STARTS) * half) @ top
+        order = np.argsort(-self.coarse.values(candidates, 2), kind="stable")
 
-    ends: list[tuple[float, Matrix]] = []
-    for end in space.workers.map(first, starts):
-        ends.append(end)
-        progress(0.5 * len(ends) / len(starts))
-    ends.sort(key=lambda end: -end[0])
-    kept = [T for _, T in ends[:CLIMBED]]
-    for k, (value, T) in enumerate(space.workers.map(climbed, kept)):
-        for other in optima:
-            if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
-                other.count += 1
-                if value > other.value and other.coarse_T is None:
-                    other.value, other.T = value, T
-                break
-        else:
-            optima.append(Optimum(value, T))
-        progress(0.5 + 0.5 * (k + 1) / len(kept))
-    return len(kept)
+        def optimum_from(k: int) -> tuple[Matrix, float]:
+            start = self.limits.clip(candidates[k])
+            return self._finish(self._coarse_optimum(self.coarse, 2, start, tolerance_deg=0.02))
 
+        for end, reached in self.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
+            ends.append(end)
+            if reached > value + MIN_IMPROVEMENT * abs(value):
+                best, value = end, reached
+        return best, ends
 
-def finish(space: SearchSpace, T: Transform) -> tuple[Matrix, float]:
-    """On the fine levels with all points: the extrinsic, and its penalised score."""
-    value = 0.0
-    for level in FINE_LEVELS:
-        T, value = levenberg_marquardt(space.score.at(level), T, 20, space.user_prior, space.limits, tolerance_deg=0.01)
-    return T, value - space.penalty(T)
-
-
-def search_nearby(space: SearchSpace, top: Transform, value: float) -> tuple[Matrix, list[Matrix]]:
-    """Something better near the best finalist (4, 4), beyond a ridge, else itself; and all optima that were met."""
-    best, ends = top, [top]
-    half = np.where(space.half > 0, NEARBY, 0.0)
-    candidates = se3.exp_many(Sobol(6, seed=space.config.seed).next(NEARBY_STARTS) * half) @ top
-    order = np.argsort(-space.coarse.values(candidates, 2), kind="stable")
-
-    def optimum_from(k: int) -> tuple[Matrix, float]:
-        start = space.limits.clip(candidates[k])
-        return finish(space, _coarse_optimum(space, space.coarse, 2, start, tolerance_deg=0.02))
-
-    for end, reached in space.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
-        ends.append(end)
-        if reached > value + MIN_IMPROVEMENT * abs(value):
-            best, value = end, reached
-    return best, ends
-
-
-def _coarse_optimum(space: SearchSpace, score: PointScore, level: int, T: Transform, tolerance_deg: float) -> Transform:
-    return levenberg_marquardt(score.at(level), T, 8, space.box_prior, space.limits, tolerance_deg)[0]
+    def _coarse_optimum(self, score: PointScore, level: int, T: Transform, tolerance_deg: float) -> Transform:
+        return levenberg_marquardt(score.at(level), T, 8, self.box_prior, self.limits, tolerance_deg)[0]
 
 
 def _same(A: Matrix, B: Matrix) -> bool:

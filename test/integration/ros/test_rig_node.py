@@ -313,7 +313,7 @@ def test_without_the_library_lidars_keep_their_priors_and_one_line_says_so(two, 
     assert "pip install small_gicp" in own._health.last_error[0]
     assert (alone.state().status, alone.state().edge()) == ("initial", None)
     assert "pip install small_gicp" in alone.state().reason
-    assert alone.stop()
+    assert alone.end()
 
 
 @pytest.mark.parametrize("given", [True, False])

@@ -97,7 +97,7 @@ class TestEstimate:
             motion = estimate_motion(before.cloud, now.cloud, 0.1, AUTO, start)
             assert motion.twist[3:] == pytest.approx(mean[3:], abs=0.02 * SPEED)
             assert motion.twist[:3] == pytest.approx(mean[:3], abs=0.03)
-            assert (motion.matched > 0.8, motion.reason) == (True, "")
+            assert motion.reason == ""
         backwards = estimate_motion(drive[2].cloud, drive[1].cloud, 0.1, MotionConfig(spin="none"))
         assert backwards.twist[3] == pytest.approx(-SPEED, rel=0.05)
 

@@ -21,7 +21,7 @@ from calib_ros.registration.covariance import (
     covariance,
     effective_frames,
     effective_points,
-    noise_covariance,
+    inverse_curvature,
     noise_level,
     unobservable_directions,
 )
@@ -298,8 +298,7 @@ def test_other_optima_nearby_count_as_far_as_they_are_as_good():
     aside = se3.exp(np.array([0, 0.02, 0, 0, 0, 0])) @ nominal()  # 4 px, where the score is far lower
     alone = covariance(score, nominal())
     assert np.allclose(covariance(score, nominal(), others=[aside, nominal()]), alone, rtol=0.05, atol=1e-8)
-    bread = noise_covariance(score, nominal(), -1, np.arange(6), noise=1.0)
-    noise = noise_level(score, nominal(), -1, bread, np.arange(6))
+    noise = noise_level(score, nominal(), inverse_curvature(score, nominal(), np.arange(6)), np.arange(6))
     less = score.at(-1).value(nominal()) - score.at(-1).value(aside)
     alike = 20 * less / noise  # of so much noise that the two are nearly as probable
     spread = covariance(score, nominal(), others=[aside], inflation=alike) - covariance(score, nominal(), inflation=alike)
@@ -323,10 +322,10 @@ def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(mo
 def test_frames_of_few_points_are_less_certain():
     """Once as the mean of fewer points, and once more where all frames together have few."""
     score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
-    level, axes = score.n_levels - 1, np.arange(6)
+    axes = np.arange(6)
     some = score.subset(120, np.random.default_rng(0))
-    bread = noise_covariance(score, nominal(), level, axes, 1.0)
-    enough, few = (noise_level(s, nominal(), level, bread, axes) for s in (score, some))
+    bread = inverse_curvature(score, nominal(), axes)
+    enough, few = (noise_level(s, nominal(), bread, axes) for s in (score, some))
     assert effective_points(some) < 130
     least = USUAL_NOISE / effective_frames(some) * FEW_POINTS * 4 / effective_points(some)
     assert few >= 0.99 * least * FEW_POINTS / effective_points(some)

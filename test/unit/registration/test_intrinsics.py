@@ -182,11 +182,6 @@ def test_a_right_camera_stays_so(scene):
         assert abs(change.value) < 2.5 * change.sigma, name
 
 
-def test_exact_intrinsics_are_left_alone(scene):
-    names = [own.name for own in lens_parameters(CameraConfig(focal_sigma=0.0), scene.camera, scene.camera)]
-    assert names == [RADIAL]
-
-
 @pytest.mark.parametrize(
     ("model", "D"), [("double_sphere", [-0.2, 0.5]), ("omnidir", [1.2, -0.1, 0.02, 1e-3, 0]), ("fov", [0.9])]
 )

@@ -46,10 +46,9 @@ def found(
     config: SearchConfig = SMALL,
     max_p_value: float = ACCEPTED,
     progress: Progress = SILENT,
-    observer: Watcher | None = None,
 ) -> SearchResult:
     start = scene.off(by)
-    score = FastScore(scene.features[:2], start, ScoreConfig(), 0.9, observer=observer)
+    score = FastScore(scene.features[:2], start, ScoreConfig(), 0.9)
     return search(score, start, box, config, unlimited(start), max_p_value, progress=progress)
 
 
@@ -174,21 +173,6 @@ class Ended(Exception):
     """What a callback raises."""
 
 
-class Watcher:
-    """An observer that notes its calls and where they come from."""
-
-    def __init__(self) -> None:
-        self.calls: list[int] = []
-        self.threads: set[str] = set()
-
-    def evaluated(self, count: int) -> None:
-        self.calls.append(count)
-        self.threads.add(threading.current_thread().name)
-
-    def linearised(self) -> None:
-        self.evaluated(0)
-
-
 def on_threads(scene: Scene, threads: int, **options: Any) -> tuple[object, ...]:
     """The bits of a search on so many threads."""
     result = found(scene, FAR, LARGE, replace(RANKED, threads=threads), **options)
@@ -230,14 +214,6 @@ def test_a_callback_that_raises_ends_the_search(scene, threads, after):
     calls = len(shares)
     assert on_threads(scene, threads) == on_threads(scene, 1)  # nothing of it is left
     assert len(shares) == calls
-
-
-def test_an_observer_is_told_in_order_by_one_thread(scene):
-    one, two = Watcher(), Watcher()
-    assert on_threads(scene, 1, observer=one) == on_threads(scene, 2, observer=two)
-    assert one.calls == two.calls
-    assert len(one.calls) > 100
-    assert two.threads == {threading.current_thread().name}
 
 
 def test_the_cpu_time_of_the_pool_is_that_of_its_owner():

@@ -19,7 +19,7 @@ from calib_ros.registration.classes import FrameSemantics, consistency_score, ed
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
-from calib_ros.registration.search.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
+from calib_ros.registration.search.search import GUIDE_LEVEL, SEED_LEVELS, Rounds, search
 from calib_ros.result import CONVERGED, REFUSED, Evidence, RefusalCode, Result
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.features import FEW_FRAMES_SHARE, frame_weights, importance
@@ -83,11 +83,11 @@ def test_the_search_is_seeded_by_classes_too(source, features):
     T = se3.perturb(source.reference, [3, -3, 3], [0.2, -0.2, 0.2])
     consistency = consistency_score([features[0].view])
     score = FastScore([features[0]], T, SOURCE.score, 0.9)
-    space = SearchSpace(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), guide=consistency)
+    space = Rounds(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), guide=consistency)
     by_edges, by_classes = space.strategies[0], space.strategies[-1]
-    assert type(by_classes.score) is type(consistency) is not type(by_edges.score)
-    assert by_classes.level == GUIDE_LEVEL
-    starts = np.array(seed_starts(space, by_classes, with_prior=False))
+    assert type(by_classes[1]) is type(consistency) is not type(by_edges[1])
+    assert by_classes[2] == GUIDE_LEVEL
+    starts = np.array(space.seed_starts(by_classes, with_prior=False))
     anywhere = se3.exp_many(np.random.default_rng(0).uniform(-1, 1, (500, 6)) * space.half) @ T
     seeded, by_chance = (consistency.values(some, GUIDE_LEVEL) for some in (starts, anywhere))
     assert seeded.min() > np.percentile(by_chance, 90)

@@ -15,11 +15,11 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.classes import Hypothesis
-from calib_ros.registration.initial_guess import allowed, near_lidar, poses, rotation_distance_deg
+from calib_ros.registration.initial_guess import allowed, near_lidar, poses
 from calib_ros.registration.motion_guess.registration import best_registration, search_boxes
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
-from calib_ros_semantics.first_guess.centroids import LEFT, RIGHT, SAME_DEG, STARTS, agreed_poses, find_pairs
+from calib_ros_semantics.first_guess.centroids import LEFT, RIGHT, agreed_poses, find_pairs
 from calib_ros_semantics.first_guess.guess import CANDIDATES, CENTROIDS, OTHER_WAY_DEG, first_guess
 from calib_ros_semantics.first_guess.score import class_score, label_score, refine_positions
 from calib_ros_semantics.first_guess.view import ClassView, class_view
@@ -113,15 +113,6 @@ def turned_away(T: np.ndarray, yaw_deg: float) -> np.ndarray:
     return T @ se3.from_parts(se3.rotation_from_euler(np.deg2rad(yaw_deg), 0, 0), np.zeros(3))
 
 
-def test_more_frames_bring_centroids_nearer() -> None:
-    T = mounted(70.0, 3)
-    errors = []
-    for count in (1, 4):
-        found = agreed_poses(find_pairs([balls(T, seed, 15, 60) for seed in range(count)]), 0)
-        errors.append(se3.translation_error_m(T, found[0]))
-    assert errors[1] < min(0.7 * errors[0], 0.2)
-
-
 def test_evidence_of_centroids_has_the_slope_that_it_says() -> None:
     T = mounted(20.0)
     pairs = replace(find_pairs([balls(T, 0, 15, 60)]), parallax=1.0)
@@ -166,20 +157,6 @@ def test_optimisations_reach_every_allowed_place() -> None:
     T = poses(np.full(6, 0.3), np.zeros(6), np.zeros(6), 1.9 * np.r_[np.eye(3), -np.eye(3)])
     assert allowed(T).all()
     assert np.array([near_lidar(own).clip(own) for own in T]) == pytest.approx(T)
-
-
-def test_rotations_that_fewer_pairs_agree_on_follow_for_the_maps_to_judge(street_views) -> None:
-    pairs = find_pairs(street_views[0])
-    found = agreed_poses(pairs, 0)
-    assert len(found) > 5 * STARTS
-    assert pairs.per_object(found[:1]) > 2 * pairs.per_object(found[STARTS:]).max()
-    assert rotation_distance_deg(found[STARTS:-1], found[-1]).min() > SAME_DEG[0]
-
-
-def test_objects_are_enough() -> None:
-    """40 of 120 objects mislabelled in the image."""
-    T = mounted(25.0, 1)
-    assert_near(T, first_guess([balls(T, seed, 40) for seed in range(3)])[0].T, 1.0, 0.3)
 
 
 @pytest.mark.parametrize("yaw", [pytest.param(180.0, marks=pytest.mark.slow), -135.0])

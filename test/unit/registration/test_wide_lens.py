@@ -19,6 +19,7 @@ from calib_ros.lidar.edges import UPWARD, EdgePoints
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, rectified_camera
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.fast_score import FastScore
+from calib_ros_synthetic.rigs import RIGS
 
 WIDTH, HEIGHT = 340, 160
 CAMERA = Camera(np.array([[100.0, 0, 168.2], [0, 105, 81.3], [0, 0, 1]]), WIDTH, HEIGHT, SPHERE)  # 194 deg wide
@@ -120,18 +121,26 @@ def test_lines_parallel_to_the_cameras_y_axis_are_edges_of_one_kind_everywhere(m
     assert FeatureExtractor(Camera(np.diag([300.0, 300, 1]), 400, 300)).across is None
 
 
-@pytest.fixture(scope="module")
-def fisheye() -> Frame:
-    return open_dataset("synthetic:rig=os1_128_fisheye,seed=5,frames=1,width=480")[0]
+MODELS = {"equidistant": None, "double_sphere": (-0.2, 0.6), "omnidir": (1.4, -0.05, 0.0, 1e-3, -1e-3)}
 
 
-def test_a_fisheye_is_used_beyond_its_image_plane_and_finds_the_extrinsic(fisheye):
+@pytest.mark.parametrize("model", MODELS)
+def test_a_fisheye_of_any_model_is_used_beyond_its_image_plane_and_finds_the_extrinsic(model, monkeypatch):
+    """OpenCV has maps for none but the first."""
+    rig = RIGS["os1_128_fisheye"]
+    if model != "equidistant":
+        rig = replace(rig, lens=replace(rig.lens, model=model, D=MODELS[model]))
+    monkeypatch.setitem(RIGS, "os1_128_fisheye", rig)
+    frame = open_dataset("synthetic:rig=os1_128_fisheye,seed=5,frames=1,width=480")[0]
+    assert frame.camera.model == model
+    assert frame.camera.field_deg == pytest.approx(190, abs=2)
     config = Config(semantics=SemanticsConfig(image_classes="", cloud_classes=""))
-    extract = FeatureExtractor(fisheye.camera, config)
+    extract = FeatureExtractor(frame.camera, config)
     assert extract.camera.is_sphere
     assert extract.camera.width / extract.camera.K[0, 0] > np.deg2rad(185)
-    assert 0.9 < extract.used.mean() < 1
-    start = se3.exp([0.015, -0.02, 0.01, 0.06, -0.05, 0.08]) @ fisheye.reference
-    result = Calibrator(fisheye.camera, config).calibrate([fisheye], initial=start)
-    assert se3.rotation_error_deg(fisheye.reference[:3, :3], result.T_camera_lidar[:3, :3]) < 0.2
-    assert se3.translation_error_m(fisheye.reference, result.T_camera_lidar) < 0.04
+    assert 0.8 < extract.used.mean() < 1
+    start = se3.exp([0.015, -0.02, 0.01, 0.06, -0.05, 0.08]) @ frame.reference
+    result = Calibrator(frame.camera, config).calibrate([frame], initial=start)
+    assert result.converged
+    assert se3.rotation_error_deg(frame.reference[:3, :3], result.T_camera_lidar[:3, :3]) < 0.2
+    assert se3.translation_error_m(frame.reference, result.T_camera_lidar) < 0.04
