@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ NEAR = SearchBox(NEAR_DEG, NEAR_M)
 NOT_JUDGED = "one scene does not tell, nor do unrolled pictures of wide lenses"
 LENS, MIX_UPS = "intrinsics", "causes"  # stages that progress tells of, besides those of an estimate
 CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
+Z_SCORE = attrgetter("z_score")
 FEW_FRAMES = 3  # tell which camera may have taken the pictures
 
 
@@ -97,7 +99,7 @@ class Alternatives:
                 if offset_s:
                     features = [at_time_offset(f, offset_s) for f in features]
                 own = starts if guess.start is None else (guess.start,)
-                yield max((fit(guess, self.score(features, T), T) for T in own), key=_z_score)
+                yield max((fit(guess, self.score(features, T), T) for T in own), key=Z_SCORE)
 
     def as_given(self, features: Sequence[FrameFeatures], T: Transform, optima: Sequence[Matrix]) -> Match | None:
         """The best match of the sensors as they are given: the optimum near T (4, 4), as of every hypothesis, or one of the
@@ -161,7 +163,7 @@ class Alternatives:
         guesses = list(camera_guesses(self.camera))
         count += len(guesses)
         # One after the other: each holds the maps of all frames.
-        other = max(self.cameras(guesses, (inputs.T,), inputs, frames=some), key=_z_score, default=None)
+        other = max(self.cameras(guesses, (inputs.T,), inputs, frames=some), key=Z_SCORE, default=None)
         if other is not None and len(some) < len(features):
             other = next(self.cameras([other.hypothesis], (inputs.T,), inputs), None)
         if other is not None and self._stands(other, given, count, rare_odds(count)):
@@ -220,10 +222,6 @@ class Alternatives:
         """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
         another score of the same frames."""
         return self._calibrator.objectives(features, T, T, atlas=atlas).edges.score
-
-
-def _z_score(match: Candidate[Any]) -> float:
-    return match.z_score
 
 
 def _is_only_off(one: Candidate[MixUp], inputs: CheckInputs) -> bool:

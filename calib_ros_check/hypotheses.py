@@ -144,8 +144,10 @@ def _clouds(T: Transform, poses: Sequence[ScannerPose], frames: Mapping[str, Mat
     yield MixUp(Cause.CLOUD_FRAME, np.eye(4), already.format("optical"))
     yield MixUp(Cause.CLOUD_FRAME, _BODY, already.format("body"), usual=True)
     for R in axis_rotations():
+        # For p_cloud = R p_expected, what each of the cloud's axes is of the expected ones.
+        axes = ", ".join(f"{'-' if row[np.abs(row).argmax()] < 0 else ''}{AXIS_LETTERS[np.abs(row).argmax()]}" for row in R)
         what = (
-            f"the points have other axes than the extrinsic expects: their x, y and z are its {_axes_of(R)}; mend the driver's "
+            f"the points have other axes than the extrinsic expects: their x, y and z are its {axes}; mend the driver's "
             "axes, or the transform to the frame that the cloud names"
         )
         yield MixUp(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(R, np.zeros(3))), what)
@@ -174,11 +176,6 @@ def axis_rotations() -> list[Matrix]:
             if np.linalg.det(R) > 0 and not np.allclose(R, np.eye(3)):
                 out.append(R)
     return sorted(out, key=lambda R: (R[2, 2] < 0.5, round(float(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))), 6)))
-
-
-def _axes_of(R: Matrix) -> str:
-    """For p_cloud = R p_expected, what each of the cloud's axes is of the expected ones."""
-    return ", ".join(f"{'-' if row[np.abs(row).argmax()] < 0 else ''}{AXIS_LETTERS[np.abs(row).argmax()]}" for row in R)
 
 
 def _turned(T: Transform, deg: float) -> Matrix:

@@ -11,6 +11,7 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.config import Config
+from calib_ros.datasets.positions import spread_positions
 from calib_ros.frame import Frame
 from calib_ros.io import check_output
 from calib_ros.lidar.deskew import deskewed_frame
@@ -138,7 +139,8 @@ def write_report(path: str | Path, result: CheckResult, frames: Sequence[Frame],
         "time": f"{result.elapsed_s:.1f} s ({result.cpu_s:.1f} s of CPU)",
         "checked": result.stamp,
     }
-    pictures = [(frame.name, picture_of(frame, result.T_checked, result.T_estimated, config)) for frame in _shown(frames)]
+    shown = [frames[k] for k in spread_positions(PICTURES, len(frames))]
+    pictures = [(frame.name, picture_of(frame, result.T_checked, result.T_estimated, config)) for frame in shown]
     write_page(
         path,
         page_template(TEMPLATE),
@@ -194,12 +196,6 @@ def _bar(own: Deviation, limit: float) -> dict[str, object]:
         "interval": (round(low, 1), round(max(high - low, 1.0), 1)),
         "median": round(at(own.error) - 0.75, 1),
     }
-
-
-def _shown(frames: Sequence[Frame]) -> list[Frame]:
-    """A few frames, evenly spread."""
-    n = min(PICTURES, len(frames))
-    return [frames[int((k + 0.5) * len(frames) / n)] for k in range(n)]
 
 
 def picture_of(frame: Frame, T_checked: Transform, T_found: Transform | None, config: Config) -> bytes:

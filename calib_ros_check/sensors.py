@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from heapq import nlargest
 from itertools import chain, product
+from operator import attrgetter
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -64,6 +65,7 @@ class LensChange:
 
 
 LensFit = Candidate[LensChange]
+PENALISED_GAIN = attrgetter("penalised_gain")
 
 
 def moves_by(fitted: LensFit, camera: Camera) -> float:
@@ -118,7 +120,7 @@ def fit_lens(
     ends = (fitting.end(lens, start, LEVELS) for lens, start in tried)  # one after the other: each may hold maps of its own
     if wide:
         ends = (fitting.descend(end, STEPS[0]) for end in nlargest(BEST, ends, key=lambda end: end.value))
-    best = max(chain([fitting.given], ends), key=_penalised_gain)
+    best = max(chain([fitting.given], ends), key=PENALISED_GAIN)
     if best.significant:
         for step in STEPS:
             best = fitting.descend(best, step)
@@ -199,11 +201,7 @@ class _Fitting:
             before = best
             for name, sign in product(NAMES, (1, -1)):
                 lens = replace(best.hypothesis, **{name: round(getattr(best.hypothesis, name) + sign * step, 6)})
-                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=_penalised_gain)
+                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=PENALISED_GAIN)
             if best is before:
                 break
         return best
-
-
-def _penalised_gain(candidate: LensFit) -> float:
-    return candidate.penalised_gain

@@ -177,18 +177,13 @@ def vehicles(rows: Sequence[Row], false_alarms: float = FALSE_ALARMS) -> tuple[l
         sequence = sequences[name].with_scatter(variances)
         found = segments(sequence, false_alarms)
         _mark(own, sequence, found)
-        out.append(Vehicle(name, ordered[name], own, sequences[name], found, _changes(name, own, found)))
+        newest_is_alone, changes = np.count_nonzero(found.labels == len(found.means) - 1) == 1, []
+        for k, (before, after) in enumerate(found.changes):
+            value, covariance = found.means[k + 1] - found.means[k], found.covariances[k + 1] + found.covariances[k]
+            confirmed = not (after == len(own) - 1 and newest_is_alone)
+            changes.append(VehicleChange(name, own[before], own[after], value, covariance, confirmed))
+        out.append(Vehicle(name, ordered[name], own, sequences[name], found, changes))
     return out, variances
-
-
-def _changes(name: str, known: Sequence[Row], found: Segments) -> list[VehicleChange]:
-    newest_is_alone = np.count_nonzero(found.labels == len(found.means) - 1) == 1
-    out = []
-    for k, (before, after) in enumerate(found.changes):
-        value, covariance = found.means[k + 1] - found.means[k], found.covariances[k + 1] + found.covariances[k]
-        confirmed = not (after == len(known) - 1 and newest_is_alone)
-        out.append(VehicleChange(name, known[before], known[after], value, covariance, confirmed))
-    return out
 
 
 def _mark(known: Sequence[Row], sequence: Extrinsics, found: Segments) -> None:

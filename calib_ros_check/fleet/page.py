@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import CalibrationError
 from calib_ros_check.fleet.certificates import Certificate
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
@@ -240,8 +241,7 @@ def pictures_of(own: Certificate, options: CheckOptions) -> list[tuple[str, byte
     try:
         source = opened(job.path, options)
         positions = positions_of(source, options)
-        n = min(PICTURES, len(positions))
-        few = [positions[int((k + 0.5) * len(positions) / n)] for k in range(n)]
+        few = [positions[k] for k in spread_positions(PICTURES, len(positions))]
         frames = read_frames(source, few, options.config, lambda share: None, None)[0]
         return [(frame.name, picture_of(frame, own.T_checked, own.T_found, options.config)) for frame in frames]
     except CalibrationError:

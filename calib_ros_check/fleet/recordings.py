@@ -74,16 +74,12 @@ def is_fleet(sources: Sequence[str]) -> bool:
     if len(sources) != 1:
         return True
     path = Path(sources[0]).expanduser()
-    if not path.is_dir() or is_single(path) or _is_empty(path):
+    try:
+        if not path.is_dir() or is_single(path) or not any(path.iterdir()):
+            return False
+    except OSError:  # said when it is opened
         return False
     return len(drives_in(path)) != 1
-
-
-def _is_empty(folder: Path) -> bool:
-    try:
-        return not any(folder.iterdir())
-    except OSError:
-        return True  # said when it is opened
 
 
 def _found_in(source: str) -> list[str]:

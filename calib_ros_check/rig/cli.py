@@ -41,14 +41,9 @@ def summary(found: RigCheck) -> str:
     """What is printed: the verdict, sensors, pairs, loops, notes."""
     rows = [(name, own.verdict.value, own.reason) for name, own in found.sensors.items()]
     rows += [(f"{pair.target} with {pair.source}", pair.verdict.value, pair.reason) for pair in found.pairs]
-    rows += [
-        (f"loop {', '.join(loop.sensors)}", "closes" if loop.closes else "open", "{:.2f} deg, {:.1f} cm".format(*_cm(loop.size)))
-        for loop in found.solution.loops
-    ]
+    for loop in found.solution.loops:
+        size = f"{loop.size[0]:.2f} deg, {100 * loop.size[1]:.1f} cm"
+        rows.append((f"loop {', '.join(loop.sensors)}", "closes" if loop.closes else "open", size))
     width = max(len(row[0]) for row in rows)
     lines = [f"  {name:<{width}}  {verdict:<12}  {reason}" for name, verdict, reason in rows]
     return "\n".join([f"{found.verdict.value}: {found.reason}", *lines, *(f"  {note}" for note in found.notes)])
-
-
-def _cm(size: tuple[float, float]) -> tuple[float, float]:
-    return size[0], 100 * size[1]

@@ -8,8 +8,7 @@ from calib_ros.config import Config
 from calib_ros.result import VERSION
 from calib_ros_check.page import page_template, write_page
 from calib_ros_check.report import SHEET, STYLE, picture_of
-from calib_ros_check.rig.check import RigCheck
-from calib_ros_check.tolerance import Judgement
+from calib_ros_check.rig.check import PairCheck, RigCheck, SensorCheck
 
 TEMPLATE = (
     f"{{% block style %}}\n{STYLE}{{% endblock %}}"
@@ -42,8 +41,11 @@ TEMPLATE = (
 
 def write_rig_page(path: str | Path, found: RigCheck, config: Config) -> None:
     """Write the page, atomically. MissingDependencyError without Jinja2, BadInputError if the folder cannot be written."""
-    sensors = [[name, own.verdict.value, *_errors(own.judgement), own.reason] for name, own in found.sensors.items()]
-    pairs = [[f"{p.target} with {p.source}", p.verdict.value, *_errors(p.judgement), p.reason] for p in found.pairs]
+    told: list[tuple[str, SensorCheck | PairCheck]] = [*found.sensors.items()]
+    told += [(f"{p.target} with {p.source}", p) for p in found.pairs]  # a pair may be there twice
+    rows = [
+        [name, own.verdict.value, own.judgement.rotation.words, own.judgement.translation.words, own.reason] for name, own in told
+    ]
     loops = [
         [", ".join(loop.sensors), "yes" if loop.closes else "no", f"{loop.size[0]:.2f} deg", f"{100 * loop.size[1]:.1f} cm"]
         for loop in found.solution.loops
@@ -64,13 +66,9 @@ def write_rig_page(path: str | Path, found: RigCheck, config: Config) -> None:
         facts={"recording": found.source, "reference": found.solution.reference, "version": VERSION},
         found=found,
         tables=[
-            ("Sensors", ["sensor", *names], sensors),
-            ("Pairs", ["pair", *names], pairs),
+            ("Sensors", ["sensor", *names], rows[: len(found.sensors)]),
+            ("Pairs", ["pair", *names], rows[len(found.sensors) :]),
             ("Loops", ["sensors", "closes", "rotation", "translation"], loops),
         ],
         pictures=pictures,
     )
-
-
-def _errors(judgement: Judgement) -> list[str]:
-    return [judgement.rotation.words, judgement.translation.words]
