@@ -146,13 +146,8 @@ def test_removed_options_are_ignored_with_one_warning(read, form):
     assert len(caught) == 1
     with pytest.warns(FutureWarning, match=r"; in place of semantics\.first_guess there is initial\.method: semantic$"):
         Config.from_dict({"semantics": {"first_guess": True, "witness": False}})
-    for form in FORMS:  # of a stage that there is no more
-        with pytest.warns(FutureWarning, match=r"^guess\.tilt_deg has .*; in place of guess\.tilt_deg there is --initial FILE"):
-            assert read(form.format(stage="guess", name="tilt_deg", value=30.0)) == Config()
     with pytest.raises(ConfigError, match=r"unknown parameter 'guess\.tilt'"):
         Config.from_dict({"guess": {"tilt": 30.0}})
-    with pytest.warns(FutureWarning, match=r"; in place of thesis\.completion there is morphology, eq\. 3\.11$"):
-        assert Config.from_dict({"thesis": {"completion": "own.onnx"}}) == Config()
 
 
 def test_all_removed_options_at_once_make_one_warning_a_stage():

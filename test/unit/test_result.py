@@ -161,6 +161,10 @@ GARBAGE = {
     f'{{"T_camera_lidar": {EYE}, "covariance": [[1, 2], [3, 4]]}}': "covariance must be a finite 6x6",
     f'{{"T_camera_lidar": {EYE}, "score": "good"}}': "must be numbers",
     f'{{"T_camera_lidar": {EYE}, "frames_used": 1e999}}': "must be numbers",
+    f'{{"T_camera_lidar": {EYE}, "frames_used": 4294967296}}': "frames_used",
+    f'{{"T_camera_lidar": {EYE}, "camera_frame": {{"a": 1}}}}': "camera_frame",
+    f'{{"T_camera_lidar": {EYE}, "stamping": "fast"}}': "stamping must have a spin",
+    f'{{"T_camera_lidar": {EYE}, "stamping": {{"spin": "clockwise", "azimuth_deg": 400}}}}': "stamping must have a spin",
 }
 
 

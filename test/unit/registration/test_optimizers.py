@@ -59,12 +59,6 @@ def test_the_optimum_is_found_within_the_evaluations(optimise, far, most_calls, 
         assert value > max(0.7 - less, score.value(start(seed, *far)))
 
 
-def test_a_simplex_crosses_ripples():
-    T, value = nelder_mead(Bumpy(), start(1), 0.8, 600)
-    assert near(T, 0.2, 0.2)
-    assert value > Bumpy().value(start(1))
-
-
 def test_the_result_is_never_worse_than_the_start():
     for seed, score in itertools.product(range(5), (Bowl(), Bumpy(), Noise())):
         for T0 in (start(seed), OPTIMUM):
@@ -74,14 +68,7 @@ def test_the_result_is_never_worse_than_the_start():
                 assert np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
 
 
-def test_a_flat_score_is_left_where_it_is():
-    flat = Bowl(curvature=np.zeros((6, 6)))
-    for T, value in (levenberg_marquardt(flat, start(2)), nelder_mead(flat, start(2)), barzilai_borwein(flat, start(2))):
-        assert np.allclose(T, start(2))
-        assert value == 0.7
-
-
-def test_nan_score_raises_no_error():
+def test_a_flat_score_and_nan_are_left_where_they_are():
     class Broken(Bowl):
         def value(self, T):
             return float("nan")
@@ -93,6 +80,9 @@ def test_nan_score_raises_no_error():
         T, value = optimise(Broken(), start(2))
         assert np.array_equal(T, start(2))
         assert np.isnan(value)
+        T, value = optimise(Bowl(curvature=np.zeros((6, 6))), start(2))
+        assert np.allclose(T, start(2))
+        assert value == 0.7
 
 
 @pytest.mark.parametrize("evaluations", [20, 50, 137])

@@ -138,19 +138,13 @@ def test_frame_weights_grow_with_the_share_of_main_classes_and_have_mean_one() -
     classes[5:] = UNLABELLED
     assert importance(classes) == pytest.approx(0.1)
     assert importance(np.full((4, 4), UNLABELLED, np.uint8)) is None
+    unknown = frame_weights([0.0, None, 0.2])
+    assert (unknown[1], unknown.mean()) == (1, pytest.approx(1))
+    assert frame_weights([0.0, 0.0]).tolist() == frame_weights([None, None]).tolist() == [1, 1]
     weights = frame_weights([0.0, 0.1, 0.35])
     assert weights.mean() == pytest.approx(1)
     assert weights[1] / weights[0] == pytest.approx((0.1 + FEW_FRAMES_SHARE) / FEW_FRAMES_SHARE)
     assert weights[2] / weights[1] == pytest.approx((0.35 + FEW_FRAMES_SHARE) / (0.1 + FEW_FRAMES_SHARE))
-
-
-def test_a_frame_of_unknown_classes_weighs_as_much_as_others_on_average() -> None:
-    weights = frame_weights([0.0, None, 0.2])
-    assert weights[1] == 1
-    assert weights[0] + weights[2] == pytest.approx(2)
-    assert frame_weights([None, None]).tolist() == [1, 1]
-    assert frame_weights([0.0, 0.0]).tolist() == [1, 1]
-    assert frame_weights([]).shape == (0,)
 
 
 def test_weights_of_edges_change_their_strength_alone() -> None:

@@ -90,12 +90,3 @@ def test_an_offset_of_half_a_scan_is_a_convention(seconds, expected, left):
     assert found.stamp_at == expected
     assert rest == pytest.approx(left, abs=1e-9)
     assert convention(Stamping("none", 0.0), seconds, 0.1)[1] == seconds
-
-
-@pytest.mark.parametrize("value", ["fast", "{spin: left, azimuth_deg: 0}", "{spin: clockwise, azimuth_deg: 400}"])
-def test_a_saved_stamping_must_be_one(value):
-    from calib_ros.result import INITIAL, Result
-
-    text = Result(np.eye(4), INITIAL).dumps(yaml_format=True).replace("stamping: null", f"stamping: {value}")
-    with pytest.raises(Exception, match="stamping must have a spin"):
-        parse(text, "a file")
