@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib_ros.camera import SPHERE, Camera, Rectifier, across_meridians
+from calib_ros.camera import SPHERE, Camera, Rectifier
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.features import working_camera
@@ -124,20 +124,6 @@ def test_the_radius_on_a_sphere_is_the_angle_from_the_axis():
     assert inside.tolist() == [True, False, False, True, True, False, False]
     assert np.isnan(uv[5]).all()  # too near
     assert not SPHERE_CAMERA.is_pinhole
-
-
-def test_lines_parallel_to_the_y_axis_are_known_on_a_sphere():
-    across = across_meridians(SPHERE_CAMERA)
-    assert np.allclose(np.linalg.norm(across, axis=0), 1)
-    for x, z in ((1, 2), (-3, 1), (2, -0.5)):
-        y = np.linspace(-3, 3, 61)
-        uv, inside = SPHERE_CAMERA.project(np.c_[np.full_like(y, x), y, np.full_like(y, z)])
-        between = inside[1:] & inside[:-1]
-        line, middle = np.diff(uv, axis=0)[between], np.rint((uv[1:] + uv[:-1])[between] / 2).astype(int)
-        own = across[:, middle[:, 1], middle[:, 0]]
-        assert between.sum() > 10
-        assert (np.abs((own.T * line).sum(axis=1)) < 0.03 * np.linalg.norm(line, axis=1)).all()
-    assert np.allclose(across[:, 150], [[1], [0]])  # on the horizon lines stand upright
 
 
 def test_the_field_is_what_lies_between_the_borders():

@@ -95,18 +95,6 @@ def test_nan_score_raises_no_error():
         assert np.isnan(value)
 
 
-def test_barzilai_borwein_takes_far_fewer_steps_than_a_fixed_step_where_axes_differ():
-    """What its step length is for: along a valley forty times longer than wide."""
-    bowl = Bowl(curvature=np.diag([400.0, 400, 400, 0.1, 0.1, 0.1]))
-    begin = start(1)
-    _, value = barzilai_borwein(bowl, begin, 2.0, evaluations=400)
-    T = begin
-    for _ in range(30):  # as many evaluations: steepest ascent of a step that does not overshoot
-        gradient, _ = bowl.linearise(T)
-        T = se3.exp(gradient / 400) @ T
-    assert bowl.top - value < 0.1 * (bowl.top - bowl.value(T))
-
-
 @pytest.mark.parametrize("evaluations", [20, 50, 137])
 def test_barzilai_borwein_respects_its_budget_and_returns_the_best(evaluations):
     noise = Noise()
@@ -117,22 +105,3 @@ def test_barzilai_borwein_respects_its_budget_and_returns_the_best(evaluations):
     assert noise.calls <= evaluations
     assert value >= before
     assert value == noise.value(T)
-
-
-class Plateau(Bowl):
-    """Whose Gauss-Newton scale is six times its curvature, as that of a mean of map values may be."""
-
-    def linearise(self, T):
-        gradient, curvature = super().linearise(T)
-        return gradient, 6 * curvature
-
-
-def test_near_the_optimum_the_curvature_is_learned():
-    used = {}
-    for near_it in (False, True):
-        score = Plateau()
-        T, value = levenberg_marquardt(score, start(3), 100, near=near_it)
-        assert near(T, 0.02, 0.003)
-        assert value > 0.7 - 1e-5
-        used[near_it] = score.calls
-    assert used[True] < 0.5 * used[False]

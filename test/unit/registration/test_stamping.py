@@ -12,7 +12,7 @@ from calib_ros.config import update
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, convention, restamped
+from calib_ros.registration.nuisance.stamping import convention
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Stamping, parse
 
@@ -79,23 +79,6 @@ def test_the_recalibrator_moves_its_keyframes_to_the_convention(end_of_the_scan)
     moved = recalibrator.buffer[0].points.xyz
     assert moved.shape == expected.shape
     assert np.median(np.abs(moved - expected)) < 0.005
-
-
-@pytest.mark.parametrize("other", CONVENTIONS[1:], ids=str)
-def test_restamped_features_are_those_of_that_configuration(end_of_the_scan, other):
-    scene = end_of_the_scan
-    before = QUICK.motion
-    after = at_stamping(before, other)
-    frame = replace(scene.frames[1], cloud=replace(scene.frames[1].cloud, time=None))
-    extracted = FeatureExtractor(
-        scene.camera, update(QUICK, {"motion": {"spin": after.spin, "stamp_azimuth_deg": other.azimuth_deg}})
-    )
-    expected = extracted(frame).points
-    points = restamped(scene.quick.extract(frame), before, after).points
-    away = np.abs(points.xyz - expected.xyz).max(axis=1)
-    assert (away < 1e-3).mean() > 0.99  # a point at the seam may fall to either side
-    there_and_back = restamped(restamped(scene.quick.extract(frame), before, after), after, before).points
-    assert (np.abs(there_and_back.xyz - scene.quick.extract(frame).points.xyz).max(axis=1) < 1e-3).mean() > 0.99
 
 
 @pytest.mark.parametrize(
