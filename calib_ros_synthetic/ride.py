@@ -1,14 +1,13 @@
-"""How the vehicle of a synthetic drive moves, and how its sensors stamp what they measure."""
+"""How the vehicle of a synthetic drive moves, and what of a scan its stamp refers to."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
-from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros_synthetic.solids import Floats
 from calib_ros_synthetic.street import LIDAR_HEIGHT, Path
 
@@ -43,32 +42,6 @@ class Timetable:
     @property
     def _phase(self) -> float:
         return float(np.random.default_rng([self.seed, 12]).uniform(0, 2 * np.pi))
-
-
-@dataclass(frozen=True)
-class StampErrors:
-    """What the stamps of a drive's messages say about when they were measured.
-
-    image_late_s: images are stamped that much late. jitter_s: standard deviation of their stamps. stamp_at: part of the scan
-    that a cloud's stamp refers to.
-    """
-
-    seed: int
-    image_late_s: float = 0.0
-    jitter_s: float = 0.0
-    stamp_at: str = "middle"
-
-    def image(self, stamp: int, index: int) -> int:
-        """The stamp, ns, of an image of the moment `stamp`."""
-        jitter = self.jitter_s * np.random.default_rng([self.seed, 11, index]).standard_normal() if self.jitter_s else 0.0
-        return stamp + round((self.image_late_s + jitter) * NANOSECONDS)
-
-    def cloud(self, stamp: int, cloud: PointCloud, period_s: float) -> tuple[int, PointCloud]:
-        """Stamp, ns, and cloud of a scan that faced ahead at `stamp`; its points' times count from the new stamp."""
-        shift = STAMP_AT[self.stamp_at] * period_s
-        if shift and cloud.time is not None:
-            cloud = replace(cloud, time=(cloud.time - shift).astype(np.float32))
-        return stamp + round(shift * NANOSECONDS), cloud
 
 
 @dataclass(frozen=True)
