@@ -23,7 +23,7 @@ from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.ego import OwnLayer
 from calib_ros_synthetic.installation import Installation
 from calib_ros_synthetic.rays import CameraView
-from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, Timetable
+from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride
 from calib_ros_synthetic.rigs import RIGS, Fields
 from calib_ros_synthetic.scanners import PERIOD, PLAIN, SpinningScanner, in_frame, plain_scanner
 from calib_ros_synthetic.scenes import SCENES
@@ -172,11 +172,9 @@ class SyntheticDrive:
             self._scanner = self._installed.scanner
         if T_camera_lidar is not None:
             self.reference = se3.as_transform(T_camera_lidar, "T_camera_lidar")
-        weaving = ride == WEAVING
-        timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
-        street = world(self.seed, timetable.station(self._seconds(self._frames)))
-        way = Ride(street.path, self.seed, street.lane, weaving)
-        self._trip = Trip(street, way, timetable, weather, self.noise, self.speed > 0, spin)
+        way = Ride(self.seed, self.speed or cruise, ride == WEAVING)
+        street = world(self.seed, way.station(self._seconds(self._frames)))
+        self._trip = Trip(street, way, weather, self.noise, self.speed > 0, spin)
         self._view: CameraView | None = None
         self._own: OwnLayer | None = None
         self._made = Recent(CACHED_FRAMES)
