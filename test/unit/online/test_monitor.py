@@ -18,7 +18,6 @@ from calib_ros.online.monitor import (
     TESTS_PER_HOUR,
     Assessment,
     Monitor,
-    ShiftTest,
     Verdict,
     clock_covariance,
     measure_shift,
@@ -204,27 +203,6 @@ def test_the_rate_of_false_alarms_is_the_threshold(scene, monkeypatch):
     assert verdicts == [Verdict.SUSPECT, Verdict.INCONCLUSIVE]
 
 
-AGAINST = ShiftTest(1e-6, np.array([0, 0, 0, 0, 0, 0.5]), 8.0, True, evidence=20.0)
-SMALL_SHIFT = replace(AGAINST, shift=np.array([0, np.deg2rad(0.2), 0, 0, 0, 0.08]))
-
-
-@pytest.mark.parametrize(
-    ("test", "changes", "unknown_motion_s", "against"),
-    [
-        (AGAINST, {}, 0.0, True),
-        (AGAINST, {"conclusive": False}, 0.0, False),
-        (AGAINST, {"significant": False}, 0.0, False),  # an empty road: the refinement ends somewhere, and claims to know it
-        # A small shift counts only while the motion during the scan is known: 10 Hz, a lens of 80 deg.
-        (SMALL_SHIFT, {}, 0.0, True),
-        (SMALL_SHIFT, {}, 0.011, False),
-        (SMALL_SHIFT, {"shift": 2 * SMALL_SHIFT.shift}, 0.011, True),
-    ],
-)
-def test_what_speaks_against_an_extrinsic(scene, test, changes, unknown_motion_s, against):
-    keyframes = [replace(f, unknown_motion_s=s) for f, s in zip(scene.features, (0.0, unknown_motion_s), strict=False)]
-    assert Monitor(CONFIG)._evidence(replace(test, **changes), keyframes) == (20.0 if against else 0.0)
-
-
 def poor(f) -> FrameFeatures:
     """A keyframe that shows a thirtieth of its edges."""
     return replace(f, points=f.points.select(np.arange(0, len(f.points), 30)))
@@ -267,15 +245,6 @@ def test_pictures_of_another_scene_are_not_significant(scene):
     right = measure_shift(scene.calibrator, scene.features[:1], scene.truth)
     assert right.significant
     assert 100 < right.points < len(scene.features[0].points)
-
-
-def test_fewer_keyframes_than_suspected_raise_no_error(scene, displaced):
-    """The buffer was cut short meanwhile."""
-    drive = Drive(scene, known=5)
-    drive.check(displaced[0], scene.truth)
-    drive.keyframes = []
-    assert drive.check(displaced[1], scene.truth).verdict == Verdict.SUSPECT
-    assert drive.check(displaced[2], scene.truth).verdict == Verdict.MOVED
 
 
 def test_what_the_clocks_leave_open_in_a_bend_is_no_movement(scene):

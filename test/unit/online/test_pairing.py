@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import itertools
 import re
-import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from driven import config
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import MotionConfig, update
-from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.lidar.deskew import deskewed_points
+from calib_ros.config import MotionConfig
+from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros.lidar.sweep import SweepOffset
-from calib_ros.messages.point_fields import seconds_from_stamp
-from calib_ros.online.events import Event, FrameIngested, Inputs, Problem
 from calib_ros.online.pairing.epochs import ClockDifference
 from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pairing.synchronizer import Synchronizer
-from calib_ros.online.pipeline import Pipeline
-from calib_ros.result import INITIAL, Extrinsic, Result
-from calib_ros_synthetic.drive import SyntheticDrive
 
 MS = 10**6
 T0 = 1_700_000_000 * NANOSECONDS
@@ -249,13 +241,6 @@ def ticks(hz: float, seconds: float = 20.0, jitter: float = 3.0, lost: float = 0
     return np.sort(t + rng.uniform(-jitter, jitter, len(t)))[rng.random(len(t)) >= lost]
 
 
-@pytest.mark.parametrize(("camera_hz", "scan_hz"), [(10, 10), (20, 10), (30, 10), (10, 20), (5, 20), (1, 10)])
-def test_different_rates_and_a_looping_recording_are_no_problem(camera_hz, scan_hz):
-    watched = Watched()
-    for _ in range(2):
-        assert set(watched.feed(ticks(camera_hz), ticks(scan_hz, seed=1) + 20)) == {""}
-
-
 @pytest.mark.parametrize(
     ("watched", "streams", "said"),
     [
@@ -339,116 +324,3 @@ def test_a_clock_that_jumps_between_pairs_has_time_to_come_back():
     assert changed(5, 0) + changed(5, jump) + changed(5, 0) + changed(9, jump) == 0
     assert (changed(2, jump), clocks.ahead) == (1, pytest.approx(jump, abs=100 * MS))
     assert (changed(2, 0), clocks.ahead) == (1, 0)
-
-
-def fed(start, decode, sink=lambda event: None, **settings) -> Pipeline:
-    """A pipeline whose messages are frames of the camera in front."""
-    inputs = Inputs(decode, lambda *_: ("camera", "lidar"), start, lambda cloud: cloud.cloud)
-    return Pipeline(update(config(mode="manual"), settings), inputs, sink)
-
-
-def test_a_pipeline_pairs_what_is_received_together(street: list[Frame]) -> None:
-    """Until the difference is known nothing belongs together; then each scan goes with its image."""
-    ahead, frames, problems = 37 * NANOSECONDS, [], []
-
-    def decode(image: Frame, cloud: Frame, camera: Camera) -> Frame:
-        return replace(image, cloud=cloud.cloud, cloud_stamp=cloud.moment_of_cloud + ahead)
-
-    def sink(event: Event) -> None:
-        frames.extend([event.frame] if isinstance(event, FrameIngested) else [])
-        problems.extend([event.message] if isinstance(event, Problem) else [])
-
-    pipeline = fed(lambda *_: Result(street[0].reference, INITIAL), decode, sink)
-    pipeline.set_camera(street[0].camera)
-    for k in range(24):
-        frame = street[k % len(street)]
-        shift = k * 100 * MS - (frame.stamp - street[0].stamp)
-        sent = replace(frame, stamp=frame.stamp + shift, cloud_stamp=frame.moment_of_cloud + shift)
-        pipeline.add_image(sent.stamp, sent)
-        pipeline.add_cloud(sent.moment_of_cloud + ahead, sent)
-        assert pipeline.wait_idle(60)
-    assert pipeline.stop()
-    assert len(frames) > 8
-    assert max(abs(frame.moment_of_cloud - frame.stamp) for frame in frames) < 100 * MS
-    assert problems == [pipeline.clock_difference]
-    assert "TAI and UTC" in problems[0]
-
-
-# ---- the same recording, stamped in other ways ------------------------------------------------------------------------------
-
-
-def restamped(frame: Frame, shift_s: float, absolute: bool) -> Frame:
-    """The frame as a driver gives it that stamps its scans so much later, with point times from that stamp or as dates."""
-    assert frame.cloud.time is not None
-    stamp = frame.moment_of_cloud + round(shift_s * NANOSECONDS)
-    values = frame.cloud.time.astype(np.float64) - shift_s + (stamp / NANOSECONDS if absolute else 0.0)
-    time, problem = seconds_from_stamp(values, stamp)
-    assert problem == ""
-    return replace(frame, cloud=replace(frame.cloud, time=time), cloud_stamp=stamp)
-
-
-def ingested(frames: list[Frame], reference: np.ndarray) -> tuple[list[int], Extrinsic]:
-    """Stamps of the images that a pipeline pairs with their own scans, and the extrinsic from them."""
-    stamps: list[int] = []
-
-    def decode(image: Frame, cloud: Frame, camera: Camera) -> Frame:
-        assert image is cloud
-        return image
-
-    def sink(event: Event) -> None:
-        assert not isinstance(event, Problem), event
-        if isinstance(event, FrameIngested):
-            stamps.append(event.frame.stamp)
-
-    start = Result(se3.perturb(reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
-    pipeline = fed(lambda *_: start, decode, sink, monitor={"enabled": False})
-    pipeline.set_camera(frames[0].camera)
-    for frame in frames:
-        pipeline.add_image(frame.stamp, frame)
-        pipeline.add_cloud(frame.moment_of_cloud, frame)
-        assert pipeline.wait_idle(60)
-    extrinsic = pipeline.request_estimate().result(60)
-    assert pipeline.stop()
-    return stamps, extrinsic
-
-
-def test_a_first_look_that_is_replaced_is_no_pair_that_was_dropped(street: list[Frame]) -> None:
-    """While the sweep is not known, messages are looked at before they are paired."""
-    begun, go = threading.Event(), threading.Event()
-
-    def start(*_: object) -> Result:
-        begun.set()
-        assert go.wait(60)
-        return Result(street[0].reference, INITIAL)
-
-    pipeline = fed(start, lambda image, *_: image)
-    pipeline.set_camera(street[0].camera)
-    for frame in street[:4]:  # the second look and the third are replaced
-        pipeline.add_image(frame.stamp, frame)
-        pipeline.add_cloud(frame.moment_of_cloud, frame)
-        assert begun.wait(60)
-    go.set()
-    assert pipeline.wait_idle(60)
-    assert pipeline.dropped_pairs == 0
-    assert pipeline.stop()
-
-
-def test_every_stamping_gives_the_same_pairs_and_the_same_extrinsic(street: list[Frame], drive: SyntheticDrive) -> None:
-    """Points move by the time from their measurement to the image, whatever the header stamp is."""
-    frames = [replace(frame, cloud_stamp=frame.moment_of_cloud) for frame in street[:5]]
-    stamps, expected = ingested(frames, drive.reference)
-    assert stamps == [frame.stamp for frame in frames]
-    assert expected.accepted == 1
-    for shift_s, absolute in ((-0.05, True), (0.05, False), (0.0, True)):
-        others = [restamped(frame, shift_s, absolute) for frame in frames]
-        for frame, other in zip(frames, others, strict=True):
-            points, moved = deskewed_points(frame, MotionConfig()), deskewed_points(other, MotionConfig())
-            assert points is not None
-            assert moved is not None
-            assert np.abs(points - moved).max() < 1e-4
-            assert np.abs(points - frame.cloud.xyz).max() > 0.05
-        stamps, extrinsic = ingested(others, drive.reference)
-        assert stamps[-4:] == [frame.stamp for frame in frames[-4:]]  # the first pair may wait for the next message
-        deg = se3.rotation_error_deg(expected.result.T_camera_lidar, extrinsic.result.T_camera_lidar)
-        m = se3.translation_error_m(expected.result.T_camera_lidar, extrinsic.result.T_camera_lidar)
-        assert (deg < 0.002, m < 0.0005) == (True, True), (shift_s, absolute, deg, m)

@@ -10,15 +10,14 @@ import pytest
 from scenes import QUICK_SEARCH, RenderedDrive
 
 from calib_ros import se3
-from calib_ros.camera import Camera
 from calib_ros.config import Config, ImageConfig, MonitorConfig, OnlineConfig, TrackerConfig, update
-from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.intrinsics import FOCAL, changed
-from calib_ros.online.monitor import Assessment, Verdict
+from calib_ros.online.monitor import Assessment
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, RefusalCode, Result
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, MOVED, REFUSED, SUSPECT, Extrinsic, RefusalCode, Result
 
 FRAMES = 4
 # A small search is enough for these tests.
@@ -81,18 +80,6 @@ def later(frame: Frame, seconds: float) -> Frame:
 
 
 # --- the way of an extrinsic ----------------------------------------------------------------------------------------------
-
-
-def test_initial_state_without_keyframes(drive, start):
-    recalibrator = Recalibrator(drive[0].camera, start, CONFIG, "cam", "velo")
-    first = recalibrator.current
-    assert (first.result.status, first.accepted, first.normalised_innovation) == (INITIAL, 0, 0)
-    assert np.array_equal(first.result.T_camera_lidar, start)
-    assert (first.result.camera_frame, first.result.lidar_frame) == ("cam", "velo")
-    assert (recalibrator.ready(), recalibrator.newest()) == (False, None)
-    extrinsic = recalibrator.estimate()
-    assert extrinsic.result.status == INSUFFICIENT
-    assert np.array_equal(extrinsic.result.T_camera_lidar, start)
 
 
 def test_on_an_empty_road_the_extrinsic_stays_and_nothing_is_estimated(drive, start, truth):
@@ -196,19 +183,6 @@ def test_blind_sensors_are_reported_and_make_no_keyframes(drive, start, truth):
     seen_again(drive[1])
 
 
-def test_unusable_frame_raises_and_the_next_one_is_accepted(drive, start):
-    recalibrator = Recalibrator(drive[0].camera, start, CONFIG)
-    with pytest.raises(TooFewFeaturesError):
-        recalibrator.ingest(empty(drive[0]))
-    assert len(recalibrator.buffer) == 0
-    assert recalibrator.ingest(later(drive[0], 0.1))  # the same picture, now with a scan: still wanted
-    other = replace(drive[1], camera=Camera(drive[1].camera.K * np.array([[1.1], [1.1], [1]]), 480, 180))
-    with pytest.raises(BadInputError, match="another camera calibration"):
-        recalibrator.ingest(other)
-    assert recalibrator.ingest(drive[1])
-    assert [f.name for f in recalibrator.buffer] == [drive[0].name, drive[1].name]
-
-
 # --- a camera that moves --------------------------------------------------------------------------------------------------
 
 BEFORE, AFTER = 7, 6
@@ -265,35 +239,6 @@ def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrato
     return recalibrator
 
 
-def test_frames_of_a_rejected_estimate_still_count_as_new(displaced, monkeypatch):
-    recalibrator = settled_at(displaced, displaced[0].reference)
-    shares, update = [], recalibrator.tracker.update
-
-    def watched(estimate: Result, share_new: float = 1.0, *rest, **more) -> Extrinsic:
-        shares.append(share_new)
-        return update(estimate, share_new, *rest, **more)
-
-    monkeypatch.setattr(recalibrator.tracker, "update", watched)
-    assert recalibrator.ingest(displaced[5])
-    recalibrator.tracker.apply(Assessment(Verdict.SUSPECT, "doubtful", 1e-4, 1))
-    recalibrator.estimate()  # not taken in
-    recalibrator.tracker.apply(Assessment(Verdict.CONSISTENT, "right", 0.5))
-    assert recalibrator.ingest(displaced[6])
-    recalibrator.estimate()
-    recalibrator.estimate()
-    assert shares == pytest.approx([1 / 6, 2 / 7, 0])
-
-
-def test_disabled_monitor_ends_suspicion(displaced):
-    recalibrator = settled_at(displaced, Result(displaced[0].reference, CONVERGED))
-    recalibrator.ingest(displaced[BEFORE])
-    assert recalibrator.current.result.status == SUSPECT
-    assert not recalibrator.ready()
-    recalibrator.configure(replace(GUARDED, monitor=MonitorConfig(enabled=False)))
-    assert recalibrator.current.result.status == CONVERGED
-    assert recalibrator.ready()
-
-
 def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, monkeypatch):
     """While the monitor looks at the old one, and at the next keyframe."""
     recalibrator = settled_at(displaced, Result(displaced[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo"))
@@ -314,17 +259,6 @@ def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, mo
 
 
 # --- reset and configure --------------------------------------------------------------------------------------------------
-
-
-def test_reset_drops_keyframes_and_estimates(drive, start):
-    recalibrator = taken_in([drive[0], drive[-1]], start)
-    recalibrator.estimate()
-    recalibrator.reset()
-    assert len(recalibrator.buffer) == 0
-    assert not recalibrator.ready()
-    assert recalibrator.current.result.status == INITIAL
-    assert np.array_equal(recalibrator.current.result.T_camera_lidar, start)
-    assert recalibrator.ingest(drive[-1])  # the scene of the last keyframe is new again
 
 
 def resize(recalibrator: Recalibrator) -> None:

@@ -1,24 +1,15 @@
-"""Requests for estimates and other jobs: shared, cancelled, refused. The pipeline under them runs real estimates."""
+"""Requests for estimates and other jobs: shared, cancelled, refused."""
 
 from __future__ import annotations
 
-import threading
 from concurrent.futures import CancelledError, Future
 
 import pytest
-from driven import Driven, config
-from waiting import LIMIT_S, until
 
-from calib_ros.config import update
 from calib_ros.errors import CalibrationError
-from calib_ros.frame import Frame
 from calib_ros.online.requests import ESTIMATE, MAX_WAITING, Pending, Requests
 from calib_ros.online.worker import Cancelled
-from calib_ros.result import Extrinsic
-from calib_ros_synthetic.drive import SyntheticDrive
 
-SOON = LIMIT_S
-LONG_SEARCH = {"search": {"rotation_deg": 3.0, "translation_m": 0.3, "starts": 1 << 20}}
 OUTCOME = "outcome"
 
 
@@ -182,55 +173,3 @@ def test_a_thread_that_is_to_end_ends_its_job() -> None:
         *["the check was ended: the node is stopping"] * 2,
         "the estimate was ended: the node is stopping",
     ]
-
-
-def searching(driven: Driven) -> Future[Extrinsic]:
-    """A request whose search has begun, and does not end before the request does."""
-    driven.pipeline.configure(update(driven.settings, LONG_SEARCH))
-    began, asked, requests = threading.Event(), threading.Event(), list[Future[Extrinsic]]()
-
-    def hold(*_: object) -> None:
-        began.set()
-        assert asked.wait(SOON)
-        until(requests[0].done, "the end of the request")
-
-    requests.append(driven.pipeline.request_estimate(hold))
-    asked.set()
-    assert began.wait(SOON)
-    return requests[0]
-
-
-def test_a_cancelled_estimate_leaves_the_pipeline_as_it_was(street: list[Frame], drive: SyntheticDrive) -> None:
-    """Its keyframes are still to be estimated from: the next frame begins an automatic estimate over them."""
-    with Driven(drive, config(mode="manual")) as driven:
-        driven.feed(*street[:3])
-        assert driven.pipeline.request_estimate().result(SOON).result.converged
-        driven.feed(street[3])
-        recalibrator = driven.pipeline.recalibrator
-        before, new = recalibrator.current, recalibrator.keyframes.new
-        assert new == 1
-        assert searching(driven).cancel()
-        assert driven.pipeline.wait_idle(SOON)
-        assert (recalibrator.current, recalibrator.keyframes.new, driven.errors) == (before, new, [])
-        driven.pipeline.configure(config(mode="manual"))
-        assert driven.pipeline.request_estimate().result(SOON).accepted == before.accepted + 1
-
-
-def test_a_paused_pipeline_keeps_keyframes_and_extrinsic(street: list[Frame], drive: SyntheticDrive) -> None:
-    with Driven(drive, config()) as driven:
-        driven.feed(*street[:3])
-        recalibrator, estimates = driven.pipeline.recalibrator, driven.estimates
-        kept = recalibrator.current
-        request = searching(driven)
-        driven.pipeline.pause("parked")
-        assert str(request.exception(SOON)) == "parked"
-        assert driven.pipeline.wait_idle(SOON)
-        driven.feed(street[3])
-        assert (recalibrator.current, recalibrator.keyframes_seen) == (kept, 3)
-        driven.pipeline.configure(config())
-        driven.pipeline.resume()
-        assert driven.pipeline.data_age_s == float("inf")
-        driven.feed(street[4])
-        assert driven.pipeline.recalibrator is recalibrator
-        assert recalibrator.keyframes_seen == 4
-        assert driven.estimates == estimates + 1

@@ -155,17 +155,6 @@ def test_at_rest_keyframes_are_taken_seldom_until_one_does_not_fit(
     assert se3.rotation_error_deg(turned_mount(drive.reference, 1.5), T) < 0.2
 
 
-def test_before_the_extrinsic_is_confirmed_every_keyframe_counts(street: list[Frame], start: np.ndarray) -> None:
-    parade = Parade(street, start, online={"rest_period_s": 100.0}, tracker={"confirmations": 5})
-    while parade.recalibrator.tracker.tentative or not parade.estimates:
-        parade(1)
-        assert parade.n < 40
-    confirmed = parade.n
-    assert parade.estimates == parade.keyframes[2 : confirmed - 1]  # at the last one it is at rest
-    parade(6)
-    assert len(parade.estimates) <= confirmed + 1
-
-
 def test_what_only_lacks_frames_of_another_speed_is_estimated_seldom_until_one_comes(
     street: list[Frame], start: np.ndarray
 ) -> None:

@@ -14,8 +14,6 @@ from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros_synthetic.drive import SyntheticDrive
 
-SLOW = np.zeros(6)
-
 
 @pytest.fixture
 def gate() -> SpeedGate:

@@ -22,7 +22,6 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
-from calib_ros.online import state
 from calib_ros.online.state import load_state, provenance_of, read_state, save_state
 from calib_ros.result import CONVERGED, VERSION, Result
 
@@ -194,36 +193,6 @@ def test_values_of_the_wrong_type(path: Path, key: str) -> None:
             assert key in ("score", "frames_used", "covariance")
 
 
-@pytest.mark.parametrize("part", ["camera", "provenance"])
-def test_parts_of_the_wrong_type(path: Path, part: str) -> None:
-    """In a file whose checksum fits, which no damage makes."""
-    whole = json.loads(path.read_text())
-    del whole["sha256"]
-
-    def holds(value: object) -> bytes:
-        data = {**whole, part: value}
-        return json.dumps({**data, "sha256": state._digest(data)}).encode()
-
-    for key in whole[part]:
-        for value in [*GARBAGE, None]:
-            refused(path, holds({**whole[part], key: value}))
-    assert all(refused(path, holds(value)) for value in GARBAGE if not isinstance(value, dict))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "sha256: &a [*a]\ntranslation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n",
-        "x: &a [*a]\nsha256: b\ntranslation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n",
-        "1: 2\na: 3\nsha256: b\ntranslation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n",
-        "a: 2024-01-02\nsha256: b\ntranslation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n",
-        '{"sha256": "b", "translation_m": [1, 2, 3], "quaternion_xyzw": [0, 0, 0, 1], "x": ' + "[" * 900 + "]" * 900 + "}",
-    ],
-)
-def test_odd_texts_with_a_checksum(path: Path, text: str) -> None:
-    assert refused(path, text.encode())
-
-
 @pytest.mark.parametrize(
     "bad",
     [
@@ -291,18 +260,3 @@ def test_a_power_cut_after_the_rename(tmp_path: Path, monkeypatch: pytest.Monkey
     write_atomically(tmp_path / "file", b"x")
     assert calls == ["file", "rename", "folder"]
     assert (tmp_path / "file").read_bytes() == b"x"
-
-
-# --- places where nothing can be written ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "place", ["{tmp}/file/state.json", "{tmp}/file/deep/state.json", "/proc/state.json", "/proc/self/x/s", "{tmp}", "/dev/full"]
-)
-def test_unwritable_paths_are_refused(tmp_path: Path, place: str) -> None:
-    """Not for root either."""
-    (tmp_path / "file").write_text("old")
-    with pytest.raises(BadInputError, match=r"^cannot write [^\n]*; check the folder, its permissions and free space$"):
-        save_state(place.format(tmp=tmp_path), RESULT, CAMERA)
-    assert (tmp_path / "file").read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]

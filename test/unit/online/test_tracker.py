@@ -11,7 +11,6 @@ import pytest
 from tracked import (
     REFUSAL,
     USUAL_DEG,
-    USUAL_M,
     T,
     assessment,
     estimate,
@@ -201,45 +200,6 @@ def test_weak_direction_is_named_and_the_result_not_saved():
     assert tracker.last_good is tracker.current.result
     # What was shown before is not lost with a scene that does not show it.
     assert played(tracker, estimate(deg=[0.03, 0.4, 0.03])) == [CONVERGED]
-
-
-def test_known_directions_become_weak_with_time_and_the_last_good_result_stays():
-    tracker = settled()
-    good = tracker.last_good
-    extrinsic = tracker.update(estimate(m=[USUAL_M, USUAL_M, 2.0]), seconds=3600.0)
-    assert extrinsic.result.status == INSUFFICIENT
-    assert "forward shift (8 cm)" in extrinsic.result.reason  # 1 cm x sqrt(60 min)
-    assert tracker.last_good is good
-
-
-def test_fusing_is_adding_information():
-    rng = np.random.default_rng(1)
-
-    def random_covariance() -> np.ndarray:
-        A = rng.normal(0, 1e-3, (6, 6)) * ([1.0] * 3 + [5.0] * 3)
-        return A.T @ A + SYSTEMATIC_COVARIANCE
-
-    for _ in range(10):
-        prior, own = random_covariance(), random_covariance()
-        xi = rng.normal(0, 1e-3, 6)
-        filter = PoseFilter(T, prior)
-        filter.update(se3.exp(xi) @ T, own + SYSTEMATIC_COVARIANCE, 0.5)
-        told = [np.linalg.inv(prior), 0.5 * np.linalg.inv(own)]
-        expected = np.linalg.inv(told[0] + told[1])
-        assert np.allclose(filter.spread, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
-        assert np.allclose(se3.log(filter.T @ se3.inverse(T)), expected @ told[1] @ xi, rtol=1e-5, atol=1e-9)
-
-
-def test_unknown_axis_does_not_mask_a_known_one():
-    """1 rad and 10 m on one side, a thousandth of a degree on the other."""
-    filter = PoseFilter(T, np.diag([1.0, 1, 1, 100, 100, 100]))
-    sure = np.diag(np.array([1e-5, 1e-5, 1, 1e-4, 1e-4, 10]) ** 2) + SYSTEMATIC_COVARIANCE
-    xi = np.array([1e-3, -2e-3, 0.3, 0.01, 0.02, 1.0])
-    filter.update(se3.exp(xi) @ T, sure, 1e-3)
-    found = se3.log(filter.T @ se3.inverse(T))
-    assert found[[0, 1, 3, 4]] == pytest.approx(xi[[0, 1, 3, 4]], rel=1e-3, abs=2e-3)
-    assert found[2] < 0.01
-    assert filter.probability(se3.exp([1e-2, 0, 0, 0, 0, 0]) @ filter.T, sure) < 1e-6
 
 
 def test_probability_is_that_of_chi_squared():
