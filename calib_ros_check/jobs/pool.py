@@ -29,6 +29,8 @@ CONNECT_S, WITHOUT_WORKERS_S, LOOK_S, POLL_S = 8.0, 60.0, 1.0, 0.02
 # A job that ends its worker ends no other, and workers leave Ctrl-C to this process.
 LOCAL = {
     "distributed.scheduler.allowed-failures": 0,
+    # Dask's own value for MALLOC_TRIM_THRESHOLD_ besides would cost a third of the CPU time: images are allocated all the time.
+    "distributed.nanny.pre-spawn-environ": dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), 1),
     "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
 }
 HANG_S = 1800.0  # for one job: checks and trials take seconds, with large models minutes
