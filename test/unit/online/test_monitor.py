@@ -179,6 +179,11 @@ def test_single_outlier_keyframe_raises_no_alarm(scene):
     assert not drive.monitor.in_doubt
 
 
+def test_a_small_shift_counts_only_while_the_motion_during_the_scan_is_known(scene):
+    unknown = [replace(f, unknown_motion_s=0.05) for f in scene.features]
+    assert not {Verdict.SUSPECT, Verdict.MOVED} & set(Drive(scene).verdicts(unknown, scene.off(HALF_DEG)))
+
+
 def test_the_rate_of_false_alarms_is_the_threshold(scene, monkeypatch):
     """0.1 deg off: what one rate calls suspect is no evidence at another."""
     off = scene.off(([0.0, 0.09, 0.03], [0.006, 0, 0]))
