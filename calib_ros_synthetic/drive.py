@@ -5,10 +5,9 @@ Everything follows from the parameters and the number of the frame, not from the
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from inspect import signature
 from typing import Any
 
@@ -17,13 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
+from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.ego import OwnLayer
 from calib_ros_synthetic.installation import Installation
 from calib_ros_synthetic.rays import CameraView
-from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, StampErrors, Timetable
+from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride
 from calib_ros_synthetic.rigs import RIGS, Fields
 from calib_ros_synthetic.scanners import PERIOD, PLAIN, SpinningScanner, in_frame, plain_scanner
 from calib_ros_synthetic.scenes import SCENES
@@ -51,14 +51,6 @@ LIMITS: Limits = {
     "jitter_ms": (float, 0.0, 100.0),
 }
 NAMED = ("rig", "scene", "condition", "fields", "ride", "stamp_at", "spin")  # parameters whose value is a name
-
-
-@dataclass(frozen=True, eq=False)
-class Labels:
-    """SemanticClass of the points (n,) uint8 and of the pixels (H, W) uint8 of a frame."""
-
-    points: NDArray[np.uint8]
-    image: NDArray[np.uint8]
 
 
 def checked(name: str, value: Any, limits: Limits = LIMITS) -> Any:
@@ -180,15 +172,12 @@ class SyntheticDrive:
             self._scanner = self._installed.scanner
         if T_camera_lidar is not None:
             self.reference = se3.as_transform(T_camera_lidar, "T_camera_lidar")
-        weaving = ride == WEAVING
-        timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
-        self._stamps = StampErrors(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
-        street = world(self.seed, timetable.station(self._seconds(self._frames)))
-        way = Ride(street.path, self.seed, street.lane, weaving)
-        self._trip = Trip(street, way, timetable, weather, self.noise, self.speed > 0, spin)
+        way = Ride(self.seed, self.speed or cruise, ride == WEAVING)
+        street = world(self.seed, way.station(self._seconds(self._frames)))
+        self._trip = Trip(street, way, weather, self.noise, self.speed > 0, spin)
         self._view: CameraView | None = None
         self._own: OwnLayer | None = None
-        self._made: OrderedDict[int, tuple[Frame, Labels]] = OrderedDict()
+        self._made = Recent(CACHED_FRAMES)
 
     @classmethod
     def from_text(cls, text: str) -> SyntheticDrive:
@@ -207,21 +196,17 @@ class SyntheticDrive:
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`, counted from the end if negative. IndexError past either end."""
-        made, _ = self._make(self._position(index))
+        position = self._position(index)
+        made = self._made(position, lambda: self._render(position, self.reference))
         # The cache must not change when a caller modifies its frame.
         return replace(deepcopy(made), camera=made.camera)
-
-    def labels(self, index: int) -> Labels:
-        """Classes of the points of a frame and of the centres of its pixels."""
-        labels = self._make(self._position(index))[1]
-        return Labels(labels.points.copy(), labels.image.copy())
 
     def moved(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> Frame:
         """Frame `index` with the camera mounted at T_camera_lidar (4, 4), which is the frame's reference.
 
         age_s: the image shows the street as seen that long before its stamp.
         """
-        return self._render(self._position(index), T_camera_lidar, age_s)[0]
+        return self._render(self._position(index), T_camera_lidar, age_s)
 
     def pose(self, index: int) -> Floats:
         """T_world_lidar (4, 4) at the frame's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
@@ -261,16 +246,7 @@ class SyntheticDrive:
             raise IndexError(f"frame {index} of a synthetic drive with {self._frames} frames")
         return index % self._frames
 
-    def _make(self, index: int) -> tuple[Frame, Labels]:
-        made = self._made.pop(index, None)
-        if made is None:
-            made = self._render(index, self.reference)
-        self._made[index] = made
-        while len(self._made) > CACHED_FRAMES:
-            self._made.popitem(last=False)
-        return made
-
-    def _render(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> tuple[Frame, Labels]:
+    def _render(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> Frame:
         if self._view is None:
             self._view = CameraView(self.camera) if self._installed is None else self._installed.view(self.camera)
         view = self._view
@@ -291,16 +267,19 @@ class SyntheticDrive:
             rng = np.random.default_rng([self.seed, 9, index])
             cloud, kept = installed.delivered(cloud, twist, self._fields, rng)
             hit, twist = hit[kept], installed.twist(ride_twist, installed.T_base_frame)
-        period = PERIOD if installed is None else 1 / installed.rig.rate
-        cloud_stamp, cloud = self._stamps.cloud(cloud_stamp, cloud, period)
-        stamp = self._stamps.image(stamp, index)
-        labels = Labels(labels_of(solids, hit), labels_of(solids, seen))
-        frame = Frame(
-            *(image, replace(cloud, label=labels.points), self.camera, stamp, cloud_stamp, T_camera_lidar, f"{index:06d}", twist),
+        shift = STAMP_AT[self._parameters["stamp_at"]] * (PERIOD if installed is None else 1 / installed.rig.rate)
+        if shift and cloud.time is not None:  # the points' times count from the stamp
+            cloud = replace(cloud, time=(cloud.time - shift).astype(np.float32))
+        late, jitter = self._parameters["image_late_ms"] / 1000, self._parameters["jitter_ms"] / 1000
+        if jitter:
+            late += jitter * np.random.default_rng([self.seed, 11, index]).standard_normal()
+        stamp, cloud_stamp = stamp + round(late * NANOSECONDS), cloud_stamp + round(shift * NANOSECONDS)
+        cloud = replace(cloud, label=labels_of(solids, hit))
+        return Frame(
+            *(image, cloud, self.camera, stamp, cloud_stamp, T_camera_lidar, f"{index:06d}", twist),
             compensated=installed is not None and installed.rig.compensated,
-            classes=labels.image,
+            classes=labels_of(solids, seen),
         )
-        return frame, labels
 
     def _picture(
         self, index: int, solids: Solids, T_camera_lidar: Floats, age_s: float, view: CameraView

@@ -1,16 +1,15 @@
-"""How the vehicle of a synthetic drive moves, and how its sensors stamp what they measure."""
+"""How the vehicle of a synthetic drive moves, and what of a scan its stamp refers to."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
-from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros_synthetic.solids import Floats
-from calib_ros_synthetic.street import LIDAR_HEIGHT, Path
+from calib_ros_synthetic.street import LIDAR_HEIGHT, Street
 
 STEADY, WEAVING = RIDES = ("steady", "weaving")
 SPINS = ("clockwise", "counterclockwise")
@@ -20,23 +19,26 @@ STAMP_AT = {"start": -0.5, "middle": 0.0, "end": 0.5}  # share of a revolution a
 
 
 @dataclass(frozen=True)
-class Timetable:
-    """Where on its path the vehicle is when. speed: m/s on average. varied: it accelerates and brakes."""
+class Ride:
+    """The vehicle's way along a street: a lane offset in metres, and slow swaying in yaw, pitch, roll and height.
 
-    speed: float
+    speed: m/s on average. weaving: it accelerates and brakes, and swerves to either side, by heading where it goes.
+    """
+
     seed: int
-    varied: bool = False
+    speed: float
+    weaving: bool = False
 
     def station(self, seconds: float) -> float:
         """m from the start."""
-        if not self.varied:
+        if not self.weaving:
             return self.speed * seconds
         wave, phase = 2 * np.pi / SPEED_PERIOD_S, self._phase
         return float(self.speed * (seconds + SPEED_CHANGE * (np.sin(wave * seconds + phase) - np.sin(phase)) / wave))
 
     def speed_at(self, seconds: float) -> float:
         """m/s."""
-        if not self.varied:
+        if not self.weaving:
             return self.speed
         return float(self.speed * (1 + SPEED_CHANGE * np.cos(2 * np.pi * seconds / SPEED_PERIOD_S + self._phase)))
 
@@ -44,46 +46,7 @@ class Timetable:
     def _phase(self) -> float:
         return float(np.random.default_rng([self.seed, 12]).uniform(0, 2 * np.pi))
 
-
-@dataclass(frozen=True)
-class StampErrors:
-    """What the stamps of a drive's messages say about when they were measured.
-
-    image_late_s: images are stamped that much late. jitter_s: standard deviation of their stamps. stamp_at: part of the scan
-    that a cloud's stamp refers to.
-    """
-
-    seed: int
-    image_late_s: float = 0.0
-    jitter_s: float = 0.0
-    stamp_at: str = "middle"
-
-    def image(self, stamp: int, index: int) -> int:
-        """The stamp, ns, of an image of the moment `stamp`."""
-        jitter = self.jitter_s * np.random.default_rng([self.seed, 11, index]).standard_normal() if self.jitter_s else 0.0
-        return stamp + round((self.image_late_s + jitter) * NANOSECONDS)
-
-    def cloud(self, stamp: int, cloud: PointCloud, period_s: float) -> tuple[int, PointCloud]:
-        """Stamp, ns, and cloud of a scan that faced ahead at `stamp`; its points' times count from the new stamp."""
-        shift = STAMP_AT[self.stamp_at] * period_s
-        if shift and cloud.time is not None:
-            cloud = replace(cloud, time=(cloud.time - shift).astype(np.float32))
-        return stamp + round(shift * NANOSECONDS), cloud
-
-
-@dataclass(frozen=True)
-class Ride:
-    """The vehicle's way along a path: a lane offset in metres, and slow swaying in yaw, pitch, roll and height.
-
-    weaving: it also swerves to either side, by heading where it goes.
-    """
-
-    path: Path
-    seed: int
-    lane: float
-    weaving: bool = False
-
-    def pose(self, s: float) -> Floats:
+    def pose(self, street: Street, s: float) -> Floats:
         """T_world_lidar (4, 4) at station s."""
         rng = np.random.default_rng([self.seed, 2])
         phase = rng.uniform(0, 2 * np.pi, (5, 2))
@@ -94,13 +57,13 @@ class Ride:
             angle = 2 * np.pi * s / SWERVE_LENGTH + phase[0, 0]
             lane += SWERVE * np.sin(angle)
             yaw += np.rad2deg(np.arctan(SWERVE * np.cos(angle) * 2 * np.pi / SWERVE_LENGTH))
-        x, y, heading = self.path.place(s, self.lane + lane)
+        x, y, heading = street.path.place(s, street.lane + lane)
         angles = [np.rad2deg(heading) + yaw, pitch, roll]
         R = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
         return se3.from_parts(R, [x, y, LIDAR_HEIGHT + bump])
 
-    def twist(self, s: float, speed: float) -> Floats:
+    def twist(self, street: Street, s: float, speed: float) -> Floats:
         """(rx, ry, rz, tx, ty, tz) in rad/s and m/s in the LiDAR's own frame: T(t) = T(0) exp(twist t)."""
         h = 0.05  # m; short against the waves, long against rounding
-        step = se3.log(se3.inverse(self.pose(s - h)) @ self.pose(s + h))
+        step = se3.log(se3.inverse(self.pose(street, s - h)) @ self.pose(street, s + h))
         return np.asarray(step * (speed / (2 * h)))

@@ -23,7 +23,7 @@ from calib_ros_synthetic.drive import LIMITS, START, SyntheticDrive, checked, pa
 from calib_ros_synthetic.installation import Installation
 from calib_ros_synthetic.multi_rigs import MULTI_RIGS, displacement
 from calib_ros_synthetic.rays import CameraView
-from calib_ros_synthetic.ride import RIDES, STEADY, WEAVING, Ride, Timetable
+from calib_ros_synthetic.ride import RIDES, STEADY, WEAVING, Ride
 from calib_ros_synthetic.rigs import RIGS, Fields
 from calib_ros_synthetic.scanners import PERIOD, RosetteScanner
 from calib_ros_synthetic.scenes import SCENES
@@ -95,10 +95,9 @@ class SyntheticRig:
         cruise = world.cruise if speed is None else p["speed"]
         if not cruise:
             raise BadInputError("synthetic drive: speed=0 does not go with several sensors, which measure at different times")
-        timetable = Timetable(cruise, self.seed, varied=ride == WEAVING)
-        street = world(self.seed, timetable.station(self.duration))
-        way = Ride(street.path, self.seed, street.lane, ride == WEAVING)
-        self.trip = Trip(street, way, timetable, named("condition", condition, CONDITIONS), p["noise"])
+        way = Ride(self.seed, cruise, ride == WEAVING)
+        street = world(self.seed, way.station(self.duration))
+        self.trip = Trip(street, way, named("condition", condition, CONDITIONS), p["noise"])
         self.facts = {
             "rig": f"{rig}: {self._rig.why}",
             "source": f"{self.name}, a ray-cast {scene.replace('_', ' ')} with exact ground truth",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 from functools import cached_property
 
 import numpy as np
@@ -25,24 +24,14 @@ MICROSECOND = 1e-6
 TEN_PERCENT = 0.1  # reflectivity that reach is stated for
 
 
-class Rings(Enum):
-    """How a driver numbers the rings."""
-
-    FROM_TOP, FROM_BOTTOM, NONE = range(3)
-
-
-class Order(Enum):
-    """How a driver stores the points of a scan: as they were measured, or ring by ring, each in the order of time."""
-
-    FIRING, ROWS = range(2)
-
-
 @dataclass(frozen=True)
 class ScannerModel:
     """A scanner's data sheet.
 
     table: of its lasers, or of all rays of a scan if firings is 1. firings: per turn at RATE. noise: of the range, m (1 sigma).
-    near, far: m. reach: m, at which a surface of 10 % reflectivity is just seen.
+    near, far: m. reach: m, at which a surface of 10 % reflectivity is just seen. from_top:
+    the driver numbers the rings so, else from the bottom. by_rows: it stores a scan ring by ring, each in the order of time, else
+    as it was measured.
     """
 
     name: str
@@ -52,8 +41,8 @@ class ScannerModel:
     near: float
     far: float
     reach: float
-    rings: Rings
-    order: Order
+    from_top: bool = False
+    by_rows: bool = False
 
     @property
     def weakest(self) -> float:
@@ -62,18 +51,18 @@ class ScannerModel:
 
 
 MODELS = {
-    "vlp16": ScannerModel("Velodyne VLP-16", tables.vlp16, 1808, 0.015, 0.5, 100.0, 60.0, Rings.FROM_BOTTOM, Order.FIRING),
-    "vlp32c": ScannerModel("Velodyne VLP-32C", tables.vlp32c, 1808, 0.015, 0.5, 200.0, 80.0, Rings.FROM_BOTTOM, Order.FIRING),
-    "hdl32e": ScannerModel("Velodyne HDL-32E", tables.hdl32e, 2170, 0.010, 0.9, 100.0, 70.0, Rings.FROM_BOTTOM, Order.FIRING),
-    "hdl64e": ScannerModel("Velodyne HDL-64E", tables.hdl64e, 2083, 0.015, 0.9, 120.0, 50.0, Rings.FROM_BOTTOM, Order.FIRING),
-    "vls128": ScannerModel("Velodyne VLS-128", tables.vls128, 1876, 0.015, 0.5, 245.0, 220.0, Rings.FROM_BOTTOM, Order.FIRING),
-    "pandar40p": ScannerModel("Hesai Pandar40P", tables.pandar40p, 1800, 0.010, 0.3, 200.0, 200.0, Rings.FROM_TOP, Order.FIRING),
-    "pandar64": ScannerModel("Hesai Pandar64", tables.pandar64, 1800, 0.010, 0.3, 200.0, 200.0, Rings.FROM_TOP, Order.FIRING),
-    "os1_64": ScannerModel("Ouster OS1-64", tables.os1_64, 1024, 0.015, 0.8, 120.0, 40.0, Rings.FROM_TOP, Order.ROWS),
-    "os1_128": ScannerModel("Ouster OS1-128", tables.os1_128, 1024, 0.010, 0.3, 120.0, 45.0, Rings.FROM_TOP, Order.ROWS),
-    "mid360": ScannerModel("Livox Mid-360", None, 20_000, 0.020, 0.1, 100.0, 40.0, Rings.NONE, Order.FIRING),
-    "rs_m1": ScannerModel("RoboSense M1", tables.rs_m1, 1, 0.020, 0.5, 200.0, 150.0, Rings.NONE, Order.FIRING),
-    "ft120": ScannerModel("Hesai FT120", tables.ft120, 1, 0.020, 0.1, 100.0, 22.0, Rings.NONE, Order.FIRING),
+    "vlp16": ScannerModel("Velodyne VLP-16", tables.vlp16, 1808, 0.015, 0.5, 100.0, 60.0),
+    "vlp32c": ScannerModel("Velodyne VLP-32C", tables.vlp32c, 1808, 0.015, 0.5, 200.0, 80.0),
+    "hdl32e": ScannerModel("Velodyne HDL-32E", tables.hdl32e, 2170, 0.010, 0.9, 100.0, 70.0),
+    "hdl64e": ScannerModel("Velodyne HDL-64E", tables.hdl64e, 2083, 0.015, 0.9, 120.0, 50.0),
+    "vls128": ScannerModel("Velodyne VLS-128", tables.vls128, 1876, 0.015, 0.5, 245.0, 220.0),
+    "pandar40p": ScannerModel("Hesai Pandar40P", tables.pandar40p, 1800, 0.010, 0.3, 200.0, 200.0, from_top=True),
+    "pandar64": ScannerModel("Hesai Pandar64", tables.pandar64, 1800, 0.010, 0.3, 200.0, 200.0, from_top=True),
+    "os1_64": ScannerModel("Ouster OS1-64", tables.os1_64, 1024, 0.015, 0.8, 120.0, 40.0, True, True),
+    "os1_128": ScannerModel("Ouster OS1-128", tables.os1_128, 1024, 0.010, 0.3, 120.0, 45.0, True, True),
+    "mid360": ScannerModel("Livox Mid-360", None, 20_000, 0.020, 0.1, 100.0, 40.0),
+    "rs_m1": ScannerModel("RoboSense M1", tables.rs_m1, 1, 0.020, 0.5, 200.0, 150.0),
+    "ft120": ScannerModel("Hesai FT120", tables.ft120, 1, 0.020, 0.1, 100.0, 22.0),
 }  # fmt: skip
 
 
@@ -122,11 +111,11 @@ class SpinningScanner:
 
     def stored(self, row: NDArray[np.intp], time: Float32) -> NDArray[np.intp] | None:
         """The order (n,) of points that lie in the rows row (n,) and were measured at time (n,); None = as they are."""
-        return np.lexsort((row, time)) if self.model.order is Order.FIRING else None
+        return None if self.model.by_rows else np.lexsort((row, time))
 
     def ring(self, row: NDArray[np.intp]) -> NDArray[np.int32] | None:
         """The driver's ring numbers of rows (n,)."""
-        return (row if self.model.rings is Rings.FROM_TOP else len(self._table[0]) - 1 - row).astype(np.int32)
+        return (row if self.model.from_top else len(self._table[0]) - 1 - row).astype(np.int32)
 
     def jobs(self, solids: Solids, beams: Float32, pose: Floats, shift: float, turn: float) -> Jobs:
         """Windows for `cast` for a scanner at any attitude; shift (m) and turn (rad): how far it moves from time 0."""
@@ -208,7 +197,7 @@ class GridScanner(RosetteScanner):
 
 # The plain drive's, by rings from the top, after the OS1-128, HDL-64E, HDL-32E and VLP-16; 0: without any, by two prisms.
 PLAIN: dict[int, ScannerModel] = {
-    rings: ScannerModel("", table, firings, 0.02, 0.9, 100.0, 91.28709291752769, Rings.FROM_TOP, Order.ROWS)
+    rings: ScannerModel("", table, firings, 0.02, 0.9, 100.0, 91.28709291752769, True, True)
     for rings, table, firings in (
         (128, tables.above_each_other(np.linspace(22.5, -22.5, 128)), 1024),
         (64, tables.above_each_other(np.r_[np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.8, 32)]), 2083),

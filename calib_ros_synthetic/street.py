@@ -5,12 +5,13 @@ Blocks do not depend on each other, so that the street has no end.
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib_ros.datasets.recent import Recent
 from calib_ros_synthetic import objects
 from calib_ros_synthetic.solids import Builder, Solids, concatenate
 
@@ -56,7 +57,7 @@ class Street:
         azimuth, elevation = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(28, 58))
         c = np.cos(elevation)
         self.sun: NDArray[np.float64] = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
-        self._blocks: OrderedDict[int, Solids] = OrderedDict()
+        self._blocks = Recent(CACHED_BLOCKS)
         self._lay_out(np.random.default_rng([seed, 8]))
 
     def _lay_out(self, rng: Rng) -> None:
@@ -65,14 +66,7 @@ class Street:
     def around(self, s: float) -> Solids:
         """All solids in `view` of station s, by whole blocks."""
         first, last = int((s - self.view[0]) // BLOCK), int((s + self.view[1]) // BLOCK)
-        return concatenate([self._block(k) for k in range(first, last + 1)])
-
-    def _block(self, k: int) -> Solids:
-        block = self._blocks.pop(k, None)
-        self._blocks[k] = block = self._furnish(k) if block is None else block
-        while len(self._blocks) > CACHED_BLOCKS:
-            self._blocks.popitem(last=False)
-        return block
+        return concatenate([self._blocks(k, partial(self._furnish, k)) for k in range(first, last + 1)])
 
     def _furnish(self, k: int) -> Solids:
         # Block numbers before the start are negative, seeds must not be.

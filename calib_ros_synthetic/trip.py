@@ -17,7 +17,7 @@ from calib_ros_synthetic.conditions import Conditions
 from calib_ros_synthetic.ego import OwnLayer
 from calib_ros_synthetic.lidar import OwnReturns, scan
 from calib_ros_synthetic.rays import CameraView, row_motion
-from calib_ros_synthetic.ride import SPINS, Ride, Timetable
+from calib_ros_synthetic.ride import SPINS, Ride
 from calib_ros_synthetic.scanners import SpinningScanner
 from calib_ros_synthetic.solids import Floats, Solids
 from calib_ros_synthetic.street import Street
@@ -28,12 +28,11 @@ Ids = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Trip:
-    """street: what stands where. ride, timetable: how the vehicle moves. condition: of the weather and the pictures.
+    """street: what stands where. ride: how the vehicle moves. condition: of the weather and the pictures.
     noise: factor on all sensor noise. moving: else the vehicle stops for every measurement. spin: of scanners."""
 
     street: Street
     ride: Ride
-    timetable: Timetable
     condition: Conditions
     noise: float
     moving: bool = True
@@ -41,15 +40,16 @@ class Trip:
 
     def station(self, seconds: float) -> float:
         """m from the start."""
-        return self.timetable.station(seconds)
+        return self.ride.station(seconds)
 
     def pose(self, seconds: float) -> Floats:
         """T_world_ride (4, 4)."""
-        return self.ride.pose(self.station(seconds))
+        return self.ride.pose(self.street, self.station(seconds))
 
     def twist(self, seconds: float) -> Floats:
         """Of the ride in its own frame, (6,) rad/s and m/s."""
-        return self.ride.twist(self.station(seconds), self.timetable.speed_at(seconds) if self.moving else 0.0)
+        speed = self.ride.speed_at(seconds) if self.moving else 0.0
+        return self.ride.twist(self.street, self.station(seconds), speed)
 
     def scan(
         self,

@@ -7,7 +7,6 @@ import sys
 import webbrowser
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from calib_ros.cli.inputs import bag_options, configuration, initial_extrinsic, open_named_source
 from calib_ros.cli.output import note, progress_bar
@@ -24,9 +23,6 @@ from calib_ros_view.session.rig_session import RigSession
 from calib_ros_view.session.rig_shown import of_priors, of_result
 from calib_ros_view.session.session import Session
 from calib_ros_view.web.server import Address, Pictures, listening, require_nicegui, serve
-
-if TYPE_CHECKING:
-    from fastapi import FastAPI
 
 FRAMES = 10  # of a source, unless said otherwise
 OUT = "extrinsic.json"
@@ -71,19 +67,15 @@ def _view_node(args: argparse.Namespace, address: Address) -> None:
     from calib_ros_view.node.watch import Watch
     from calib_ros_view.web.live_page import LivePage
     from calib_ros_view.web.rig_live import LivePairs
-    from calib_ros_view.web.rig_page import RigPages
+    from calib_ros_view.web.rig_page import RigPage
 
-    with Watch(args.node) as watch, LivePairs(RigWatch(watch)) as pairs:
-        feed, pictures = pairs.feed, Pictures()
-        live, rig = LivePage(watch, other=lambda: feed.rig is not None), RigPages(feed, pictures)
-
-        def routes(app: FastAPI) -> None:
-            for own in (live, pairs, pictures):
-                own.routes(app)
-
+    pictures = Pictures()
+    with Watch(args.node) as watch, LivePairs(RigWatch(watch), pictures) as pairs:
+        feed = pairs.feed
+        live = LivePage(watch, pictures, other=lambda: feed.rig is not None)
         serve(
-            *(lambda: live.page() if feed.rig is None else rig.page(), f"{watch.name} · {TITLE}", address, routes),
-            partial(_ready, opened=args.open),
+            lambda: live.page() if feed.rig is None else RigPage(feed, pictures).build(),
+            *(f"{watch.name} · {TITLE}", address, pictures.routes, partial(_ready, opened=args.open)),
             others={PAIR: pairs.page},
         )
 
@@ -93,7 +85,7 @@ def _view_rig(args: argparse.Namespace, address: Address) -> None:
     given = [name.replace("_", "-") for name in OF_ONE_PAIR if getattr(args, name)]
     if given:
         raise BadInputError(f"--rig says what {', '.join(given)} would: leave them out, and set them in {args.rig}")
-    from calib_ros_view.web.rig_page import RigPages
+    from calib_ros_view.web.rig_page import RigPage
     from calib_ros_view.web.rig_sessions import SessionPairs
 
     config, description = configuration(args.config, preset_name=args.preset), read_rig(args.rig)
@@ -105,7 +97,8 @@ def _view_rig(args: argparse.Namespace, address: Address) -> None:
     pictures, session = Pictures(), RigSession(source, description, rig, config, args.frames, out)
     pairs, title = SessionPairs(session, pictures), f"{source.name} · {TITLE}"
     ready = partial(_ready, opened=args.open)
-    serve(RigPages(session, pictures).page, title, address, pictures.routes, ready, pairs.close, {PAIR: pairs.page})
+    page = partial(RigPage, session, pictures)
+    serve(lambda: page().build(), title, address, pictures.routes, ready, pairs.close, {PAIR: pairs.page})
 
 
 def _session(args: argparse.Namespace) -> Session:

@@ -27,7 +27,7 @@ from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache, spread
-from calib_ros_evaluation.methods.edges import Levinson, worse_share
+from calib_ros_evaluation.methods.edges import LevinsonScore, worse_share
 from calib_ros_evaluation.protocols.definitions import PROTOCOLS, Size
 from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_thesis.features import importance
@@ -121,10 +121,16 @@ def cost(cache: WorkerCache, job: EvaluationJob) -> Answer:
     score, rng = method.score(made, T), np.random.default_rng(0)
     around = [se3.exp(rng.uniform(-1, 1, 6) * SPREAD) @ T for _ in range(EVALUATIONS)]
     times = [_batch(score, around) for _ in range(BATCHES)]
+    tracemalloc.start()
+    try:
+        method.score([method.features(frame) for frame in frames], T).value(T)
+        peak = tracemalloc.get_traced_memory()[1]  # of all arrays; numpy reports its own, and those that OpenCV allocates by it
+    finally:
+        tracemalloc.stop()
     return {
         "features_ms_per_frame": 1000 * float(np.median(spent)),
         "evaluation_ms": 1000 * float(np.median(times)),
-        "memory_mb": _memory(cache, job),
+        "memory_mb": peak / 1e6,
     }
 
 
@@ -135,18 +141,6 @@ def _batch(score: Score, around: list[Matrix]) -> float:
         score.value(around[done])
         done, spent = done + 1, time.process_time() - started
     return spent / done
-
-
-def _memory(cache: WorkerCache, job: EvaluationJob) -> float:
-    """Peak of all arrays, MB; numpy reports its own, and those that OpenCV allocates through it."""
-    method, T = cache.methods[job.method], cache.reference(job.scene, job.frames[0])
-    frames = [cache.frame(job.scene, position) for position in job.frames]
-    tracemalloc.start()
-    try:
-        method.score([method.features(frame) for frame in frames], T).value(T)
-        return tracemalloc.get_traced_memory()[1] / 1e6
-    finally:
-        tracemalloc.stop()
 
 
 def loss_curves(cache: WorkerCache, job: EvaluationJob) -> Answer:
@@ -165,11 +159,9 @@ def _score(cache: WorkerCache, job: EvaluationJob) -> Score:
 
 def trust(cache: WorkerCache, job: EvaluationJob) -> Answer:
     """F_C at the reference and at extrinsics that are wrong by each of ERRORS."""
-    method = cache.methods[job.method]
-    if not isinstance(method, Levinson):
+    score, reference = _score(cache, job), cache.reference(job.scene, job.frames[0])
+    if not isinstance(score, LevinsonScore):
         raise BadInputError(f"{job.method} has no share of worse neighbours; only levinson has")
-    reference = cache.reference(job.scene, job.frames[0])
-    score = method.score([cache.features(job.method, job.scene, position)[0] for position in job.frames], reference)
     rng = np.random.default_rng(int(job.option("seed")))  # the same for all frames, as if a mount had been displaced
     wrong = []
     for deg, m in ERRORS:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,18 +16,11 @@ UNSEEN = (110, 110, 110)  # RGB of points that the camera does not see
 MOST_POINTS = 60_000  # that a phone still turns smoothly
 
 
-@dataclass(frozen=True, eq=False)
-class ColoredCloud:
-    """xyz: (n, 3) float32, m, LiDAR frame. rgb: (n, 3) uint8. seen: (n,) whether the camera sees the point."""
-
-    xyz: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
-    seen: NDArray[np.bool_]
-
-
-def colored_cloud(frame: Frame, T: Matrix, most: int = MOST_POINTS) -> ColoredCloud:
-    """The points of a frame in the colours of its image at T_camera_lidar (4, 4); those outside of it, or hidden from the camera
-    behind other points, are grey.
+def colored_cloud(
+    frame: Frame, T: Matrix, most: int = MOST_POINTS
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_]]:
+    """The points of a frame, (n, 3) m in the LiDAR's frame, their colours (n, 3) RGB in its image at T_camera_lidar (4, 4), and
+    whether the camera sees them (n,); those outside of the image, or hidden behind other points, are grey.
 
     most: points kept, drawn evenly; those in the image first, since they are what is looked at.
     """
@@ -45,7 +36,7 @@ def colored_cloud(frame: Frame, T: Matrix, most: int = MOST_POINTS) -> ColoredCl
     seen = np.zeros(len(xyz), bool)
     seen[visible] = True
     kept = _drawn(seen, most, np.random.default_rng(0))
-    return ColoredCloud(np.ascontiguousarray(xyz[kept]), rgb[kept], seen[kept])
+    return np.ascontiguousarray(xyz[kept]), rgb[kept], seen[kept]
 
 
 def _hidden(uv: Matrix, depth: Matrix, width: int) -> NDArray[np.bool_]:

@@ -45,7 +45,6 @@ class RigSession:
         self.clouds: dict[str, NDArray[np.float32]] = {}
         self._source, self._description, self._config, self._frames, self._out = source, description, config, frames, out
         self._lock = threading.Lock()
-        self._sessions: dict[Pair, Session] = {}
         first = description.cameras[0] if description.cameras else ""
         count = len(source.pair(first, description.lidars[0]) if first else source.scans(description.lidars[0]))
         if not count:
@@ -110,19 +109,15 @@ class RigSession:
         return FramePicture(whole).draw(se3.inverse(poses[camera]), None, TILE)
 
     def session(self, camera: str, lidar: str) -> Session:
-        """Of a pair, read when it is asked for first. BadInputError for names that are no pair, or frames that cannot be used."""
+        """Of a pair, read anew. BadInputError for names that are no pair, or frames that cannot be used."""
         if (camera, lidar) not in self.pairs:
             raise BadInputError(f"{camera} and {lidar} are no pair of this rig; open one that its page lists")
         with self._lock:
-            if (camera, lidar) not in self._sessions:
-                source, mask = self._source.pair(camera, lidar), self._description[camera].mask
-                config = update(self._config, {"image": {"mask": mask}}) if mask else self._config
-                poses = self.rig.poses
-                start = se3.inverse(poses[camera]) @ poses[lidar]
-                out = self._out.with_name(f"{self._out.stem}.{camera}.{lidar}{self._out.suffix}")
-                frames = [source[k] for k in self._positions(len(source))]
-                self._sessions[camera, lidar] = Session(frames, source, start, config, out)
-            return self._sessions[camera, lidar]
+            source, mask = self._source.pair(camera, lidar), self._description[camera].mask
+            config = update(self._config, {"image": {"mask": mask}}) if mask else self._config
+            start = se3.inverse(self.rig.poses[camera]) @ self.rig.poses[lidar]
+            out = self._out.with_name(f"{self._out.stem}.{camera}.{lidar}{self._out.suffix}")
+            return Session([source[k] for k in self._positions(len(source))], source, start, config, out)
 
 
 def corners_of(camera: Camera) -> Matrix:

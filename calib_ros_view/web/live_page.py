@@ -1,8 +1,7 @@
 """The live page: one node over the last hour, its pictures, and buttons for its services.
 
-`LivePage(watch)` has the page and the routes of its pictures for `calib_ros_view.web.server.serve`. Everything shown is the
-watch's, so that all clients see the same; per client there are only the window of time, the reference and the switch of the
-overlay.
+Everything shown is the watch's, so that all clients see the same; per client there are only the window of time, the reference
+and the switch of the overlay.
 """
 
 from __future__ import annotations
@@ -11,14 +10,11 @@ import asyncio
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
-from fastapi import FastAPI, Response
 from nicegui import ui
 from nicegui.events import GenericEventArguments, KeyEventArguments
 
 from calib_ros.arrays import Matrix
-from calib_ros.messages import stamp_ns
 from calib_ros_view.node.watch import CHECK, Watch
 from calib_ros_view.session.live import HOUR, Event, Presence, moment_of
 from calib_ros_view.web import live_charts, theme
@@ -36,28 +32,25 @@ from calib_ros_view.web.live_words import (
     tile_html,
     words_of_check,
 )
-
-if TYPE_CHECKING:
-    from calib_ros_msgs.msg import KeyframePicture
+from calib_ros_view.web.server import Pictures
 
 CHARTS_S = 3.0  # between updates of the charts; everything else is updated once a second
 WINDOWS = {300: "5 min", 900: "15 min", 3600: "1 h"}
 REFERENCES = {"first": "first heard", "newest": "newest", "moment": "at"}
 WHERE_CLICKED = "(e) => emit(e.offsetX / e.currentTarget.clientWidth)"  # on the strip, 0..1
-NO_STORE = {"Cache-Control": "no-store"}
 EVENTS_SHOWN = 60
 
 
 class LivePage:
     """The page of one node, and what its clients share: the keyframes drawn last.
 
-    at: where its pictures are. back: address of the page that it belongs to, "" = none. other: whether another page is to be
-    shown at its place, which loading it again brings.
+    back: address of the page that it belongs to, "" = none. other: whether another page is to be shown at its place, which
+    loading it again brings.
     """
 
-    def __init__(self, watch: Watch, at: str = "/live", back: str = "", other: Callable[[], bool] = lambda: False) -> None:
-        self.watch, self.at, self.back, self.other = watch, at, back, other
-        self.tiles: list[KeyframePicture] = []
+    def __init__(self, watch: Watch, pictures: Pictures, back: str = "", other: Callable[[], bool] = lambda: False) -> None:
+        self.watch, self.pictures, self.back, self.other = watch, pictures, back, other
+        self.gallery = ""
         self.gallery_note = "not asked for yet"
         self.gallery_at = 0.0
         self.drawn_of = 0  # keyframes in the buffer when they were drawn last
@@ -66,28 +59,16 @@ class LivePage:
         """Build the page of a client."""
         _ClientPage(self).build()
 
-    def routes(self, app: FastAPI) -> None:
-        """Add the addresses of the pictures. They are in memory: no path of the disk is made of a request."""
-
-        app.get(f"{self.at}/overlay.jpg", response_class=Response)(self.overlay)
-        app.get(f"{self.at}/keyframe/{{stamp}}.jpg", response_class=Response)(self.keyframe)
-
-    def overlay(self) -> Response:
-        """The newest ~/overlay."""
-        jpeg = self.watch.overlay.jpeg
-        return Response(jpeg, 200 if jpeg else 404, NO_STORE, "image/jpeg")
-
-    def keyframe(self, stamp: int) -> Response:
-        """One of those drawn last."""
-        found = [bytes(tile.data) for tile in self.tiles if stamp_ns(tile.stamp) == stamp]
-        return Response(found[0] if found else b"", 200 if found else 404, NO_STORE, "image/jpeg")
-
     async def draw_keyframes(self) -> None:
         """Ask the node for pictures; clients that ask meanwhile share the answer."""
         answer = await asyncio.wrap_future(self.watch.keyframes())
         if answer.success:
-            self.tiles = list(answer.response.keyframes)
-            drawn, ms = len(self.tiles), 1000 * answer.response.cpu
+            tiles = [
+                tile_html(tile, self.pictures.put(f"keyframe {k}{self.watch.name}", bytes(tile.data)))
+                for k, tile in enumerate(answer.response.keyframes)
+            ]
+            self.gallery = "".join(tiles)
+            drawn, ms = len(tiles), 1000 * answer.response.cpu
             self.gallery_note = f"{drawn} keyframe{'s' * (drawn != 1)}, drawn in {ms:.0f} ms of the node's CPU time"
         else:
             self.gallery_note = answer.message
@@ -375,15 +356,14 @@ class _ClientPage:
         overlay = self.watch.overlay
         if overlay.number and overlay.number != self.overlay_number:
             self.overlay_number = overlay.number
-            self.picture.props(f'src="{self.page.at}/overlay.jpg?n={overlay.number}"')
+            address = self.page.pictures.put(f"overlay{self.watch.name}", overlay.jpeg)
+            self.picture.props(f'src="{address}"')
             self.picture.set_visibility(True)
         if overlay.number:
             self.overlay_note.text = f"drawn {ago(now - overlay.at)}; before: initial extrinsic, after: current one"
         if self.page.gallery_at != self.gallery_shown:
             self.gallery_shown = self.page.gallery_at
-            self.gallery.content = (
-                f'<div class="tiles">{"".join(tile_html(tile, self.page.at) for tile in self.page.tiles)}</div>'
-            )
+            self.gallery.content = f'<div class="tiles">{self.page.gallery}</div>'
         history = self.watch.history
         keyframes = history.diagnosis.number("keyframes in the buffer")
         if history.presence is Presence.LIVE and keyframes >= 0 and self.page.is_due(int(keyframes)):

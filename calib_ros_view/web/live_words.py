@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib_ros.messages import stamp_ns
 from calib_ros_view.node.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Watch
 from calib_ros_view.session.live import BAD, DOUBTFUL, GOOD, NEUTRAL, Event, LiveHistory, Presence
 from calib_ros_view.session.motion import AXES
@@ -169,12 +168,12 @@ def event_html(event: Event) -> str:
     )
 
 
-def tile_html(tile: KeyframePicture, at: str) -> str:
-    """A keyframe of the gallery. at: where the pictures of its page are."""
+def tile_html(tile: KeyframePicture, address: str) -> str:
+    """A keyframe of the gallery. address: of its picture."""
     score = "too little in view" if math.isnan(tile.score) else f"score {tile.score:.2f}"
     age = "newest" if tile.age <= 0 else f"{tile.age:.1f} s older"
     return (
-        f'<figure><img src="{at}/keyframe/{stamp_ns(tile.stamp)}.jpg" alt="keyframe, {age}" loading="lazy">'
+        f'<figure><img src="{address}" alt="keyframe, {age}" loading="lazy">'
         f"<figcaption>{age} · {score} · {tile.in_view} of {tile.edge_points} edge points</figcaption></figure>"
     )
 

@@ -206,11 +206,12 @@ class ScenePanel(TurnedScene):
         cloud = await run.io_bound(colored_cloud, self._session.frames[frame], T)
         if cloud is None:
             return
+        xyz, rgb, _ = cloud
         # From behind the camera, whichever way it looks: not all LiDARs call that x.
         scene = self._opened(*se3.transform(se3.inverse(T), np.array([EYE, AIM])))
-        linear = (cloud.rgb / 255.0) ** GAMMA  # as the scene wants colours; those of pictures would look pale
+        linear = (rgb / 255.0) ** GAMMA  # as the scene wants colours; those of pictures would look pale
         with scene:
-            scene.point_cloud(_rounded(cloud.xyz), _rounded(linear), point_size=POINT_SIZE)
+            scene.point_cloud(_rounded(xyz), _rounded(linear), point_size=POINT_SIZE)
             self._frustum(se3.inverse(T), np.array([[u, v, 1.0] for u, v in FRUSTUM]), "#fb923c")
 
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from fastapi import FastAPI, Response
-
 from calib_ros_view.node.rig_watch import RigWatch
 from calib_ros_view.node.watch import Watch
 from calib_ros_view.session.rig_shown import Pair
 from calib_ros_view.web.live_page import LivePage
 from calib_ros_view.web.rig_sessions import RIG, failed
-
-NOT_FOUND = Response(b"", 404)
+from calib_ros_view.web.server import Pictures
 
 
 class LivePairs:
     """Opens pairs that a rig has. Use as a context manager: leaving it ends their watches."""
 
-    def __init__(self, feed: RigWatch) -> None:
-        self.feed = feed
+    def __init__(self, feed: RigWatch, pictures: Pictures) -> None:
+        self.feed, self._pictures = feed, pictures
         self._opened: dict[Pair, LivePage] = {}
 
     def __enter__(self) -> LivePairs:
@@ -34,18 +31,5 @@ class LivePairs:
             failed(f"{self.feed.name} has no pair of {camera} and {lidar}; open one that its page lists")
             return
         if pair not in self._opened:
-            self._opened[pair] = LivePage(Watch(f"{self.feed.name}/{camera}/{lidar}"), f"/live/{camera}/{lidar}", RIG)
+            self._opened[pair] = LivePage(Watch(f"{self.feed.name}/{camera}/{lidar}"), self._pictures, RIG)
         self._opened[pair].page()
-
-    def routes(self, app: FastAPI) -> None:
-        """Add the addresses of the pictures of all pairs, which are in memory."""
-
-        @app.get("/live/{camera}/{lidar}/overlay.jpg", response_class=Response)
-        def overlay(camera: str, lidar: str) -> Response:
-            own = self._opened.get((camera, lidar))
-            return own.overlay() if own else NOT_FOUND
-
-        @app.get("/live/{camera}/{lidar}/keyframe/{stamp}.jpg", response_class=Response)
-        def keyframe(camera: str, lidar: str, stamp: int) -> Response:
-            own = self._opened.get((camera, lidar))
-            return own.keyframe(stamp) if own else NOT_FOUND

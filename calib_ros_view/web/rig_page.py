@@ -27,30 +27,11 @@ def address_of(pair: Pair) -> str:
     return f"/pair/{'/'.join(pair)}"
 
 
-class RigPages:
-    """What all browsers see of a rig, each in a page of its own."""
+class RigPage:
+    """What one browser sees of a rig."""
 
     def __init__(self, feed: RigSession | RigWatch, pictures: Pictures) -> None:
-        self.feed, self._pictures = feed, pictures
-        self._shown: dict[str, tuple[bytes, str]] = {}
-
-    def page(self) -> None:
-        """Build the page of a browser."""
-        _RigPage(self).build()
-
-    def address(self, tile: str) -> str:
-        """Of a picture; another one when it is another."""
-        data = self.feed.tiles.get(tile, b"")
-        if data and (tile not in self._shown or self._shown[tile][0] is not data):
-            self._shown[tile] = data, self._pictures.put(f"rig {tile}".replace("/", " "), data)
-        return self._shown[tile][1] if data else ""
-
-
-class _RigPage:
-    """The page of one browser."""
-
-    def __init__(self, pages: RigPages) -> None:
-        self._pages, self._feed = pages, pages.feed
+        self._feed, self._pictures = feed, pictures
         self._seen = -1
         self._tiles: dict[str, ui.element] = {}
         self._links: dict[str, Sequence[Pair]] = {}
@@ -147,7 +128,7 @@ class _RigPage:
             with self._grid:
                 self._tiles = {tile: self._tile(tile, pairs) for tile, pairs in links.items()}
         for tile, picture in self._tiles.items():
-            picture.props(f'src="{self._pages.address(tile)}"')
+            picture.props(f'src="{self._pictures.put(f"rig {tile}", self._feed.tiles[tile])}"')
 
     def _tile(self, tile: str, pairs: Sequence[Pair]) -> ui.element:
         with ui.element("figure").classes("m-0"):

@@ -37,7 +37,7 @@ TOKEN_BYTES = 16
 TOKEN = re.compile(r"[A-Za-z0-9._-]+")
 REFUSED_ORIGIN = b"refused: this request comes from another page; open the address that calib-ros printed"
 REFUSED_TOKEN = b"refused: open the whole address that calib-ros printed, with its token"
-PICTURES_HELD = 128  # of all browsers together
+PICTURES_HELD = 256  # of all browsers together
 PAGE_S = 300.0  # in which the frames of a pair are read and searched for edges
 FINISH_S = 2  # seconds that open connections get at the end
 
@@ -167,18 +167,20 @@ class Pictures:
     """The last picture of each name, in memory: no request names a file."""
 
     def __init__(self) -> None:
-        self._held: OrderedDict[str, bytes] = OrderedDict()
+        self._held: OrderedDict[str, tuple[bytes, str]] = OrderedDict()  # with its address
         self._count = itertools.count()
         self._lock = threading.Lock()
 
     def put(self, name: str, data: bytes) -> str:
-        """Hold a JPEG under a name in place of the one before; returns its address, another one every time."""
+        """Hold a JPEG under a name in place of the one before; returns its address, another one whenever it is another."""
+        name = name.replace("/", " ")
         with self._lock:
-            self._held[name] = data
+            if name not in self._held or self._held[name][0] is not data:
+                self._held[name] = data, f"/picture/{name}?v={next(self._count)}"
             self._held.move_to_end(name)
             while len(self._held) > PICTURES_HELD:
                 self._held.popitem(last=False)
-        return f"/picture/{name}?v={next(self._count)}"
+            return self._held[name][1]
 
     def drop(self, owner: str) -> None:
         """Forget the pictures of a browser that has left, whose names begin with its own."""
@@ -192,8 +194,8 @@ class Pictures:
 
         @app.get("/picture/{name}", response_class=Response)
         def picture(name: str):  # type: ignore[no-untyped-def]  # FastAPI resolves annotations, which are imported late here
-            data = self._held.get(name)
-            return Response(data or b"", 200 if data else 404, {"Cache-Control": "no-store"}, "image/jpeg")
+            data, _ = self._held.get(name, (b"", ""))
+            return Response(data, 200 if data else 404, {"Cache-Control": "no-store"}, "image/jpeg")
 
 
 def require_nicegui() -> None:

@@ -200,8 +200,8 @@ def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pyte
     out = tmp_path / "out"
     code, _, err = run(capsys, SOURCE, "--frame", "1", "--config", str(tmp_path / "models.yaml"), "--out", str(out))
     assert code == 0, err
-    frame, labels = drive[1], drive.labels(1)
-    w = np.isin(labels.image, [1, 2, 3, 4, 5]).mean()
+    frame = drive[1]
+    w = np.isin(frame.classes, [1, 2, 3, 4, 5]).mean()
     text = (out / "index.html").read_text()
     assert f"w_j = {w:.1%}" in text
     assert f"100% of the {len(frame.cloud)} points" in text
@@ -209,13 +209,13 @@ def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pyte
     assert "Boundaries of masks are blended in" in text
     assert "score blends 50% of them into its edges of either direction" in text
     assert "No model" not in text
-    counts = {c.name.lower(): int((labels.image == c).sum()) for c in SemanticClass}
+    counts = {c.name.lower(): int((frame.classes == c).sum()) for c in SemanticClass}
     bars = class_histogram(counts, [c.name.lower() for c in MAIN_CLASSES])
     np.testing.assert_array_equal(cv2.imread(str(next(out.glob("*pixels_by_class.png")))), bars)
     row = re.search(r"<td>vehicle</td><td>([0-9.]+)%</td><td>([0-9.]+)%</td>", text)
     assert row
-    assert float(row[1]) == pytest.approx(100 * np.mean(labels.image == 1), abs=0.06)
-    assert float(row[2]) == pytest.approx(100 * np.mean(labels.points == 1), abs=0.06)
+    assert float(row[1]) == pytest.approx(100 * np.mean(frame.classes == 1), abs=0.06)
+    assert float(row[2]) == pytest.approx(100 * np.mean(frame.cloud.label == 1), abs=0.06)
     assert shows_semantics(out, "boundaries_of_masks")
     pictures = [path.read_bytes() for path in out.glob("*.png")]
     assert len(set(pictures)) >= len(pictures) - 1  # one edge operator is that of the run

@@ -42,22 +42,22 @@ def test_hostile_requests_are_refused_and_no_file_is_read(page):
     assert page.opened() == page.opened(Origin=f"http://127.0.0.1:{page.port}") == 101
     for headers in ({"Origin": "http://evil.example"}, {"Host": f"evil.example:{page.port}"}, {"Origin": "null"}, {"Host": ""}):
         assert page.opened(**headers) == 403, headers
-        for path in ("/", POLLING, "/live/overlay.jpg"):
+        for path in ("/", POLLING, "/picture/overlay"):
             assert page.get(path, **headers)[0] == 403, (path, headers)
     etc = "..%2f..%2f..%2fetc%2fpasswd"
-    live = (f"/live/keyframe/{etc}.jpg", "/live/keyframe/%2fetc%2fpasswd.jpg", "/live/../../etc/passwd")
-    for path in (f"/picture/{etc}", "/picture/extrinsic.json", *live, "/../../etc/passwd", "/docs", "/openapi.json", "/reset"):
+    pictures = (f"/picture/{etc}", "/picture/%2fetc%2fpasswd", "/picture/../../etc/passwd", "/picture/extrinsic.json")
+    for path in (*pictures, "/../../etc/passwd", "/docs", "/openapi.json", "/reset"):
         status, content = page.get(path)
         assert status in (400, 403, 404, 422), path
         assert b"root:" not in content
-    for path in ("/", "/live/calibrate", "/calibrate", "/reset"):
+    for path in ("/", "/calibrate", "/reset"):
         assert page.get(path, "POST")[0] in (404, 405), path
 
 
 def test_with_a_token_nothing_is_told_without_it():
     with Page(SOURCE, "--frames", "0", "--token", "sesame") as page:
         assert page.url.endswith("?token=sesame")
-        assert {page.get(path)[0] for path in ("/", POLLING, "/?token=open", "/live/overlay.jpg")} == {page.opened()} == {403}
+        assert {page.get(path)[0] for path in ("/", POLLING, "/?token=open", "/picture/overlay")} == {page.opened()} == {403}
         cookie = f"calib_ros_token_{page.port}=sesame"
         assert (page.opened(Cookie=cookie), page.get(Cookie=cookie)[0]) == (101, 200)
         page.end(signal.SIGTERM)

@@ -65,12 +65,12 @@ def _check(command: str) -> None:
         case ["ros2", "param", "set", "/calib_ros", name, _]:
             assert is_parameter(name)
         case ["ros2", "service", "call", name, kind, *request]:
-            assert name.removeprefix("/calib_ros") in _offered(r"(?:create_service\(|serve\(\w+, [\w.]+, )"), name
+            assert name.removeprefix("/calib_ros") in _offered("(?:create_service|serve)"), name
             _check_fields(_interface(kind).Request, yaml.safe_load(request[0]) if request else {})
         case ["ros2", "action", "send_goal", "--feedback", "/calib_ros/calibrate", kind]:
             assert _interface(kind).Goal
         case ["ros2", "topic", "echo", name, *options] if name.startswith("/calib_ros/"):
-            assert name.removeprefix("/calib_ros") in _offered(r"create_publisher\("), name
+            assert name.removeprefix("/calib_ros") in _offered("create_publisher"), name
             assert options in ([], ["--once"]) or (
                 options[0] == "--field" and options[1] in Extrinsic.get_fields_and_field_types()
             )
@@ -125,8 +125,8 @@ def _check_fields(message: Any, values: dict[str, Any]) -> None:
 
 
 def _offered(call: str) -> set[str]:
-    """Names below the node's, such as /check, that its sources give to a call, whose beginning is a pattern."""
+    """Names below the node's, such as /check, that its sources make services or publishers of."""
     found: set[str] = set()
     for path in [*ROOT.glob("calib_ros/ros/*.py"), *ROOT.glob("calib_ros_*/node/*.py")]:
-        found |= set(re.findall(rf'{call}\w+, "~(/[\w/]+)"', Path(path).read_text(encoding="utf-8")))
+        found |= set(re.findall(rf'{call}\(\w+, "~(/[\w/]+)"', Path(path).read_text(encoding="utf-8")))
     return found

@@ -22,7 +22,7 @@ from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.result import CONVERGED, REFUSED, Result
-from calib_ros_synthetic.drive import Labels, SyntheticDrive
+from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_synthetic.rig import SyntheticRig
 
 SIZE = {"width": 640, "height": 240, "rings": 64, "speed": 0, "stride": 30}
@@ -51,14 +51,14 @@ def made_once(key: object, make: Callable[[], Any]) -> Any:
     return pickle.loads(path.read_bytes())
 
 
-def render_once(drive: SyntheticDrive, index: int, T_camera_lidar: np.ndarray, age_s: float = 0.0) -> tuple[Frame, Labels]:
+def render_once(drive: SyntheticDrive, index: int, T_camera_lidar: np.ndarray, age_s: float = 0.0) -> Frame:
     """In place of SyntheticDrive._render. Not for tests of the renderer, nor for a drive with an empty stretch."""
     options = {name: value for name, value in drive._parameters.items() if name != "frames"}  # no frame depends on their number
     camera = drive.camera
     lens = (camera.K.tolist(), camera.width, camera.height, camera.model, np.asarray(camera.D).tolist())
     key = (sorted(options.items()), lens, index, np.asarray(T_camera_lidar).tolist(), age_s)
-    frame, labels = made_once(key, lambda: _render(drive, index, T_camera_lidar, age_s))
-    return replace(frame, camera=camera, reference=T_camera_lidar), labels
+    frame = made_once(key, lambda: _render(drive, index, T_camera_lidar, age_s))
+    return replace(frame, camera=camera, reference=T_camera_lidar)
 
 
 def scan_once(rig: SyntheticRig, lidar: str, index: int) -> Any:
@@ -94,14 +94,14 @@ def is_near(reference: np.ndarray, T: np.ndarray, deg: float, m: float) -> bool:
 
 def on_pixels_of_their_class(drive: SyntheticDrive, index: int, T: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
     """Classes (n,) of a frame's points in the picture, and whether a pixel within `reach` px has the same one."""
-    labels = drive.labels(index)
-    uv, inside = drive.camera.project(se3.transform(T, drive[index].cloud.xyz))
+    frame = drive[index]
+    uv, inside = drive.camera.project(se3.transform(T, frame.cloud.xyz))
     u, v = np.rint(uv[inside]).astype(int).T
-    own = labels.points[inside]
+    own = frame.cloud.label[inside]
     same = np.zeros(len(own), bool)
     for dv, du in itertools.product(range(-reach, reach + 1), repeat=2):
         row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
-        same |= labels.image[row, column] == own
+        same |= frame.classes[row, column] == own
     return own, same
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import struct
 import tracemalloc
 from dataclasses import replace
@@ -20,7 +19,7 @@ from sample_sources import Listed, frames, originals
 
 from calib_ros import result
 from calib_ros.camera import Camera, Rectifier
-from calib_ros.config import Config, LidarConfig, load_stages
+from calib_ros.config import Config, load_stages
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.kitti_files import Timestamps, read_picture
@@ -80,19 +79,6 @@ def test_image_size_is_limited_by_its_bytes(tmp_path: Path):
         assert decode_compressed_image(ros.compressed("x", black)).shape == (1080, 1920, *channels)
 
 
-def test_driver_texts_stay_on_one_line():
-    ros, bad = Messages("rosbags"), "x\ny" + "z" * 5000
-    for decode, message in (
-        (decode_image, ros.image(bad, 2, 2, bytes(4), 2)),
-        (decode_compressed_image, ros.compressed(bad, b"")),
-        (decode_camera_info, ros.camera_info(96, 64, K, model=bad)),
-    ):
-        with pytest.raises(BadInputError) as caught:
-            decode(message)
-        assert "\n" not in str(caught.value)
-        assert len(str(caught.value)) < 500
-
-
 def test_extreme_cameras_are_refused_or_cost_nothing_before_their_first_image():
     with pytest.raises(BadInputError, match="beyond 32766 px a side"):
         Camera(K, 2**31, 64)
@@ -104,16 +90,6 @@ def test_extreme_cameras_are_refused_or_cost_nothing_before_their_first_image():
     tracemalloc.stop()
     assert rectify.camera.width == 30_000
     assert peak < MIB
-
-
-@pytest.mark.filterwarnings("error")
-def test_coordinates_beyond_any_lidar_range_are_dropped():
-    rng = np.random.default_rng(0)
-    xyz = rng.normal(0, 10, (500, 3)).astype(np.float32)
-    xyz[::5] = rng.choice(np.array([1e6, 1e19, 1e38, -1e38, np.inf, np.nan], np.float32), (100, 3))
-    cloud = PointCloud(xyz)
-    assert len(cloud.finite()) == 400
-    assert len(range_image(cloud, LidarConfig()).cloud) <= 400
 
 
 @pytest.mark.parametrize("layout", ["auto", "rings", "projection"])
@@ -136,11 +112,8 @@ ALIASES = "aliases are not supported"
     [
         (LAUGHS, ALIASES),
         (MERGES, ALIASES),
-        (LAUGHS.replace("i:", "search:"), ALIASES),
-        ("search: &a {seed: *a}", ALIASES),
         ("search: {seed: 0x" + "f" * 6000 + "}", "more than 1000 digits"),
         ('"a\\nb": 1', "a key that is no name"),
-        ("? [a]\n: 1", "a key that is no name"),
         ("search: {seed: '" + "x" * 5000 + "'}", "xxx... must be of type int"),
     ],
 )
@@ -162,12 +135,6 @@ def test_endless_files_are_refused(path: str):
         load_stages(path)
     with pytest.raises(BadInputError, match="has more than 1000000 bytes; give a JSON or YAML result"):
         result.load(path)
-
-
-@pytest.mark.parametrize("change", [{"frames_used": -1}, {"frames_used": 2**32}, {"status": ["a"]}, {"camera_frame": {"a": 1}}])
-def test_results_beyond_message_limits_are_refused(change: dict[str, Any]):
-    with pytest.raises(BadInputError, match=next(iter(change))):
-        result.parse(json.dumps({"T_camera_lidar": np.eye(4).tolist(), **change}), "x")
 
 
 def test_texts_of_a_result_can_be_written_and_sent():

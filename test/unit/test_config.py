@@ -62,19 +62,6 @@ def test_values_that_contradict_each_other_are_refused():
             Config.from_dict(values)
 
 
-def test_unusual_but_consistent_values_are_accepted():
-    for values in (
-        {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}},
-        {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "once_per_level"}},
-        {"refine": {"optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "every_evaluation"}},
-        {"semantics": {"segment_anything": "encoder.onnx", "segment_anything_decoder": "decoder.onnx"}},
-    ):
-        config = Config.from_dict(values).to_dict()
-        for stage, fields in values.items():
-            for key, value in fields.items():
-                assert config[stage][key] == (tuple(value) if isinstance(value, list) else value)
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -101,25 +88,19 @@ def test_empty_files_mean_the_defaults(read, text):
 def test_wrong_values_are_refused_by_name(read):
     for text, says in (
         ("serch: {seed: 1}", "stage 'serch'; there are camera, image, lidar, "),
-        ("/**:\n  ros__parameters:\n    serach.seed: 1", "serach"),
-        ("/**:\n  ros__parameters:\n    serach: {seed: 1}", "serach"),
         ("search: {sed: 1}", "unknown parameter 'search.sed'; there are .*seed"),
         ("/**:\n  ros__parameters:\n    search.sed: 1", "unknown parameter 'search.sed'"),
         ("search: 5", "stage 'search' must hold names and values, got 5"),
         ("search: {seed: 1.5}", "search.seed = 1.5 must be of type int"),
-        ("search: {seed: '1'}", "search.seed = '1' must be of type int"),
-        ("search: {seed: null}", "search.seed = None must be of type int"),
         ("search: {seed: true}", "search.seed = True must be of type int"),
         ("search: {rotation_deg: '3'}", "search.rotation_deg = '3' must be of type float"),
         ("search: {rotation_deg: 46}", r"search.rotation_deg = 46 is out of range \[0, 45\]"),
         ("search: {rotation_deg: .nan}", r"search.rotation_deg = nan is out of range"),
-        ("search: {seed: -1}", r"search.seed = -1 is out of range \[0, "),
         ("monitor: {enabled: 'true'}", "monitor.enabled = 'true' must be of type bool"),
         ("refine: {optimizer: bfgs}", "optimizer = 'bfgs' must be one of auto, levenberg_marquardt, nelder_mead"),
         ("lidar: {ego_box: 4}", "lidar.ego_box = 4 must be a list of float"),
         ("constraints: {limit_m: [0, 0]}", r"constraints.limit_m = \[0, 0\] must have 3 elements"),
         ("constraints: {sigma_deg: [1, 1, -0.1]}", r"constraints.sigma_deg = -0.1 is out of range \[0, 180\]"),
-        ("constraints: {sigma_m: [1, 1, a]}", "constraints.sigma_m = 'a' must be of type float"),
     ):
         with pytest.raises(ConfigError, match=says) as caught:
             read(text)
@@ -133,11 +114,8 @@ def test_files_without_a_configuration_are_refused(read, tmp_path):
     for text, says in (
         ("search: {seed: 1\nonline: [", "line [23]"),
         ("search:\n\tseed: 1", "line 2"),
-        ("a: 2024-13-45", "not valid YAML"),
         ("!!python/object/apply:os.system ['true']", "not valid YAML"),
-        ("\x00", "not valid YAML"),
         (b"\xff\xfe\x00abc", "not valid YAML"),
-        (b"search: {seed: 1} # \xe4", "not valid YAML"),
         ("- search", "must hold stages"),
         ("/**:\n  ros__parameters: [1, 2]", "must hold names and values"),
     ):
@@ -168,13 +146,8 @@ def test_removed_options_are_ignored_with_one_warning(read, form):
     assert len(caught) == 1
     with pytest.warns(FutureWarning, match=r"; in place of semantics\.first_guess there is initial\.method: semantic$"):
         Config.from_dict({"semantics": {"first_guess": True, "witness": False}})
-    for form in FORMS:  # of a stage that there is no more
-        with pytest.warns(FutureWarning, match=r"^guess\.tilt_deg has .*; in place of guess\.tilt_deg there is --initial FILE"):
-            assert read(form.format(stage="guess", name="tilt_deg", value=30.0)) == Config()
     with pytest.raises(ConfigError, match=r"unknown parameter 'guess\.tilt'"):
         Config.from_dict({"guess": {"tilt": 30.0}})
-    with pytest.warns(FutureWarning, match=r"; in place of thesis\.completion there is morphology, eq\. 3\.11$"):
-        assert Config.from_dict({"thesis": {"completion": "own.onnx"}}) == Config()
 
 
 def test_all_removed_options_at_once_make_one_warning_a_stage():

@@ -41,8 +41,5 @@ def test_texts_are_read() -> None:
 def test_other_texts_are_refused_with_the_form(text: str) -> None:
     with pytest.raises(ConfigError, match=r"must be NAME DEG M .*'planner 0.5 0.10'"):
         parse_consumers(["fusion 0.1 0.02", text])
-
-
-def test_a_name_stands_for_one_consumer() -> None:
     with pytest.raises(ConfigError, match="planner is named twice"):
         parse_consumers(["planner 0.5 0.10", "planner 1 1"])

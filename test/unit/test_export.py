@@ -22,7 +22,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.export import FORMATS, export
 from calib_ros.online.state import save_state
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.result import CONVERGED, INITIAL, REFUSED, Result, load, parse
+from calib_ros.result import CONVERGED, INITIAL, REFUSED, Result, parse
 
 PINHOLE = Camera(np.array([[700.0, 0, 600.5], [0, 710, 180.25], [0, 0, 1]]), 1242, 375)
 LENS = Camera(PINHOLE.K, 1242, 375, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0]))
@@ -200,10 +200,7 @@ def test_the_command_takes_direction_and_names(saved: Path, capsys: pytest.Captu
     same(found, TRANSFORMS["near nominal"], "lidar")
 
 
-def test_yaml_and_hand_written_files_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    result(TRANSFORMS["near nominal"]).save(tmp_path / "r.yaml")
-    code, out, err = run(capsys, tmp_path / "r.yaml")
-    assert (code, out, err) == (0, export(load(tmp_path / "r.yaml"), "tf"), "")
+def test_files_written_by_hand_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "hand.yaml").write_text("translation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n")
     code, out, err = run(capsys, tmp_path / "hand.yaml")
     assert code == 0
@@ -211,7 +208,7 @@ def test_yaml_and_hand_written_files_are_read(tmp_path: Path, capsys: pytest.Cap
     assert "its status is initial; exported all the same" in err
 
 
-@pytest.mark.parametrize("status", [INITIAL, REFUSED, "insufficient", "suspect", "moved", "blinded"])
+@pytest.mark.parametrize("status", [INITIAL, REFUSED])
 def test_unaccepted_results_are_exported_with_a_note(status: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result(np.eye(4), status=status, reason="nothing\nmatches").save(tmp_path / "r.json")
     code, out, err = run(capsys, tmp_path / "r.json")
@@ -232,10 +229,7 @@ def test_bad_input_is_one_line(saved: Path, tmp_path: Path, capsys: pytest.Captu
         (["{tmp}"], "cannot read"),
         (["{tmp}/bad.json"], "neither valid JSON nor YAML"),
         (["{tmp}/flipped.json"], "damaged"),
-        (["{tmp}/state.json", "--format", "png"], "--format"),
         (["{tmp}/state.json", "--parent", "base"], "--parent"),
-        (["{tmp}/state.json", "--lidar-frame", ""], "has no name"),
-        (["{tmp}/state.json", "--out", "{tmp}"], "cannot write"),
         (["{tmp}/state.json", "--out", "/dev/full"], "No space left"),
         ([], "file"),
     ):

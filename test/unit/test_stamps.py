@@ -51,26 +51,14 @@ def test_the_share_of_missing_messages_is_told(lost):
     "stamps",
     [
         regular(33.3, 200, 3.0),
-        regular(200.0, 200, 20.0),
-        regular(1000.0, 200),
-        np.r_[regular(33.3, 100), 3330 + regular(66.6, 40)],  # longer exposures since some seconds
-        np.r_[regular(33.3, 100), 3330 + regular(66.6, 30)],
         np.r_[regular(33.3, 100), 3330 + regular(66.6, 15)],
         np.r_[regular(100.0, 60), 9000 + regular(100.0, 30)],  # an interruption
-        np.r_[regular(100.0, 60), 3.6e6 + regular(100.0, 30)],  # a clock set forward
         regular(33.3, WINDOW - 2, lost=0.5),  # too few to tell
     ],
-    ids=["camera", "5 Hz", "1 Hz", "slower 40", "slower 30", "slower 15", "interruption", "clock set", "few"],
+    ids=["camera", "slower", "interruption", "few"],
 )
 def test_a_slow_or_interrupted_stream_loses_nothing(stamps):
     assert rhythm(stamps).missing_share() < 0.02
-
-
-def test_messages_at_random_times_lose_nothing():
-    """A camera that is triggered by what it sees has no period that anything could be missing in."""
-    for seed in range(20):
-        stamps = np.cumsum(np.random.default_rng(seed).exponential(100.0, 200))
-        assert rhythm(stamps).missing_share() == 0.0
 
 
 def test_the_tolerance_follows_the_longer_period():
@@ -81,14 +69,6 @@ def test_the_tolerance_follows_the_longer_period():
         *(((100, 100), 0.02, 20 * MS), ((100, 100), 0.5, 60 * MS), ((1000, 1000), 0.5, 500 * MS), ((0, 0), 0.5, 500 * MS)),
     ):
         assert pair_tolerance((periods_ms[0] * MS, periods_ms[1] * MS), limit_s) == tolerance
-
-
-def test_nearest_pairs_use_each_stamp_once():
-    a, b = np.array([0, 10, 20, 30]), np.array([1, 9, 11, 33, 90])
-    ia, ib = nearest_pairs(a, b, 5)
-    assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (3, 3)]
-    ia, ib = nearest_pairs(a, b, 9)
-    assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (2, 2), (3, 3)]  # 20 takes 11, which 10 left over
 
 
 def test_nearest_pairs_equal_a_greedy_choice():

@@ -114,16 +114,6 @@ def test_export_changes_the_joint_of_a_file_that_exists(urdf: Path, tmp_path: Pa
     assert urdf.read_bytes() == after
 
 
-def test_export_says_that_a_new_file_holds_a_joint_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    RESULT.save(tmp_path / "result.json")
-    new = tmp_path / "new.urdf"
-    assert main(["export", str(tmp_path / "result.json"), "--format", "urdf", "--out", str(new)]) == 0
-    assert f"wrote {new}: a joint alone, not a description; put it between the <robot> tags" in capsys.readouterr().out
-    description = f"<robot>{new.read_text()}</robot>"
-    new.write_text(description)
-    np.testing.assert_allclose(joint(new, f"{RESULT.camera_frame}_to_{RESULT.lidar_frame}"), RESULT.T_camera_lidar, atol=1e-12)
-
-
 @pytest.mark.parametrize("origin", [b"", b'<origin rpy="0 0 0"/>', b"<origin/>", b"<origin></origin>"])
 def test_an_origin_or_its_attributes_may_be_missing(urdf: Path, origin: bytes) -> None:
     before = URDF[: URDF.index(b"<origin note")] + origin + URDF[URDF.index(b"  <!-- by hand") :]

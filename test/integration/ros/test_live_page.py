@@ -21,10 +21,6 @@ def live():
         page.end()
 
 
-def test_pictures_come_from_memory(live):
-    assert [live.get(f"/live/{name}.jpg")[0] for name in ("overlay", "keyframe/1")] == [404, 404], "no picture yet"
-
-
 @pytest.mark.slow
 def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(live, open_page, street, drive):  # noqa: F811
     browser = open_page(live.url, 420, 900)

@@ -16,7 +16,7 @@ from calib_ros_synthetic import camera, lidar, rays, scanners, wide, windows
 from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_synthetic.rigs import RIGS
-from calib_ros_synthetic.scanners import MODELS, Order, Rings, scanner
+from calib_ros_synthetic.scanners import MODELS, scanner
 from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Solids
 from calib_ros_synthetic.wide import WideView
@@ -80,9 +80,9 @@ def test_clouds_are_stored_as_the_driver_stores_them(name: str) -> None:
     assert ring is not None
     assert time is not None
     elevation = np.arcsin(cloud.xyz[:, 2] / np.linalg.norm(cloud.xyz, axis=1))
-    order = ring if model.rings is Rings.FROM_BOTTOM else -ring
+    order = -ring if model.from_top else ring
     assert np.corrcoef(order, elevation)[0, 1] > 0.99
-    assert (np.diff(time) >= 0).all() if model.order is Order.FIRING else (np.diff(ring) >= 0).all()
+    assert (np.diff(ring if model.by_rows else time) >= 0).all()
 
 
 QUICK = ("hdl32e_front", "os1_64_robot")
@@ -104,13 +104,13 @@ def test_points_fall_on_pixels_of_their_class_in_every_rig(rig: str) -> None:
 def test_every_scene_is_its_own(scene: str) -> None:
     drive = RenderedDrive(seed=2, frames=4, rig="os1_64_robot", scene=scene, width=240, noise=0, speed=0)
     assert agreement(drive, drive.reference) > 0.93
-    labels = drive.labels(1)
-    share = np.bincount(labels.image.ravel(), minlength=256) / labels.image.size
+    frame = drive[1]
+    share = np.bincount(frame.classes.ravel(), minlength=256) / frame.classes.size
     assert (share[Label.SKY] < 0.06) == (scene in ("car_park", "warehouse"))
     if scene in ("trees", "park"):
         assert share[Label.BUILDING] == 0
         assert share[Label.VEGETATION] > 0.15
-    assert np.mean(labels.points == Label.GROUND) > 0.05
+    assert np.mean(frame.cloud.label == Label.GROUND) > 0.05
 
 
 def test_a_cloud_in_the_frame_of_the_vehicle_hides_where_the_scanner_is() -> None:
@@ -121,7 +121,7 @@ def test_a_cloud_in_the_frame_of_the_vehicle_hides_where_the_scanner_is() -> Non
     assert frame.cloud.ring is None
     assert frame.cloud.time is None
     assert np.abs(frame.cloud.xyz[:, 1]).max() <= 22.0
-    ground = drive.labels(1).points == Label.GROUND
+    ground = drive[1].cloud.label == Label.GROUND
     assert abs(np.median(frame.cloud.xyz[ground, 2])) < 0.15  # the origin is on the ground
     assert frame.cloud.intensity is not None
     assert frame.cloud.intensity.max() > 1000
@@ -140,11 +140,11 @@ def test_a_triggered_camera_takes_its_picture_when_the_scan_sweeps_it() -> None:
 
 def test_the_own_vehicle_stays_where_it_is_in_picture_and_scan() -> None:
     drive = RenderedDrive(seed=1, frames=4, rig="os1_128_windshield", width=160, noise=0)
-    seen = [drive.labels(i).image == UNLABELLED for i in (0, 3)]
+    seen = [drive[i].classes == UNLABELLED for i in (0, 3)]
     np.testing.assert_array_equal(*seen)
     assert 0.1 < seen[0].mean() < 0.35
     assert seen[0][-1].mean() > 0.9
-    hit = [drive[i].cloud.xyz[drive.labels(i).points == UNLABELLED] for i in (0, 3)]
+    hit = [drive[i].cloud.xyz[drive[i].cloud.label == UNLABELLED] for i in (0, 3)]
     assert len(hit[0]) > 500
     assert len(hit[0]) == len(hit[1])
     np.testing.assert_allclose(hit[0], hit[1], atol=1e-4)
@@ -185,7 +185,7 @@ def test_conditions_change_the_picture_and_not_the_truth() -> None:
     assert contrast["haze"] < 0.7 * contrast["clear"]
     assert len(drives["haze"][1].cloud) < len(drives["clear"][1].cloud)
     for name in ("rain", "blur", "jpeg"):
-        np.testing.assert_array_equal(drives[name].labels(1).image, drives["clear"].labels(1).image)
+        np.testing.assert_array_equal(drives[name][1].classes, drives["clear"][1].classes)
 
 
 def test_the_rows_of_a_rolling_shutter_are_taken_one_after_the_other() -> None:

@@ -58,10 +58,10 @@ def test_frames_do_not_depend_on_the_order_of_access_nor_on_the_length() -> None
 def test_seeds_give_different_streets() -> None:
     drives = [RenderedDrive(seed=seed, **SMALL, noise=0) for seed in range(3)]
     for a, b in itertools.combinations(drives, 2):
-        assert (a.labels(0).image == b.labels(0).image).mean() < 0.9
+        assert (a[0].classes == b[0].classes).mean() < 0.9
         assert np.abs(a[0].image.astype(float) - b[0].image).mean() > 10
         assert se3.rotation_error_deg(a.reference, b.reference) > 0.3
-    seen = np.unique(np.concatenate([d.labels(i).points for d in drives for i in (0, 8)]))
+    seen = np.unique(np.concatenate([d[i].cloud.label for d in drives for i in (0, 8)]))
     assert {Label.VEHICLE, Label.PERSON, Label.POLE, Label.SIGN, Label.BUILDING, Label.VEGETATION, Label.GROUND} <= set(
         seen.tolist()
     )
@@ -207,14 +207,14 @@ def test_noise_has_the_stated_size_and_can_be_switched_off() -> None:
     where = {(r, t): k for k, (r, t) in enumerate(zip(a.ring.tolist(), a.time.tolist(), strict=True))}  # type: ignore[union-attr]
     pairs = [(where[key], k) for k, key in enumerate(zip(b.ring.tolist(), b.time.tolist(), strict=True)) if key in where]  # type: ignore[union-attr]
     i, j = np.array(pairs).T
-    ground = clean.labels(2).points[i] == Label.GROUND
+    ground = clean[2].cloud.label[i] == Label.GROUND
     error = (np.linalg.norm(b.xyz[j], axis=1) - np.linalg.norm(a.xyz[i], axis=1))[ground]
     assert 0.018 < 1.4826 * np.median(np.abs(error)) < 0.022
     assert abs(np.median(error)) < 0.001
     assert 0.9 < len(j) / len(a) < 0.999
     difference = noisy[2].image.astype(float) - clean[2].image
     assert 1.0 < difference.std() < 2.5
-    np.testing.assert_array_equal(clean.labels(2).image, noisy.labels(2).image)
+    np.testing.assert_array_equal(clean[2].classes, noisy[2].classes)
 
 
 @pytest.mark.parametrize(

@@ -57,32 +57,6 @@ def camera_centre(T: np.ndarray) -> np.ndarray:
 
 
 @ALL
-def test_fixed_axes_stay_and_the_others_go_to_the_best_that_is_left(optimizer):
-    for fixed in ((0,), (4,), (3, 4, 5), (0, 1, 2), (0, 2, 4, 5), (0, 1, 3, 4, 5), range(6)):
-        run, tolerance = OPTIMIZERS[optimizer]
-        half = np.where(np.isin(np.arange(6), fixed), 0, INF)
-        T, value = run(Bowl(), ANCHOR, Limits(ANCHOR, half))
-        assert np.abs(twist(T)[list(fixed)]).max() < 1e-12
-        assert_twist(T, best_with(dict.fromkeys(fixed, 0.0)), tolerance)
-        assert value == pytest.approx(Bowl().value(T), abs=1e-12)
-        assert value > Bowl().value(ANCHOR) or len(fixed) == 6
-
-
-@ALL
-def test_an_axis_whose_optimum_is_out_of_reach_ends_at_its_bound(optimizer):
-    for bounded in ({0: 0.004}, {4: 0.03}, {2: 0.003, 3: 0.05}, {0: 0.004, 1: 0.004, 2: 0.004}):
-        run, tolerance = OPTIMIZERS[optimizer]
-        half = np.array([bounded.get(k, INF) for k in range(6)])
-        T, _ = run(Bowl(), ANCHOR, Limits(ANCHOR, half))
-        at_bounds = {k: v * np.sign(twist(OPTIMUM)[k]) for k, v in bounded.items()}
-        assert all(abs(twist(OPTIMUM)[k]) > v for k, v in bounded.items())
-        for k, v in at_bounds.items():
-            assert twist(T)[k] == pytest.approx(v, rel=1e-9 if optimizer == "levenberg_marquardt" else 5e-3)
-            assert abs(twist(T)[k]) <= abs(v) + 1e-12
-        assert_twist(T, best_with(at_bounds), tolerance)
-
-
-@ALL
 def test_a_start_out_of_bounds_is_brought_in_and_nothing_is_tried_outside(optimizer):
     """Bounds are not around the start, and whatever is scored lies within them."""
     run, tolerance = OPTIMIZERS[optimizer]
@@ -219,20 +193,3 @@ def test_thesis_objective_respects_constraints(scene, dense_edges):
     stay = objective.refine(start)
     assert np.rad2deg(np.abs(twist(stay, start)[1])) <= 0.2 + 1e-9
     assert np.allclose(camera_centre(stay), camera_centre(start), atol=1e-9)
-
-
-def test_bound_axis_does_not_change_the_covariance_of_the_others(scene):
-    """There the score is not at its top and bends anyhow; that is no direction which the scenes do not show."""
-    start = scene.off(([0, -0.5, 0], [0, 0, 0]))
-    bounds = {"limit_deg": [180, 0.3, 180], "limit_m": [0.05, 0.05, 0.05]}
-    # Beside the right extrinsic the scenes tell less of the focal length, which is another matter.
-    exact = update(QUICK, {"camera": {"focal_sigma": 0.0}})
-    result = Calibrator(scene.camera, update(exact, {"constraints": bounds})).estimate(scene.features, start)
-    free = Calibrator(scene.camera, exact).estimate(scene.features, start)
-    assert result.converged, result.reason
-    assert "not shown" not in result.reason
-    assert abs(from_start(result)[3]) < 0.05
-    held, sigma = np.sqrt(np.diag(result.covariance)), np.sqrt(np.diag(free.covariance))
-    # Off its top the regions of the score pull apart more, which counts as noise.
-    assert (held[[0, 2, 4, 5]] < 2.5 * sigma[[0, 2, 4, 5]]).all()
-    assert sigma[1] < held[1] <= np.deg2rad(0.3) * 1.001  # no better known than that it lies within

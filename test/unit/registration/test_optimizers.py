@@ -59,12 +59,6 @@ def test_the_optimum_is_found_within_the_evaluations(optimise, far, most_calls, 
         assert value > max(0.7 - less, score.value(start(seed, *far)))
 
 
-def test_a_simplex_crosses_ripples():
-    T, value = nelder_mead(Bumpy(), start(1), 0.8, 600)
-    assert near(T, 0.2, 0.2)
-    assert value > Bumpy().value(start(1))
-
-
 def test_the_result_is_never_worse_than_the_start():
     for seed, score in itertools.product(range(5), (Bowl(), Bumpy(), Noise())):
         for T0 in (start(seed), OPTIMUM):
@@ -74,14 +68,7 @@ def test_the_result_is_never_worse_than_the_start():
                 assert np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
 
 
-def test_a_flat_score_is_left_where_it_is():
-    flat = Bowl(curvature=np.zeros((6, 6)))
-    for T, value in (levenberg_marquardt(flat, start(2)), nelder_mead(flat, start(2)), barzilai_borwein(flat, start(2))):
-        assert np.allclose(T, start(2))
-        assert value == 0.7
-
-
-def test_nan_score_raises_no_error():
+def test_a_flat_score_and_nan_are_left_where_they_are():
     class Broken(Bowl):
         def value(self, T):
             return float("nan")
@@ -93,18 +80,9 @@ def test_nan_score_raises_no_error():
         T, value = optimise(Broken(), start(2))
         assert np.array_equal(T, start(2))
         assert np.isnan(value)
-
-
-def test_barzilai_borwein_takes_far_fewer_steps_than_a_fixed_step_where_axes_differ():
-    """What its step length is for: along a valley forty times longer than wide."""
-    bowl = Bowl(curvature=np.diag([400.0, 400, 400, 0.1, 0.1, 0.1]))
-    begin = start(1)
-    _, value = barzilai_borwein(bowl, begin, 2.0, evaluations=400)
-    T = begin
-    for _ in range(30):  # as many evaluations: steepest ascent of a step that does not overshoot
-        gradient, _ = bowl.linearise(T)
-        T = se3.exp(gradient / 400) @ T
-    assert bowl.top - value < 0.1 * (bowl.top - bowl.value(T))
+        T, value = optimise(Bowl(curvature=np.zeros((6, 6))), start(2))
+        assert np.allclose(T, start(2))
+        assert value == 0.7
 
 
 @pytest.mark.parametrize("evaluations", [20, 50, 137])
@@ -117,22 +95,3 @@ def test_barzilai_borwein_respects_its_budget_and_returns_the_best(evaluations):
     assert noise.calls <= evaluations
     assert value >= before
     assert value == noise.value(T)
-
-
-class Plateau(Bowl):
-    """Whose Gauss-Newton scale is six times its curvature, as that of a mean of map values may be."""
-
-    def linearise(self, T):
-        gradient, curvature = super().linearise(T)
-        return gradient, 6 * curvature
-
-
-def test_near_the_optimum_the_curvature_is_learned():
-    used = {}
-    for near_it in (False, True):
-        score = Plateau()
-        T, value = levenberg_marquardt(score, start(3), 100, near=near_it)
-        assert near(T, 0.02, 0.003)
-        assert value > 0.7 - 1e-5
-        used[near_it] = score.calls
-    assert used[True] < 0.5 * used[False]

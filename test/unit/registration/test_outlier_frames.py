@@ -11,7 +11,6 @@ import pytest
 from scenes import FAR, NEAR, Scene, assert_not_used
 
 from calib_ros import se3
-from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
@@ -95,23 +94,6 @@ def test_the_last_frame_can_be_the_outlier_and_is_named_by_its_number_without_a_
     assert result.frame_names == ("0", "1", "2", "3", "4")
     first = eight.quick.calibrate([replace(frames[4]), *frames[:4]], eight.off(NEAR))
     assert first.frames_left_out == ("0",)
-
-
-@pytest.mark.slow
-def test_thesis_objective_leaves_out_outlier_frames(scene):
-    config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"dense_edges": "once_per_level"}})
-    thesis, start = Calibrator(scene.camera, config), scene.off(([0.3, -0.3, 0.3], [0.03, -0.03, 0.03]))
-    features = [thesis.extract(f) for f in scene.frames]
-    mirrored = thesis.extract(replace(scene.frames[2], image=np.ascontiguousarray(scene.frames[2].image[:, ::-1])))
-    result = thesis.estimate([*features[:2], mirrored, features[3]], start)
-    clean = thesis.estimate([*features[:2], features[3]], start)
-    assert result.converged, result.reason
-    assert result.frames_left_out == (scene.frames[2].name,)
-    assert result.frames_used == 3
-    # From other starts this objective ends up to 0.12 deg apart with the same frames, so that the truth is what counts.
-    error, expected = (se3.rotation_error_deg(scene.truth, r.T_camera_lidar) for r in (result, clean))
-    assert error < expected + 0.1
-    assert se3.translation_error_m(clean.T_camera_lidar, result.T_camera_lidar) < 0.02
 
 
 @pytest.mark.parametrize(

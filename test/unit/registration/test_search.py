@@ -20,12 +20,12 @@ from calib_ros.registration.acceptance.checks import check_uncertainty
 from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import SILENT, Progress
-from calib_ros.registration.score.chance import null_distribution, p_value
+from calib_ros.registration.score.chance import p_value
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 from calib_ros.registration.search.parallel import Workers, cpu_time
-from calib_ros.registration.search.search import AGREEMENT, FRUITLESS_ROUNDS, SearchResult, search
+from calib_ros.registration.search.search import FRUITLESS_ROUNDS, SearchResult, search
 
 SMALL = SearchConfig(starts=32, rounds=8)
 RANKED, LARGE = SearchConfig(starts=1024, rounds=2), SearchBox(6, 0.4)  # so large that starts are ranked first
@@ -84,31 +84,6 @@ def test_the_decoy_is_searched_only_in_doubt(scene):
     doubtful = search(score, start, SearchBox(5, 0.3), SMALL, unlimited(start), ACCEPTED)
     assert doubtful.decoy_z is not None
     assert 0 < doubtful.decoy_z < 8
-
-
-def test_the_decoy_holds_no_alignment(scene):
-    """The mirrored maps are the maps of the mirrored image, and the truth is nothing special there."""
-    score = FastScore(scene.features, scene.truth, ScoreConfig())
-    assert null_distribution(score, scene.truth).z_score > 10
-    decoy = score.mirrored()
-    assert null_distribution(decoy, scene.truth).z_score < 4
-    frame, camera = scene.frames[0], scene.camera
-    K = camera.K * [[1, 1, 0], [1, 1, 1], [1, 1, 1]] + [[0, 0, camera.width - 1 - camera.K[0, 2]], [0, 0, 0], [0, 0, 0]]
-    other = replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), camera=replace(camera, K=K))
-    mirror = FastScore([Calibrator(other.camera).extract(other)], scene.truth, ScoreConfig(), 5.0)
-    one = FastScore(scene.features[:1], scene.truth, ScoreConfig(), 5.0).mirrored()
-    assert one.at(-1).value(scene.truth) == pytest.approx(mirror.at(-1).value(scene.truth), abs=0.02)
-
-
-def test_the_result_counts_the_starts_of_the_search(scene):
-    config = Config(search=SMALL)
-    result = Calibrator(scene.camera, config).estimate(scene.features, scene.off(FAR), SearchBox(5, 0.3))
-    scene.assert_found(result)
-    assert result.starts is not None
-    agreed, climbed = result.starts
-    assert result.to_dict()["starts"] == {"agreed": agreed, "climbed": climbed}
-    assert AGREEMENT <= agreed <= climbed
-    assert scene.calibrator.estimate(scene.features, scene.off(NEAR)).starts is None
 
 
 def test_search_without_a_match_ends_after_its_rounds(scene):

@@ -15,13 +15,13 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.classes import Hypothesis
-from calib_ros.registration.initial_guess import allowed, near_lidar, poses
+from calib_ros.registration.initial_guess import allowed, poses
 from calib_ros.registration.motion_guess.registration import best_registration, search_boxes
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
-from calib_ros_semantics.first_guess.centroids import LEFT, RIGHT, agreed_poses, find_pairs
+from calib_ros_semantics.first_guess.centroids import agreed_poses, find_pairs
 from calib_ros_semantics.first_guess.guess import CANDIDATES, CENTROIDS, OTHER_WAY_DEG, first_guess
-from calib_ros_semantics.first_guess.score import class_score, label_score, refine_positions
+from calib_ros_semantics.first_guess.score import class_score
 from calib_ros_semantics.first_guess.view import ClassView, class_view
 
 C = SemanticClass
@@ -87,15 +87,6 @@ def test_invalid_views_are_refused(problem: str) -> None:
         class_view(PointCloud(np.ones((1, 3), np.float32), label=label), classes, camera)
 
 
-def test_tilted_and_distant_poses_are_not_allowed() -> None:
-    zero = np.zeros(6)
-    tilts = np.deg2rad([0, 24, 26, 0, 0, 0])
-    rolls = np.deg2rad([0, 0, 0, -26, 24, 0])
-    centres = np.c_[zero, zero, [0, 1.9, 0, 0, 0, 2.1]]
-    T = poses(np.deg2rad(np.arange(6) * 60.0), tilts, rolls, centres)
-    assert allowed(T).tolist() == [True, True, False, False, True, False]
-
-
 @pytest.mark.parametrize(("yaw", "wrong", "seen"), [(180.0, 0, 0.5), (-97.0, 30, 1.0), (60.0, 20, 0.7)])
 def test_centroids_alone_find_the_pose(yaw: float, wrong: int, seen: float) -> None:
     """Objects of the wrong class in the image, and missing in the cloud."""
@@ -113,19 +104,6 @@ def turned_away(T: np.ndarray, yaw_deg: float) -> np.ndarray:
     return T @ se3.from_parts(se3.rotation_from_euler(np.deg2rad(yaw_deg), 0, 0), np.zeros(3))
 
 
-def test_evidence_of_centroids_has_the_slope_that_it_says() -> None:
-    T = mounted(20.0)
-    pairs = replace(find_pairs([balls(T, 0, 15, 60)]), parallax=1.0)
-    off = se3.perturb(T, [0.6, -0.4, 0.5], [0.1, 0.05, -0.1])
-    gradient, scale = pairs.linearise(off)
-    step = 1e-6
-    slope = [(pairs.value(se3.exp(e) @ off) - pairs.value(se3.exp(-e) @ off)) / (2 * step) for e in step * np.eye(6)]
-    assert gradient == pytest.approx(slope, rel=0.03, abs=1.0)
-    assert (np.linalg.eigvalsh(scale) > 0).all()
-    assert pairs.value(T) > pairs.value(off) > pairs.value(turned_away(T, 90))
-    assert pairs.values(np.stack([T, off])) == pytest.approx([pairs.value(T), pairs.value(off)])
-
-
 def test_centroids_need_no_sweep_and_say_what_they_miss(street_views) -> None:
     views, T = street_views
     found = first_guess([turned(v, 120)[0] for v in views], sweep=False)
@@ -135,28 +113,6 @@ def test_centroids_need_no_sweep_and_say_what_they_miss(street_views) -> None:
     with pytest.raises(TooFewFeaturesError, match=r"3 objects .* of \d+ in the images 0 may be in the clouds"):
         agreed_poses(find_pairs(nothing), 0)
     assert not find_pairs(nothing).per_object(T[None]).any()
-
-
-@pytest.mark.parametrize(("yaw", "columns", "kind"), [(75.0, (0, 200), RIGHT), (-75.0, (440, 640), LEFT), (75.0, (0, 640), None)])
-def test_of_a_row_that_the_border_cuts_the_end_in_view_counts(yaw: float, columns: tuple[int, int], kind: int | None) -> None:
-    """A row of 110 deg in the cloud, of which the image shows one end, or the middle."""
-    azimuth, z = (a.ravel() for a in np.meshgrid(np.deg2rad(np.arange(yaw - 55, yaw + 55, 0.4)), np.arange(-1, 1, 0.2)))
-    cloud = PointCloud(
-        np.c_[10 * np.cos(azimuth), 10 * np.sin(azimuth), z].astype(np.float32), label=np.full(len(z), C.VEHICLE, np.uint8)
-    )
-    classes = np.full((CAMERA.height, CAMERA.width), C.SKY, np.uint8)
-    classes[90:150, columns[0] : columns[1]] = C.VEHICLE
-    pairs = find_pairs([class_view(cloud, classes, CAMERA)])
-    assert pairs.cls.tolist() == ([] if kind is None else [C.VEHICLE + kind])
-    if kind is not None:
-        end = poses(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros((1, 3)))[0, :3, :3] @ pairs.point[0]
-        assert np.rad2deg(np.arccos(end @ pairs.ray[0] / np.linalg.norm(end))) < 2.0
-
-
-def test_optimisations_reach_every_allowed_place() -> None:
-    T = poses(np.full(6, 0.3), np.zeros(6), np.zeros(6), 1.9 * np.r_[np.eye(3), -np.eye(3)])
-    assert allowed(T).all()
-    assert np.array([near_lidar(own).clip(own) for own in T]) == pytest.approx(T)
 
 
 @pytest.mark.parametrize("yaw", [pytest.param(180.0, marks=pytest.mark.slow), -135.0])
@@ -195,17 +151,6 @@ def test_missing_labels_of_a_frame_do_no_harm(street_views) -> None:
     assert_near(T, first_guess([blind, bare, views[2], views[1]])[0].T, 2.0, 0.7)
 
 
-def test_the_score_is_highest_at_the_truth_and_zero_where_nothing_is_known(street_views) -> None:
-    views, T = street_views
-    score = class_score(views, [int(c) for c in (C.VEHICLE, C.BUILDING, C.GROUND)])
-    for level in range(score.n_levels):
-        around = [score.at(level).value(se3.perturb(T, [0, by, 0], np.zeros(3))) for by in (-20, -5, 5, 20)]
-        assert score.at(level).value(T) > max(around)
-    for unknown in (77, UNLABELLED):  # no class that there is, and none
-        blank = [replace(v, classes=np.full_like(v.classes, unknown)) for v in views]
-        assert class_score(blank, [int(C.VEHICLE)]).at(0).value(T) == pytest.approx(0, abs=1e-6)
-
-
 def test_class_confusions_count_as_matches(street_views) -> None:
     """A cyclist that the image's network takes for a vehicle, or for the sky."""
     views, T = street_views
@@ -222,32 +167,14 @@ def test_class_confusions_count_as_matches(street_views) -> None:
     assert values[0] > values[2] > values[3]
 
 
-def test_guess_finds_a_remounted_camera(street_views) -> None:
-    """The sum over all points leaves it where it is, or farther back."""
-    views, T = street_views
-    score = label_score(views)
-    back = T.copy()
-    back[2, 3] += 1.2
-    found, values, source = refine_positions(score, back[None], 0)
-    assert_near(T, found[0], 2.0, 0.5)
-    assert (np.diff(values) <= 0).all()
-    assert (source == 0).all()
-    assert (values > 0).all()
-
-
 def test_too_few_common_classes_are_reported(street_views) -> None:
     view = street_views[0][0]
     no_pixels = replace(view, classes=np.full_like(view.classes, UNLABELLED))
     no_points = replace(view, xyz=view.xyz[:0], label=view.label[:0])
     only_ground = replace(view, label=np.full_like(view.label, C.GROUND))
-    few = np.flatnonzero(np.isin(view.label, (C.GROUND, C.BUILDING)))[::40]
-    few_points = replace(view, xyz=view.xyz[few], label=view.label[few])
     for views, told in (
-        ([no_pixels], "0 points of none"),
-        ([no_points], "0 points of none"),
+        ([no_pixels, no_points], "2 frames have 0 points of none"),
         ([only_ground], "points of ground"),
-        ([few_points], "points of building, ground"),
-        ([no_pixels, no_points], "2 frames have 0 points"),
         ([], "at least one frame"),
     ):
         with pytest.raises(TooFewFeaturesError, match=told) as error:
@@ -287,14 +214,3 @@ def test_a_converged_result_counts_before_a_higher_score(results: list[tuple[str
     assert tried == 2  # those that score nearly as much as the best
     narrow, wide = search_boxes(SEMANTIC_BOX)
     assert boxes == [narrow] * 2 if best.converged else [narrow] * 2 + [wide] * 2
-
-
-def test_first_search_covers_half_the_box() -> None:
-    narrow, wide = search_boxes(SearchBox((4.0, 6.0, 8.0), 0.5))
-    assert np.allclose(narrow.half_width(), SearchBox((2.0, 3.0, 4.0), 0.25).half_width())
-    assert narrow.rounds == 2
-    assert wide.rounds is not None
-    assert wide.rounds > 1
-    assert search_boxes(SearchBox(4.0, 0.5, rounds=7))[1].rounds == 7
-    refined = SearchBox(0.0, 0.0)
-    assert search_boxes(refined) == (refined,)

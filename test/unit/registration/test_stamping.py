@@ -12,7 +12,7 @@ from calib_ros.config import update
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, convention, restamped
+from calib_ros.registration.nuisance.stamping import convention
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Stamping, parse
 
@@ -81,23 +81,6 @@ def test_the_recalibrator_moves_its_keyframes_to_the_convention(end_of_the_scan)
     assert np.median(np.abs(moved - expected)) < 0.005
 
 
-@pytest.mark.parametrize("other", CONVENTIONS[1:], ids=str)
-def test_restamped_features_are_those_of_that_configuration(end_of_the_scan, other):
-    scene = end_of_the_scan
-    before = QUICK.motion
-    after = at_stamping(before, other)
-    frame = replace(scene.frames[1], cloud=replace(scene.frames[1].cloud, time=None))
-    extracted = FeatureExtractor(
-        scene.camera, update(QUICK, {"motion": {"spin": after.spin, "stamp_azimuth_deg": other.azimuth_deg}})
-    )
-    expected = extracted(frame).points
-    points = restamped(scene.quick.extract(frame), before, after).points
-    away = np.abs(points.xyz - expected.xyz).max(axis=1)
-    assert (away < 1e-3).mean() > 0.99  # a point at the seam may fall to either side
-    there_and_back = restamped(restamped(scene.quick.extract(frame), before, after), after, before).points
-    assert (np.abs(there_and_back.xyz - scene.quick.extract(frame).points.xyz).max(axis=1) < 1e-3).mean() > 0.99
-
-
 @pytest.mark.parametrize(
     ("seconds", "expected", "left"),
     [(0.051, "start", 0.001), (-0.049, "end", 0.001), (0.003, "middle", 0.003), (0.12, "start", 0.07)],
@@ -107,12 +90,3 @@ def test_an_offset_of_half_a_scan_is_a_convention(seconds, expected, left):
     assert found.stamp_at == expected
     assert rest == pytest.approx(left, abs=1e-9)
     assert convention(Stamping("none", 0.0), seconds, 0.1)[1] == seconds
-
-
-@pytest.mark.parametrize("value", ["fast", "{spin: left, azimuth_deg: 0}", "{spin: clockwise, azimuth_deg: 400}"])
-def test_a_saved_stamping_must_be_one(value):
-    from calib_ros.result import INITIAL, Result
-
-    text = Result(np.eye(4), INITIAL).dumps(yaml_format=True).replace("stamping: null", f"stamping: {value}")
-    with pytest.raises(Exception, match="stamping must have a spin"):
-        parse(text, "a file")

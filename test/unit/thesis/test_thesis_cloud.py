@@ -384,7 +384,7 @@ def test_a_covered_scanner_is_refused(n, value, usable):
 @pytest.mark.parametrize("rings", [16, 64])
 def test_the_ground_of_a_street_is_the_true_one(rings):
     drive = SyntheticDrive(seed=3, frames=1, rings=rings, width=64, height=48)
-    frame, truth = drive[0], drive.labels(0).points
+    frame, truth = drive[0], drive[0].cloud.label
     found = attributes(frame.cloud, CONFIG)
     place = {tuple(p): k for k, p in enumerate(frame.cloud.xyz.tolist())}
     kind = truth[[place[tuple(p)] for p in found.xyz.tolist()]]

@@ -28,39 +28,39 @@ def frame(*points: tuple[float, float, float]) -> Frame:
 
 
 def test_points_take_the_colour_under_them():
-    cloud = colored_cloud(frame((10, 2, 0), (10, -2, 0), (-10, 0, 0)), nominal())
-    assert cloud.rgb.tolist() == [[255, 0, 0], [0, 0, 255], list(UNSEEN)]
-    assert cloud.seen.tolist() == [True, True, False]
+    _, rgb, seen = colored_cloud(frame((10, 2, 0), (10, -2, 0), (-10, 0, 0)), nominal())
+    assert rgb.tolist() == [[255, 0, 0], [0, 0, 255], list(UNSEEN)]
+    assert seen.tolist() == [True, True, False]
     near, behind, beside = (5.0, 1.0, 0.0), (20.0, 4.0, 0.0), (20.0, -4.0, 0.0)
-    assert colored_cloud(frame(near, behind, beside), nominal()).seen.tolist() == [True, False, True]
+    assert colored_cloud(frame(near, behind, beside), nominal())[2].tolist() == [True, False, True]
 
 
 def test_grey_pictures_and_lost_returns():
     one = frame((10, 2, 0), (np.nan, 0, 0), (0, 0, 0))
-    cloud = colored_cloud(replace(one, image=one.image[..., 2]), nominal())
-    assert cloud.rgb.tolist() == [[255, 255, 255]]
+    _, rgb, _ = colored_cloud(replace(one, image=one.image[..., 2]), nominal())
+    assert rgb.tolist() == [[255, 255, 255]]
     empty = replace(one, cloud=PointCloud(np.zeros((0, 3), np.float32)))
-    assert len(colored_cloud(empty, nominal()).xyz) == 0
+    assert len(colored_cloud(empty, nominal())[0]) == 0
 
 
 def test_of_many_points_those_in_view_are_kept_and_the_same_every_time(street):
     T = street[0].reference
-    every = colored_cloud(street[0], T, most=10**9)
-    assert len(every.xyz) == len(street[0].cloud.finite())
-    most = int(every.seen.sum()) + 500
-    some = colored_cloud(street[0], T, most)
-    assert len(some.xyz) == most
-    assert some.seen.sum() == every.seen.sum()
-    assert np.array_equal(some.xyz, colored_cloud(street[0], T, most).xyz)
-    assert colored_cloud(street[0], T, 300).seen.all()
+    xyz, _, seen = colored_cloud(street[0], T, most=10**9)
+    assert len(xyz) == len(street[0].cloud.finite())
+    most = int(seen.sum()) + 500
+    some, _, some_seen = colored_cloud(street[0], T, most)
+    assert len(some) == most
+    assert some_seen.sum() == seen.sum()
+    assert np.array_equal(some, colored_cloud(street[0], T, most)[0])
+    assert colored_cloud(street[0], T, 300)[2].all()
 
 
 def test_a_right_extrinsic_gives_neighbours_more_alike_colours(street):
     """On surfaces, next to each other: a turned camera paints objects with what is beside them."""
 
     def unlike(T: np.ndarray) -> float:
-        cloud = colored_cloud(street[0], T, most=10**9)
-        xyz, rgb = cloud.xyz[cloud.seen], cloud.rgb[cloud.seen].astype(float)
+        xyz, rgb, seen = colored_cloud(street[0], T, most=10**9)
+        xyz, rgb = xyz[seen], rgb[seen].astype(float)
         near = np.linalg.norm(np.diff(xyz, axis=0), axis=1) < 0.1
         return float(np.abs(np.diff(rgb, axis=0)).mean(axis=1)[near].mean())
 
