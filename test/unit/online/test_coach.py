@@ -139,9 +139,11 @@ def test_a_camera_on_its_side_sees_poles_lie() -> None:
         (advice(MOVED, covariance(), missing=Confirmations(5, 3), of_all=Confirmations(5, 4)), "3 further estimates"),
         (advice(SUSPECT, covariance()), "keep driving: the newest keyframes decide"),
         (advice(BLINDED, covariance(), fault=SensorFault.CAMERA_BLIND), "clean or uncover the camera"),
+        (advice(BLINDED, covariance(), fault=SensorFault.LIDAR_BLIND), "clean or uncover the LiDAR"),
         (advice(BLINDED, covariance(), fault=SensorFault.IMAGE_FROZEN), "restart the camera"),
         (advice(REFUSED, refusal=RefusalCode.NOT_SIGNIFICANT), "drive where there are poles, buildings or parked cars"),
         (advice(REFUSED, refusal=RefusalCode.WRONG_INTRINSICS), "calibrate the camera's intrinsics"),
+        (advice(REFUSED, refusal=RefusalCode.WRONG_TIMES), "mend the time stamps"),
         (advice(REFUSED, covariance()), "keep driving: more keyframes decide"),
     ],
 )

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import QUICK, RenderedDrive
 
 from calib_ros import se3
 from calib_ros.config import update
+from calib_ros.frame import NANOSECONDS
+from calib_ros.online.first_guess import ENOUGH_S, RUN_S, SPACING_S, FirstGuess
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.result import INSUFFICIENT, InitialSource
@@ -69,3 +73,11 @@ def test_a_known_start_is_not_guessed(drive):
         recalibrator.ingest(drive[4 * k])
     assert not recalibrator.first_guess._run
     assert recalibrator.estimate().result.status != INSUFFICIENT
+
+
+def test_no_more_frames_are_kept_than_are_used(drive):
+    guess, frame = FirstGuess(CONFIG), drive[0]
+    for after in range(0, 20 * NANOSECONDS, NANOSECONDS // 10):
+        guess.add(replace(frame, stamp=frame.stamp + after, cloud_stamp=frame.stamp + after))
+    assert len(guess._run) <= RUN_S / SPACING_S + 1
+    assert guess._lasted(guess._run) >= ENOUGH_S

@@ -18,6 +18,7 @@ from calib_ros.online.monitor import (
     TESTS_PER_HOUR,
     Assessment,
     Monitor,
+    ShiftTest,
     Verdict,
     clock_covariance,
     measure_shift,
@@ -177,6 +178,18 @@ def test_single_outlier_keyframe_raises_no_alarm(scene):
     assert drive.monitor.in_doubt
     assert drive.verdicts(scene.features[6:9], scene.truth)[-1] == Verdict.CONSISTENT
     assert not drive.monitor.in_doubt
+
+
+def test_a_small_shift_counts_only_while_the_motion_during_the_scan_is_known(scene):
+    unknown = [replace(f, unknown_motion_s=0.05) for f in scene.features]
+    assert not {Verdict.SUSPECT, Verdict.MOVED} & set(Drive(scene).verdicts(unknown, scene.off(HALF_DEG)))
+
+
+def test_a_chance_optimum_does_not_speak_against_an_extrinsic(scene):
+    """An empty road: the refinement ends somewhere, and claims to know it."""
+    found = ShiftTest(1e-6, np.array([0, 0, 0, 0, 0, 0.5]), 8.0, True, evidence=20.0)
+    told = [Monitor(CONFIG)._evidence(replace(found, significant=own), scene.features[:1]) for own in (True, False)]
+    assert told == [20.0, 0.0]
 
 
 def test_the_rate_of_false_alarms_is_the_threshold(scene, monkeypatch):

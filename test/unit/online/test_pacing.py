@@ -120,6 +120,13 @@ def test_classes_are_the_first_to_go_without() -> None:
         assert vehicle.budget.allows_classes() is allowed
 
 
+def test_a_request_comes_on_top() -> None:
+    budget = Vehicle(0.1).budget
+    budget.add(Work.ESTIMATES, 1e6, charged=False)
+    assert budget.allows_keyframe()
+    assert budget.counts().forced == 0
+
+
 @pytest.mark.parametrize("in_step", [True, False])
 def test_what_is_done_in_step_falls_on_the_same_stamps_wherever_it_began(in_step: bool) -> None:
     """Scans at 10 Hz with jitter, every 0.55 s."""

@@ -14,7 +14,7 @@ from calib_ros.config import Config, ImageConfig, MonitorConfig, OnlineConfig, T
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.intrinsics import FOCAL
-from calib_ros.online.monitor import Assessment
+from calib_ros.online.monitor import Assessment, Verdict
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, MOVED, REFUSED, SUSPECT, Extrinsic, Result
@@ -237,6 +237,35 @@ def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrato
     driven(recalibrator, frames[:5])
     assert recalibrator.tracker.settled
     return recalibrator
+
+
+def test_frames_of_a_rejected_estimate_still_count_as_new(displaced, monkeypatch):
+    recalibrator = settled_at(displaced, displaced[0].reference)
+    shares, update = [], recalibrator.tracker.update
+
+    def watched(estimate: Result, share_new: float = 1.0, *rest, **more) -> Extrinsic:
+        shares.append(share_new)
+        return update(estimate, share_new, *rest, **more)
+
+    monkeypatch.setattr(recalibrator.tracker, "update", watched)
+    assert recalibrator.ingest(displaced[5])
+    recalibrator.tracker.apply(Assessment(Verdict.SUSPECT, "doubtful", 1e-4, 1))
+    recalibrator.estimate()  # not taken in
+    recalibrator.tracker.apply(Assessment(Verdict.CONSISTENT, "right", 0.5))
+    assert recalibrator.ingest(displaced[6])
+    recalibrator.estimate()
+    recalibrator.estimate()
+    assert shares == pytest.approx([1 / 6, 2 / 7, 0])
+
+
+def test_disabled_monitor_ends_suspicion(displaced):
+    recalibrator = settled_at(displaced, Result(displaced[0].reference, CONVERGED))
+    recalibrator.ingest(displaced[BEFORE])
+    assert recalibrator.current.result.status == SUSPECT
+    assert not recalibrator.ready()
+    recalibrator.configure(replace(GUARDED, monitor=MonitorConfig(enabled=False)))
+    assert recalibrator.current.result.status == CONVERGED
+    assert recalibrator.ready()
 
 
 def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, monkeypatch):

@@ -46,6 +46,7 @@ class Parade:
         self.estimates: list[float] = []
         self.keyframes: list[float] = []
         self.n: float = 0  # frames, each GAP_S later
+        self.permitted = True  # by the load
 
     def __call__(self, seconds: float, turned_deg: float = 0.0, drift_deg_s: float = 0.0) -> None:
         for _ in range(round(seconds / GAP_S)):
@@ -72,7 +73,7 @@ class Parade:
         self.n += 1
         stamp = round((1000 + now) * NANOSECONDS)
         frame = dataclasses.replace(frame, stamp=stamp, cloud_stamp=stamp, compensated=True)
-        if self.recalibrator.ingest(frame):
+        if self.recalibrator.ingest(frame, permit=lambda: self.permitted):
             self.keyframes.append(now)
         if self.recalibrator.ready():
             self.recalibrator.estimate()
@@ -229,6 +230,14 @@ def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(standing: Parade) ->
     assert SUSPECT in after[:10]
     assert MOVED in after
     assert len(standing.keyframes) <= keyframes + 1
+
+
+def test_a_look_that_struck_is_followed_by_a_test_once_the_load_allows_for_it(standing: Parade) -> None:
+    standing.stand(8, 0.0)
+    standing.permitted = False
+    assert standing.stand(3, 1.5)[-1] == CONVERGED
+    standing.permitted = True
+    assert standing.stand(0.5, 1.5)[-1] == SUSPECT
 
 
 def test_at_rest_pairs_between_two_looks_are_not_even_decoded_unless_something_is_in_doubt(
