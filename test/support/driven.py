@@ -26,7 +26,6 @@ class Driven:
     """A pipeline fed with frames as if they were messages."""
 
     def __init__(self, drive: SyntheticDrive, settings: Config) -> None:
-        self.settings = settings
         self.errors: list[str] = []
         self.notices: list[str] = []
         self.states: list[Extrinsic] = []

@@ -52,19 +52,19 @@ def is_at(tracker: Tracker, by: tuple, deg: float, m: float) -> bool:
 REFUSAL, FAR = estimate(status=REFUSED, reason="no optimum"), estimate(((0, 2, 0), (0, 0, 0)))
 
 
-def tracking(initial: Result, current: Result | None = None, config: Config | None = None) -> Tracker:
+def tracking(initial: Result, current: Result | None = None) -> Tracker:
     """A tracker that trusts the first estimate."""
-    config = config or Config()
+    config = Config()
     return Tracker(initial, current, replace(config, tracker=replace(config.tracker, confirmations=0)))
 
 
-def unknown(config: Config | None = None) -> Tracker:
-    return tracking(Result(T, INITIAL, "no estimate yet"), config=config)
+def unknown() -> Tracker:
+    return tracking(Result(T, INITIAL, "no estimate yet"))
 
 
-def settled(config: Config | None = None) -> Tracker:
+def settled() -> Tracker:
     """Two estimates agree, at T."""
-    tracker = unknown(config)
+    tracker = unknown()
     for _ in range(2):
         tracker.update(estimate())
     assert tracker.settled
@@ -84,9 +84,6 @@ def blind(tracker: Tracker, message: str) -> Extrinsic:
 
 def assessment(verdict: Verdict, text: str = "in words", p_value: float = 1e-5) -> Assessment:
     return Assessment(verdict, text, p_value, 3)
-
-
-# --- the first estimate ---------------------------------------------------------------------------------------------------
 
 
 def confirming(config: Config | None = None) -> Tracker:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -155,12 +154,3 @@ def test_events_tell_what_led_to_it(box: Box) -> None:
     assert moved[7]["message"] == "no messages on points"
     box.keyframes(2 * KEPT_EVENTS)
     assert len(box.events().splitlines()) == KEPT_EVENTS
-
-
-def test_messages_of_keyframes_are_wanted_and_one_that_shows_a_blind_sensor(box: Box) -> None:
-    keyframe, other = FrameIngested(FRAME, True, None, None), FrameIngested(FRAME, False, None, None)
-    assert [box.wants(keyframe), box.wants(other)] == [True, False]
-    box.says(BLINDED)
-    for wanted in (True, False, False):
-        assert box.wants(other) is wanted
-        box.add(replace(other))

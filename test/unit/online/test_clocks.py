@@ -12,7 +12,6 @@ from calib_ros.config import Config, update
 from calib_ros.lidar.deskew import moved
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.tracker import Tracker
-from calib_ros.registration.initial_guess import nominal_start
 from calib_ros.result import CONVERGED, INITIAL, Result, Stamping, parse
 
 LATE_S = 0.06
@@ -162,16 +161,6 @@ def test_what_one_estimate_takes_for_a_late_image_and_another_for_a_shift_is_no_
     assert not tracker.current.result.converged
 
 
-def test_an_offset_that_is_stated_anew_is_no_movement():
-    tracker = followed(tracked(confirmations=0), *[alike(0.0, 0.03)] * 4)
-    assert tracker.settled
-    tracker.config = update(tracker.config, {"motion": {"time_offset_s": 0.0}})
-    for _ in range(4):
-        followed(tracker, alike(0.0, 0.0))  # 12 cm from there
-        assert tracker.current.result.status == CONVERGED
-    assert tracker.T[0, 3] == pytest.approx(0.0, abs=1e-6)
-
-
 def test_an_offset_that_estimates_agree_on_is_followed_with_the_extrinsic():
     tracker = followed(tracked(confirmations=0), *[alike(0.0, 0.0)] * 2)
     followed(tracker, *[alike(0.0, -0.02, 0.011)] * 40)
@@ -206,12 +195,3 @@ def test_a_saved_offset_is_not_used_where_none_is_estimated(scene, changed):
     assert recalibrator.config.motion.spin == "clockwise"
     assert recalibrator.current.result.time_offset_s is None
     assert Recalibrator(scene.camera, saved, CONFIG).config.motion.spin == "counterclockwise"
-
-
-def test_a_reset_after_a_first_guess_forgets_the_offset_of_the_guess(scene):
-    recalibrator = Recalibrator(scene.camera, nominal_start(), update(CONFIG, {"initial": {"method": "motion"}}))
-    recalibrator.tracker = Tracker(replace(estimate(0.0, 0.06), status=INITIAL), None, recalibrator.config)
-    recalibrator.first_guess.end()
-    recalibrator.reset()
-    assert recalibrator.config.motion.time_offset_s == 0.0
-    assert recalibrator.first_guess.pending

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracked import STILL, T, assessment, confirming, consistent, estimate, played, turned, unknown, variances
+from tracked import STILL, T, assessment, confirming, consistent, estimate, turned, unknown, variances
 
 from calib_ros.config import Config, TrackerConfig, update
 from calib_ros.online.monitor import Verdict
 from calib_ros.online.tracker import RECOVERING, Tracker
-from calib_ros.online.tracker_states import NOTHING, TrackerState
+from calib_ros.online.tracker_states import NOTHING
 from calib_ros.result import CONVERGED, INITIAL, TENTATIVE, Result
 
 
@@ -110,16 +110,6 @@ def test_standing_still_needs_no_clocks_and_says_nothing_of_them():
         assert consistent(tracker, 5).result.status == TENTATIVE
 
 
-@pytest.mark.parametrize(("second", "anew"), [(0.0124, False), (0.016, True)])
-def test_a_confirmation_begins_again_where_two_offsets_differ_by_more_than_both_are_known_to(second, anew):
-    tracker = confirming()
-    tracker.update(estimate(time_offset_s=0.01, time_offset_sigma_s=0.0017))
-    tracker.config = update(tracker.config, {"motion": {"time_offset_s": 0.01}})
-    consistent(tracker, 5)
-    tracker.update(estimate(time_offset_s=second, time_offset_sigma_s=0.0012))
-    assert (tracker.state is TrackerState.TENTATIVE) is anew
-
-
 def test_clocks_that_are_said_to_agree_need_not_be_shown():
     tracker = confirming()
     tracker.update(estimate(**ALIKE))
@@ -134,13 +124,3 @@ def test_what_the_sensors_leave_open_is_not_averaged_out():
         extrinsic = tracker.update(estimate(covariance=variances() + shared, shared_covariance=shared))
     assert extrinsic.result.covariance[5, 5] > 0.03**2
     assert tracker.spread[5, 5] < 0.006**2
-
-
-def test_movement_while_tentative_starts_the_confirmation_anew():
-    tracker = confirming()
-    consistent(tracker, 4)
-    assert played(tracker, Verdict.MOVED, *[estimate(((3.0, 0, 0), (0.3, 0, 0)))] * (RECOVERING + 1))[-1] == TENTATIVE
-    assert consistent(tracker, 5).usable
-
-
-# --- the gate -------------------------------------------------------------------------------------------------------------

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scenes import QUICK, RenderedDrive
 
 from calib_ros import se3
 from calib_ros.config import update
-from calib_ros.frame import Frame
-from calib_ros.online.first_guess import ENOUGH_S, RUN_S, SPACING_S, FirstGuess
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.result import INSUFFICIENT, InitialSource
 
@@ -74,49 +69,3 @@ def test_a_known_start_is_not_guessed(drive):
         recalibrator.ingest(drive[4 * k])
     assert not recalibrator.first_guess._run
     assert recalibrator.estimate().result.status != INSUFFICIENT
-
-
-def test_no_more_frames_are_kept_than_are_used(drive):
-    guess, frame = FirstGuess(CONFIG), drive[0]
-
-    def at(seconds: float) -> Frame:
-        stamp = frame.stamp + round(1e9 * seconds)
-        return replace(frame, stamp=stamp, cloud_stamp=stamp)
-
-    for k in range(200):
-        guess.add(at(0.1 * k))
-    assert len(guess._run) <= RUN_S / SPACING_S + 1
-    assert guess._lasted(guess._run) >= ENOUGH_S
-    assert guess._run[0].image.ndim == 2
-    guess.add(at(60.0))
-    assert len(guess._run) == 1  # what was before the pause is no part of the motion
-    guess.add(at(59.0))
-    assert len(guess._run) == 1  # nor what was before the clock was set back
-
-
-def test_a_guess_that_failed_is_tried_again_after_the_clock_was_set_back(drive):
-    guess, frame, calibrator = FirstGuess(CONFIG), drive[0], Calibrator(drive.camera, CONFIG)
-    features = [calibrator.extract(frame)]
-
-    def drive_on(since: float) -> None:
-        for k in range(60):
-            stamp = round(1e9 * (since + 0.1 * k))
-            guess.add(replace(frame, stamp=stamp, cloud_stamp=stamp, twist=np.zeros(6)))
-
-    drive_on(1000.0)
-    first = guess.estimate(calibrator, features, nominal_start())
-    assert "stands still" in first.reason
-    assert guess.estimate(calibrator, features, nominal_start()).reason == first.reason
-    drive_on(10.0)
-    tried_at = guess._tried_at
-    assert tried_at is None
-    assert "stands still" in guess.estimate(calibrator, features, nominal_start()).reason
-    assert guess._tried_at is not None
-
-
-def test_frames_are_freed_when_no_guess_is_wanted_any_more(drive):
-    recalibrator = Recalibrator(drive.camera, nominal_start(), CONFIG)
-    recalibrator.ingest(drive[0])
-    assert recalibrator.first_guess._run
-    recalibrator.configure(update(CONFIG, {"initial": {"method": "nominal"}}))
-    assert not recalibrator.first_guess._run

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import RenderedDrive, Scene
+from scenes import Scene
 
 from calib_ros import se3
 from calib_ros.config import Config
@@ -71,13 +71,3 @@ def test_what_cannot_be_looked_at_says_nothing(scene):
     nan = replace(frame, cloud=replace(frame.cloud, xyz=np.full_like(frame.cloud.xyz, np.nan)))
     assert [match_loss(f, scene.truth, CONFIG) for f in (empty, black, nan)] == [None] * 3
     assert match_loss(frame, behind, CONFIG) != 0.0  # whatever is there: no exception
-
-
-def test_neither_rings_nor_an_order_of_points_are_needed(scene):
-    frame = scene.frames[0]
-    cloud = replace(frame.cloud, ring=None).select(np.random.default_rng(0).permutation(len(frame.cloud)))
-    assert match_loss(replace(frame, cloud=cloud), scene.truth, CONFIG) == match_loss(frame, scene.truth, CONFIG)
-    rosette = RenderedDrive(seed=1, frames=1, rings=0)
-    off = se3.perturb(rosette.reference, [0, 2, 0], [0, 0, 0])
-    losses = [match_loss(rosette[0], T, CONFIG) for T in (rosette.reference, off)]
-    assert losses[1] > losses[0] + 0.5

@@ -10,7 +10,7 @@ import pytest
 from calib_ros import se3
 from calib_ros.config import OnlineConfig
 from calib_ros.frame import NANOSECONDS
-from calib_ros.online.keyframes import KeyframeBuffer, KeyframeSelector, histogram, similarity
+from calib_ros.online.keyframes import KeyframeBuffer, KeyframeSelector, similarity
 from calib_ros.online.monitor import UNIT_ROTATION_DEG, UNIT_TRANSLATION_M, normalised_innovation
 
 CONFIG = OnlineConfig(keyframe_spacing_s=0.0)
@@ -48,17 +48,6 @@ ONE, HALVES = hist(1.0), hist(0.5, 0.5)
 )
 def test_similarity_is_the_overlap_over_the_union(first, second, expected):
     assert similarity(first, second) == similarity(second, first) == pytest.approx(expected, abs=1e-6)
-
-
-def test_a_histogram_holds_the_shares_of_each_channel():
-    picture = np.dstack([flat((10, 0.5), (20, 0.5)), flat((30, 1.0)), flat((0, 0.25), (255, 0.75))])
-    h = histogram(picture)
-    assert h.shape == (3, 256)
-    assert np.allclose(h.sum(axis=1), 1)
-    assert (h[0, 10], h[0, 20], h[1, 30], h[2, 0], h[2, 255]) == (0.5, 0.5, 1, 0.25, 0.75)
-    assert np.array_equal(histogram(picture[:, :, 1]), h[1:2])
-    for shape in ((1, 1), (1, 7), (3, 2), (5, 5, 3)):
-        assert np.allclose(histogram(np.zeros(shape, np.uint8)).sum(axis=1), 1)
 
 
 # --- algorithm 6 ----------------------------------------------------------------------------------------------------------
@@ -112,13 +101,6 @@ def test_keyframes_keep_their_distance_in_time():
     assert selector.select(pictures[5], 0)  # the clock was set back
     selector.reset()
     assert selector.select(pictures[5], 1)
-
-
-def test_new_limits_take_effect_at_once():
-    selector, pictures = KeyframeSelector(CONFIG), brightening(0.025, 2)
-    assert offer_all(selector, pictures) == [True, False]
-    selector.config = replace(CONFIG, similarity_threshold=0.99)
-    assert selector.select(pictures[1], NANOSECONDS // 5)
 
 
 # --- drift ----------------------------------------------------------------------------------------------------------------

@@ -7,12 +7,9 @@ import dataclasses
 import pytest
 from driven import Driven, config
 
-from calib_ros.cli.calibrate import replay
-from calib_ros.config import OnlineConfig, update
-from calib_ros.errors import CalibrationError
+from calib_ros.config import OnlineConfig
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.pacing import Schedule, Work
-from calib_ros.result import MOVED
 from calib_ros_synthetic.drive import SyntheticDrive
 
 
@@ -49,12 +46,6 @@ def test_periods_count_the_datas_own_stamps(config: OnlineConfig, waits: bool) -
     schedule.add_frame(seconds(28))
     schedule.start_estimate()  # as a request does: it starts the period anew
     assert moments(schedule, 32.0, 38.0, waits=waits) == [False, True]
-
-
-@pytest.mark.parametrize(("mode", "estimates"), [("manual", 0), ("continuous", 7)])
-def test_replay_follows_the_mode(drive: SyntheticDrive, mode: str, estimates: int) -> None:
-    lines = list(replay(drive, "all", "reference", 0.0, config(mode=mode)))
-    assert len(lines) == estimates
 
 
 def later(frame: Frame, by: float) -> Frame:
@@ -98,41 +89,3 @@ def test_cpu_time_is_booked_under_the_work_it_went_into(street: list[Frame], dri
         driven.feed(street[1])
         assert driven.pipeline.request_estimate().result(60).result.converged
         assert driven.pipeline.load.counts().seconds[Work.ESTIMATES] > 0
-
-
-def test_unchanged_configuration_recomputes_nothing(street: list[Frame], drive: SyntheticDrive) -> None:
-    with Driven(drive, config(mode="manual")) as driven:
-        driven.feed(street[0])
-        recalibrator = driven.pipeline.recalibrator
-        calibrator = recalibrator.calibrator
-        for k in range(100):
-            driven.pipeline.configure(config(mode="manual", buffer_size=10 + k % 5))
-        assert recalibrator.calibrator is calibrator
-        assert (recalibrator.buffer.maxlen, len(recalibrator.buffer)) == (14, 1)
-        driven.pipeline.configure(update(config(mode="manual"), {"search": {"rounds": 7}}))
-        assert recalibrator.calibrator is not calibrator
-        assert len(recalibrator.buffer) == 1
-
-
-def test_status_changes_are_reported_without_an_estimate(street: list[Frame], drive: SyntheticDrive) -> None:
-    """A monitor may find with a single frame that the extrinsic has moved: nobody waits for the next estimate."""
-    with Driven(drive, config(mode="manual")) as driven:
-        driven.feed(street[0])
-        assert len(driven.states) == 1  # the initial one
-        driven.feed(street[1])
-        assert len(driven.states) == 1  # nothing new
-        tracker = driven.pipeline.recalibrator.tracker
-        moved = dataclasses.replace(tracker.current, result=dataclasses.replace(tracker.current.result, status=MOVED))
-        ingest = driven.pipeline.recalibrator.ingest
-
-        def judging(frame: Frame, *scan_before: object) -> bool:
-            tracker.current = moved
-            ingest(frame)
-            raise CalibrationError("and the frame is bad")
-
-        driven.pipeline.recalibrator.ingest = judging
-        driven.feed(street[2])
-        assert driven.states[1:] == [driven.pipeline.recalibrator.current]
-        assert driven.errors == ["and the frame is bad"]
-        driven.pipeline.reset()
-        assert len(driven.states) == 3

@@ -21,22 +21,6 @@ def test_false_alarms_are_no_more_than_promised(freedom):
         assert np.mean(ratios >= limit) <= 1 / limit
 
 
-def test_evidence_grows_with_the_shift_and_with_what_is_known():
-    turns = [shift_evidence(np.r_[np.deg2rad(deg), [0.0] * 5], C, 12.0) for deg in (0.0, 0.3, 0.6, 1.5)]
-    assert turns[0] < 0 < turns[2] < turns[3]
-    assert turns == sorted(turns)
-    x = np.r_[np.deg2rad(0.5), [0.0] * 5]
-    assert shift_evidence(x, C, 12.0) < shift_evidence(x, C, 60.0) < shift_evidence(x, C / 4, 60.0)
-
-
-def test_fixed_axes_say_nothing():
-    fixed = C.copy()
-    fixed[3:] = fixed[:, 3:] = 0.0
-    x = np.r_[np.deg2rad(1.0), 0.0, 0.0, 0.3, 0.0, 0.0]
-    assert shift_evidence(x, fixed, 12.0) == shift_evidence(np.r_[x[:3], 0, 0, 0], fixed, 12.0) > 5
-    assert shift_evidence(x, np.zeros((6, 6)), 12.0) == 0.0
-
-
 @pytest.mark.parametrize("factor", [0.25, 1.0, 3.0])
 def test_covariances_are_scaled_by_the_shifts_of_a_right_extrinsic(factor):
     noise, freedom = ShiftNoise(), 12.0
@@ -68,21 +52,3 @@ def test_what_matches_as_chance_does_speaks_against_it():
     assert match.ratio(3.5, 100.0) < 0  # with a quarter of the points half of the z-score is usual
     assert matching([6.0, 7.0]).ratio(0.0, 400.0) == 0.0  # it is not known yet what is usual
     assert abs(matching([1.0, 0.5, 1.5, 1.0, 0.8]).ratio(0.0, 400.0)) < 1  # a scene that never tells anything
-
-
-def test_evidence_of_keyframes_in_a_row_adds_up():
-    match = matching([6.0, 7.0, 8.0, 6.5, 7.5, 7.0, 6.0, 8.0])
-    one = match.ratio(0.5, 400.0)
-    match.add(0.5, 400.0, same_scene=False)
-    assert (match.evidence, match.count) == (one, 1)
-    match.add(0.5, 400.0, same_scene=True)  # again, and again: nothing new
-    assert (match.evidence, match.count) == (one, 1)
-    match.add(0.5, 400.0, same_scene=False)
-    assert (match.evidence, match.count) == (2 * one, 2)
-    for _ in range(3):
-        match.add(7.0, 400.0, same_scene=False)
-    assert match.evidence < 0
-    match.add(0.5, 400.0, same_scene=False)
-    assert (match.evidence, match.count) == (one, 1)  # what was before is over
-    match.reset()
-    assert (match.evidence, match.count) == (0.0, 0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import pytest
 
@@ -79,20 +77,6 @@ def test_where_no_estimate_is_due_keyframes_have_all() -> None:
     assert len(vehicle.keyframes) - n == pytest.approx(60 * (0.3 - INTAKE / STEP) / KEYFRAME, abs=2)
 
 
-@pytest.mark.parametrize("still_due", [True, False])
-def test_keyframes_make_room_for_an_estimate_as_long_as_it_is_due(still_due: bool) -> None:
-    vehicle = Vehicle(0.5)
-    assert vehicle.budget.allows_keyframe()
-    vehicle.budget.start_estimate()
-    vehicle.spend(0.5, Work.ESTIMATES)
-    vehicle.spend(0.5 * SAVED_S)  # their turn is over, and the budget overdrawn by 0.5 s
-    assert not vehicle.budget.allows_estimate(True)
-    vehicle.now += 1.1
-    assert still_due or not vehicle.budget.allows_estimate(False)
-    assert vehicle.budget.allows_keyframe() is not still_due
-    assert vehicle.budget.allows_estimate(True)
-
-
 @pytest.mark.parametrize(("saved_s", "overdrawn", "wait"), [(3600.0, 0.01, 0.02), (0.0, 1.0, 2.0)])
 def test_the_budget_saves_up_for_some_seconds_only_and_what_is_overdrawn_is_made_up_for(
     saved_s: float, overdrawn: float, wait: float
@@ -134,41 +118,6 @@ def test_classes_are_the_first_to_go_without() -> None:
     for wait, allowed in ((CLASSES_EVERY_S - 0.1, False), (0.2, True)):
         vehicle.now += wait
         assert vehicle.budget.allows_classes() is allowed
-
-
-def test_a_request_comes_on_top() -> None:
-    vehicle = Vehicle(0.1)
-    with vehicle.budget.counting(Work.ESTIMATES, charged=False):
-        sum(range(300_000))
-    assert vehicle.budget.counts().seconds[Work.ESTIMATES] > 0
-    vehicle.budget.add(Work.ESTIMATES, 1e6, charged=False)
-    assert vehicle.budget.allows_keyframe()
-    assert vehicle.budget.allows_estimate(True)
-
-
-def test_another_share_takes_effect_at_once() -> None:
-    vehicle = Vehicle(1.0)
-    vehicle.budget.config = OnlineConfig(max_load=0.1)
-    vehicle.now += 1.0
-    vehicle.spend(0.1 * SAVED_S + 1.0)  # what was saved up at the higher share is gone
-    assert vehicle.keyframe_after(0.0)
-    assert not vehicle.keyframe_after(1.0)
-    vehicle.budget.config = OnlineConfig(max_load=1.0)
-    assert vehicle.keyframe_after(1.0)
-
-
-def test_a_meter_books_cpu_time_under_one_work_after_the_other() -> None:
-    budget = LoadBudget(OnlineConfig())
-    with budget.counting(Work.INTAKE) as switch:
-        threading.Event().wait(0.3)  # takes no CPU time
-        switch(Work.KEYFRAMES)
-        sum(range(3_000_000))
-    with pytest.raises(ZeroDivisionError), budget.counting(Work.CLASSES):  # work that fails counts as well
-        sum(range(300_000)) / 0
-    seconds = budget.counts().seconds
-    assert seconds[Work.KEYFRAMES] > 3 * seconds[Work.INTAKE] > 0
-    assert seconds[Work.CLASSES] > 0
-    assert seconds[Work.ESTIMATES] == 0
 
 
 @pytest.mark.parametrize("in_step", [True, False])

@@ -13,10 +13,6 @@ from calib_ros.online.worker import Cancelled
 OUTCOME = "outcome"
 
 
-def go_on() -> None:
-    """A thread that is not to end."""
-
-
 class Queue(Requests):
     """Estimates and checks, which return OUTCOME after what a test does meanwhile."""
 
@@ -26,13 +22,11 @@ class Queue(Requests):
     def check(self, key: object, obstacle: str = "") -> Future[str]:
         return self.add(Pending("check", key), obstacle=obstacle)
 
-    def do(
-        self, keyframes: int | None = None, meanwhile=lambda progress: None, check_cancelled=go_on, is_due: bool = False
-    ) -> bool:
+    def do(self, keyframes: int | None = None, meanwhile=lambda progress: None, is_due: bool = False) -> bool:
         """An estimate over so many keyframes, None = a check; False if there is none to be done, Cancelled or not."""
         job = self.begin(keyframes is not None, keyframes, is_due)
         if job is not None:
-            assert self.run(job, lambda progress: [meanwhile(progress), OUTCOME][1], check_cancelled) is OUTCOME
+            assert self.run(job, lambda progress: [meanwhile(progress), OUTCOME][1], lambda: None) is OUTCOME
         return job is not None
 
 
@@ -90,23 +84,6 @@ def test_what_goes_wrong_is_said_to_who_asked_and_the_next_is_done() -> None:
     assert not queue.do()
 
 
-def test_progress_goes_to_those_who_still_wait() -> None:
-    heard: dict[str, list[float]] = {"first": [], "second": []}
-    queue = Queue()
-    first = queue.ask(1, lambda stage, share: heard["first"].append(share))
-
-    def meanwhile(progress) -> None:
-        progress("search", 0.25)
-        queue.ask(1, lambda stage, share: heard["second"].append(share))
-        progress("search", 0.5)
-        assert first.cancel()
-        progress("search", 0.75)
-
-    assert queue.do(1, meanwhile)
-    assert heard == {"first": [0.25, 0.5], "second": [0.5, 0.75]}
-    assert first.cancelled()
-
-
 def test_a_run_ends_when_the_last_request_is_cancelled_and_nobody_joins_it_then() -> None:
     queue = Queue()
     first = queue.ask(1)
@@ -158,18 +135,3 @@ def test_refused_requests_fail_at_once_and_the_one_under_way_ends(keyframes: int
     assert not queue.waiting
     queue.refuse("not now")
     assert not queue.do(1, is_due=True)
-
-
-def test_a_thread_that_is_to_end_ends_its_job() -> None:
-    def stopping() -> None:
-        raise Cancelled
-
-    queue = Queue()
-    asked = queue.check(1)
-    with pytest.raises(Cancelled):
-        queue.do(check_cancelled=stopping)
-    queue.refuse()
-    assert [str(future.exception(0)) for future in (asked, queue.check(1), queue.ask(1))] == [
-        *["the check was ended: the node is stopping"] * 2,
-        "the estimate was ended: the node is stopping",
-    ]

@@ -209,9 +209,6 @@ def test_probability_is_that_of_chi_squared():
     assert filter.probability(T, C) == 1
     for k in range(6):
         assert filter.probability(se3.exp(sigma * np.eye(6)[k]) @ T, C) == pytest.approx(0.98561, abs=1e-4)
-    rng = np.random.default_rng(0)
-    drawn = [filter.probability(se3.exp(sigma * rng.standard_normal(6)) @ T, C) for _ in range(2000)]
-    assert np.quantile(drawn, [0.1, 0.5, 0.9]) == pytest.approx([0.1, 0.5, 0.9], abs=0.03)
     # With fixed axes, of those that are left.
     fixed = PoseFilter(T, np.diag([1e-6, 0, 0, 0, 0, 0]))
     assert fixed.probability(se3.exp([2e-3, 1e-9, 0, 0, 0, 0]) @ T, np.zeros((6, 6))) == pytest.approx(0.0455, abs=1e-3)

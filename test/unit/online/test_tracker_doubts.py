@@ -7,11 +7,11 @@ import re
 
 import numpy as np
 import pytest
-from tracked import FAR, REFUSAL, T, assessment, at, blind, estimate, is_at, played, settled, tracking, turned, unknown
+from tracked import FAR, REFUSAL, assessment, at, blind, estimate, is_at, played, settled, turned, unknown
 
 from calib_ros.online.monitor import Verdict
 from calib_ros.online.tracker import RECOVERING, UNSETTLING_REJECTIONS
-from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, SUSPECT, Result
+from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, SUSPECT
 
 
 def test_suspect_extrinsic_is_held_until_confirmed_again():
@@ -123,31 +123,3 @@ def test_distant_estimate_is_rejected_after_poor_scenes():
         assert tracker.last_good is good
     assert played(tracker, FAR) == [CONVERGED]
     assert played(tracker, *refusals, estimate(((0, 2.01, 0), (0, 0, 0))))[-1] == CONVERGED  # near: as before
-
-
-@pytest.mark.parametrize(("verdict", "status"), [(Verdict.CONSISTENT, CONVERGED), (Verdict.SUSPECT, SUSPECT)])
-def test_a_saved_extrinsic_is_initial_until_it_is_tested(verdict, status):
-    saved = estimate(turned(0.2))
-    tracker = tracking(saved)
-    assert tracker.current.result.status == INITIAL
-    assert tracker.last_good is saved
-    assert played(tracker, verdict) == [status]
-
-
-@pytest.mark.parametrize("start", [estimate(turned(0.2)), Result(T, INITIAL)], ids=["saved", "unknown"])
-def test_reset_goes_back_to_the_start(start):
-    tracker = tracking(start)
-    before, good, spread = tracker.current, tracker.last_good, tracker.spread
-    played(tracker, *[estimate()] * 3, Verdict.MOVED)
-    blind(tracker, "dark")
-    tracker.reset()
-    now = tracker.current
-    assert tracker.last_good is good
-    assert now.result.status == INITIAL
-    assert np.array_equal(now.result.T_camera_lidar, start.T_camera_lidar)
-    assert (now.accepted, now.normalised_innovation, now.monitor_message, tracker.settled) == (0, 0, "", False)
-    assert (now.result.reason, tracker.monitored) == (before.result.reason, start.converged)
-    assert np.array_equal(tracker.spread, spread)
-
-
-# --- the filter -----------------------------------------------------------------------------------------------------------

@@ -127,28 +127,6 @@ def test_an_idle_worker_stops_at_once_and_takes_nothing_any_more(make):
         recorder.worker.check_cancelled("stage", 0.6)
 
 
-def test_busy_time_counts_the_work_under_way(make):
-    recorder = make(blocked=True)
-    assert recorder.worker.busy_seconds() == 0
-    recorder.begin(1)
-    first = recorder.worker.busy_seconds()
-    assert recorder.worker.busy_seconds() > first
-    recorder.go.set()
-    recorder.worker.wait_idle(SOON)
-    total = recorder.worker.busy_seconds()
-    assert recorder.worker.busy_seconds() == total > first
-
-
-def test_what_an_idle_thread_was_woken_for_is_not_replaced(make):
-    """However late it wakes: one item is at work and one waits."""
-    recorder, wake = make(), threading.Event()
-    recorder.worker._thread.submit(wake.wait)
-    assert [recorder.worker.put(k) for k in range(4)] == [[], [], [1], [2]]
-    wake.set()
-    assert recorder.worker.wait_idle(SOON)
-    assert recorder.items == [0, 3]
-
-
 def test_what_waits_can_be_taken_in_place_of_what_is_worked_on(make) -> None:
     recorder = make(blocked=True)
     recorder.begin("old")
