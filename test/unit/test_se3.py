@@ -99,13 +99,6 @@ def test_rotation_error_is_the_angle_between():
     assert se3.translation_error_m(a, b) == pytest.approx(0.5)
 
 
-def test_perturbation_acts_in_the_target_frame():
-    T = random_transform(5)
-    moved = se3.perturb(T, [0, 0, 90], [10, 0, 0])
-    x, y, z = se3.transform(T, [[1, 2, 3]])[0]
-    assert np.allclose(se3.transform(moved, [[1, 2, 3]])[0], [10 - y, x, z])
-
-
 def test_a_rounded_calibration_is_accepted_and_made_exact():
     T = random_transform(6)
     given = np.round(T, 4)

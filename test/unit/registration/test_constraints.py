@@ -57,6 +57,18 @@ def camera_centre(T: np.ndarray) -> np.ndarray:
 
 
 @ALL
+def test_fixed_axes_stay_and_the_others_go_to_the_best_that_is_left(optimizer):
+    for fixed in ((0,), (4,), (3, 4, 5), (0, 1, 2), (0, 2, 4, 5), (0, 1, 3, 4, 5), range(6)):
+        run, tolerance = OPTIMIZERS[optimizer]
+        half = np.where(np.isin(np.arange(6), fixed), 0, INF)
+        T, value = run(Bowl(), ANCHOR, Limits(ANCHOR, half))
+        assert np.abs(twist(T)[list(fixed)]).max() < 1e-12
+        assert_twist(T, best_with(dict.fromkeys(fixed, 0.0)), tolerance)
+        assert value == pytest.approx(Bowl().value(T), abs=1e-12)
+        assert value > Bowl().value(ANCHOR) or len(fixed) == 6
+
+
+@ALL
 def test_a_start_out_of_bounds_is_brought_in_and_nothing_is_tried_outside(optimizer):
     """Bounds are not around the start, and whatever is scored lies within them."""
     run, tolerance = OPTIMIZERS[optimizer]

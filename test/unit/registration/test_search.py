@@ -20,7 +20,7 @@ from calib_ros.registration.acceptance.checks import check_uncertainty
 from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import SILENT, Progress
-from calib_ros.registration.score.chance import p_value
+from calib_ros.registration.score.chance import null_distribution, p_value
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import levenberg_marquardt
@@ -84,6 +84,12 @@ def test_the_decoy_is_searched_only_in_doubt(scene):
     doubtful = search(score, start, SearchBox(5, 0.3), SMALL, unlimited(start), ACCEPTED)
     assert doubtful.decoy_z is not None
     assert 0 < doubtful.decoy_z < 8
+
+
+def test_the_decoy_holds_no_alignment(scene):
+    score = FastScore(scene.features, scene.truth, ScoreConfig())
+    assert null_distribution(score, scene.truth).z_score > 10
+    assert null_distribution(score.mirrored(), scene.truth).z_score < 4
 
 
 def test_search_without_a_match_ends_after_its_rounds(scene):

@@ -19,7 +19,7 @@ from calib_ros.registration.initial_guess import allowed, poses
 from calib_ros.registration.motion_guess.registration import best_registration, search_boxes
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
-from calib_ros_semantics.first_guess.centroids import agreed_poses, find_pairs
+from calib_ros_semantics.first_guess.centroids import LEFT, RIGHT, agreed_poses, find_pairs
 from calib_ros_semantics.first_guess.guess import CANDIDATES, CENTROIDS, OTHER_WAY_DEG, first_guess
 from calib_ros_semantics.first_guess.score import class_score
 from calib_ros_semantics.first_guess.view import ClassView, class_view
@@ -113,6 +113,22 @@ def test_centroids_need_no_sweep_and_say_what_they_miss(street_views) -> None:
     with pytest.raises(TooFewFeaturesError, match=r"3 objects .* of \d+ in the images 0 may be in the clouds"):
         agreed_poses(find_pairs(nothing), 0)
     assert not find_pairs(nothing).per_object(T[None]).any()
+
+
+@pytest.mark.parametrize(("yaw", "columns", "kind"), [(75.0, (0, 200), RIGHT), (-75.0, (440, 640), LEFT), (75.0, (0, 640), None)])
+def test_of_a_row_that_the_border_cuts_the_end_in_view_counts(yaw: float, columns: tuple[int, int], kind: int | None) -> None:
+    """A row of 110 deg in the cloud, of which the image shows one end, or the middle."""
+    azimuth, z = (a.ravel() for a in np.meshgrid(np.deg2rad(np.arange(yaw - 55, yaw + 55, 0.4)), np.arange(-1, 1, 0.2)))
+    cloud = PointCloud(
+        np.c_[10 * np.cos(azimuth), 10 * np.sin(azimuth), z].astype(np.float32), label=np.full(len(z), C.VEHICLE, np.uint8)
+    )
+    classes = np.full((CAMERA.height, CAMERA.width), C.SKY, np.uint8)
+    classes[90:150, columns[0] : columns[1]] = C.VEHICLE
+    pairs = find_pairs([class_view(cloud, classes, CAMERA)])
+    assert pairs.cls.tolist() == ([] if kind is None else [C.VEHICLE + kind])
+    if kind is not None:
+        end = poses(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros((1, 3)))[0, :3, :3] @ pairs.point[0]
+        assert np.rad2deg(np.arccos(end @ pairs.ray[0] / np.linalg.norm(end))) < 2.0
 
 
 @pytest.mark.parametrize("yaw", [pytest.param(180.0, marks=pytest.mark.slow), -135.0])
