@@ -88,6 +88,13 @@ def test_quaternions_are_in_ros_order_and_have_no_negative_w():
         assert np.allclose(se3.rotation_from_quaternion([-7 * x, -7 * y, -7 * z, -7 * w]), R)
 
 
+def test_inverse_and_transform():
+    T, xyz = random_transform(5), RNG.standard_normal((7, 3))
+    moved = np.c_[xyz, np.ones(7)] @ T.T
+    assert np.allclose(se3.transform(T, xyz), moved[:, :3])
+    assert np.allclose(se3.transform(se3.inverse(T), moved[:, :3]), xyz)
+
+
 def test_rotation_error_is_the_angle_between():
     for angle_deg in (0.0, 1e-5, 0.05, 10.0, 179.0, 180.0):
         R = random_transform(3)[:3, :3]
