@@ -19,7 +19,7 @@ ROUNDS = 2
 
 
 def serve(
-    node: Node, health: Health, kind: Any, name: str, answer: Callable[[Any, Any], Any], group: CallbackGroup | None = None
+    kind: Any, name: str, node: Node, health: Health, answer: Callable[[Any, Any], Any], group: CallbackGroup | None = None
 ) -> Service:
     """A service. answer: fills the response to a request; what it raises becomes the message, since it would end the node. One
     that awaits blocks its group: in the node's own group it would block all others until it is done."""

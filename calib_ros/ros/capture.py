@@ -75,7 +75,7 @@ class Capture(NodeService):
         self._node, self._pipeline, self._parameters, self._health, self._files = node, pipeline, parameters, health, files
         self._camera_info = camera_info
         self.black_box = BlackBox(pipeline, lambda: parameters()["capture.on"], self._record)
-        self._service = serve(node, health, Trigger, "~/capture", self._answer, MutuallyExclusiveCallbackGroup())
+        self._service = serve(Trigger, "~/capture", node, health, self._answer, MutuallyExclusiveCallbackGroup())
         self._frames: deque[RawKeyframe] = deque(maxlen=parameters()["capture_frames"])
         self._lock = threading.Lock()
         if self._frames.maxlen:
@@ -201,7 +201,9 @@ def _write(parameters: Parameters, name: str, frames: list[RawKeyframe], result:
                 (partial / file).write_bytes(data)
             for path in (*partial.rglob("*"), partial):
                 flush(path)
-            target = _free_name(folder, name.format(f"{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"))
+            wanted = name.format(f"{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}")
+            candidates = map(folder.joinpath, chain([wanted], (f"{wanted}_{k}" for k in count(2))))
+            target = next(path for path in candidates if not path.exists())
             os.rename(partial, target)
         flush(folder)
     except OSError as error:
@@ -220,11 +222,6 @@ def _make_room(folder: Path, keep: int, most: int) -> None:
     while boxes and (len(boxes) > keep or sum(sizes) > most):
         shutil.rmtree(boxes.pop(0), ignore_errors=True)
         del sizes[0]
-
-
-def _free_name(folder: Path, name: str) -> Path:
-    names = chain([name], (f"{name}_{k}" for k in count(2)))
-    return next(path for path in map(folder.joinpath, names) if not path.exists())
 
 
 def _types() -> Any:

@@ -27,7 +27,6 @@ for _number in SIGNALS:  # Python's own would raise KeyboardInterrupt wherever t
 
 import sys
 import traceback
-from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -39,33 +38,28 @@ WAKE_S = 0.2  # Python's handlers of signals run between callbacks only
 
 def calib_node(args: list[str] | None = None) -> int:
     """Entry point of the node that is active from its start on."""
-    return _run("calib_node", "calib_ros.ros.node", "CalibNode", args)
+    return _run("calib_node", "CalibNode", args)
 
 
 def calib_lifecycle_node(args: list[str] | None = None) -> int:
     """Entry point of the managed node."""
-    return _run("calib_lifecycle_node", "calib_ros.ros.node", "CalibLifecycleNode", args)
+    return _run("calib_lifecycle_node", "CalibLifecycleNode", args)
 
 
-def _run(name: str, module: str, node: str, args: list[str] | None) -> int:
-    """Run the node of a module, which is imported when signals end the process already."""
+def _run(name: str, kind: str, args: list[str] | None) -> int:
+    """Run a node until SIGINT or SIGTERM: 0; 2 with one line, which begins with the name, if it cannot start.
+
+    kind: of the node, whose module is imported when signals end the process already.
+    """
+    global _ros_runs
     try:
-        make = getattr(import_module(module), node)
+        make = getattr(import_module("calib_ros.ros.node"), kind)
     except CalibrationError as error:  # the compiled kernel is missing
         print(f"{name}: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
         print(f"{name}: {error.name} is missing: source your ROS install or pip install 'calib_ros[ros]'", file=sys.stderr)
         return 2
-    return run(name, make, args)
-
-
-def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM: 0; 2 with one line, which begins with the name, if it cannot start.
-
-    make: a rclpy node with threads of its own, which its stop() ends; True if they ended.
-    """
-    global _ros_runs
     import cv2
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -89,7 +83,7 @@ def run(name: str, make: Callable[[], Any], args: list[str] | None = None) -> in
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     executor = SingleThreadedExecutor()
-    node: Any = None
+    node: Any = None  # with threads of its own, which its stop() ends; True if they ended
     try:
         node = make()
         every(node, WAKE_S, lambda: None)

@@ -118,7 +118,7 @@ class RigInterface(Interface):
         self._solver: Worker[tuple[LiveRig, list[PairState], Priors]] = Worker("calib_rig", self._solve, self._failed)
         self.publisher = node.create_publisher(Rig, "~/rig", LATCHED)
         self._diagnostics_pub = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._service = serve(node, self.health, Trigger, "~/reset", self._reset)
+        self._service = serve(Trigger, "~/reset", node, self.health, self._reset)
         node.add_on_set_parameters_callback(self._on_parameters)
 
     # ---- states -------------------------------------------------------------------------------------------------------

@@ -50,10 +50,10 @@ class Services(NodeService):
         self._promises: dict[bytes, Promise[Extrinsic]] = {}  # of the goals under way, by their ids
         group = ReentrantCallbackGroup()  # requests for an estimate share one, and must not wait for each other
         self._services = [
-            serve(node, health, GetExtrinsic, "~/get_extrinsic", self._get_extrinsic),
-            serve(node, health, Trigger, "~/reset", self._reset),
-            serve(node, health, Trigger, "~/save", self._save),
-            serve(node, health, Trigger, "~/calibrate", self._calibrate, group),
+            serve(GetExtrinsic, "~/get_extrinsic", node, health, self._get_extrinsic),
+            serve(Trigger, "~/reset", node, health, self._reset),
+            serve(Trigger, "~/save", node, health, self._save),
+            serve(Trigger, "~/calibrate", node, health, self._calibrate, group),
         ]
         self._action = ActionServer(
             node,

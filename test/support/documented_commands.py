@@ -65,7 +65,7 @@ def _check(command: str) -> None:
         case ["ros2", "param", "set", "/calib_ros", name, _]:
             assert is_parameter(name)
         case ["ros2", "service", "call", name, kind, *request]:
-            assert name.removeprefix("/calib_ros") in _offered("create_service"), name
+            assert name.removeprefix("/calib_ros") in _offered("(?:create_service|serve)"), name
             _check_fields(_interface(kind).Request, yaml.safe_load(request[0]) if request else {})
         case ["ros2", "action", "send_goal", "--feedback", "/calib_ros/calibrate", kind]:
             assert _interface(kind).Goal

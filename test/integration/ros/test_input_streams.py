@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import count, cycle, islice
 
 import numpy as np
@@ -19,7 +18,6 @@ from vehicle import QUICK, is_right
 from waiting import until
 
 from calib_ros import se3
-from calib_ros.errors import MissingDependencyError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import stamp_ns
 from calib_ros.ros.conversions import image_message, time_message
@@ -157,9 +155,3 @@ def test_no_keyframe_in_a_sharp_turn(street, drive, source, kind):
         peer.until(lambda: peer.values.get("frames too fast for a keyframe") == "2")
         assert peer.values["the newest of them"] == "45.0 deg/s are above online.max_turn_deg_s = 30"
         assert gate.motion_at(street[3])[0] == (5.0 if source == "twist" else pytest.approx(3.0, abs=0.1))
-
-
-@pytest.mark.skipif(find_spec("nav_msgs") is not None, reason="nav_msgs is installed: nothing is missing")
-def test_odometry_without_its_messages_is_named():
-    with pytest.raises(MissingDependencyError, match="motion_source: odom needs nav_msgs; install it"):
-        Peer(motion_source="odom")

@@ -159,8 +159,9 @@ def test_bad_parameters_fail_the_configuration_in_one_line_until_they_are_put_ri
 
 
 @pytest.mark.skipif(find_spec("nav_msgs") is not None, reason="nav_msgs is installed: nothing is missing")
-def test_a_missing_package_fails_the_configuration_and_leaves_nothing_behind():
+def test_a_missing_package_fails_the_configuration_and_leaves_nothing_behind(capfd):
     with Managed(motion_source="odom") as managed:
         before, threads = managed.topics(), threading.active_count()
         assert managed.configure() == UNCONFIGURED
         assert (managed.topics(), threading.active_count()) == (before, threads)
+    assert "motion_source: odom needs nav_msgs; install it" in capfd.readouterr().err

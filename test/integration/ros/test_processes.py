@@ -29,6 +29,12 @@ from calib_ros.result import CONVERGED, Result
 pytestmark = pytest.mark.ros
 SMALL_SEARCH = {name: value for name, value in QUICK.items() if name.startswith("search")}
 LONG_SEARCH = {"search__starts": 1 << 20}  # minutes
+NO_SEARCH = {"search__rotation_deg": 0.0, "search__translation_m": 0.0}
+
+
+def ran(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A process of Python that has ended."""
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=LIMIT_S)
 
 
 def assert_kept(client: Observer, reference: np.ndarray) -> None:
@@ -124,29 +130,26 @@ def test_a_looping_bag_with_its_clock(street_bag, drive):
         assert "jumped back" in end(node)
 
 
-def test_signal_during_an_estimate(street_bag, drive, tmp_path):
-    """The search takes minutes; the node ends without it, and the saved state stays whole."""
+@pytest.mark.parametrize(
+    "long",
+    [
+        {**LONG_SEARCH, "online__min_keyframes": 1},
+        # Two smoothings of eq. 3.12 over six frames take a minute.
+        pytest.param({**NO_SEARCH, "refine__objective": "thesis", "online__min_keyframes": 6}, marks=pytest.mark.slow),
+    ],
+)
+def test_signal_during_an_estimate(street_bag, drive, tmp_path, long):
+    """The node ends without it, and the saved state stays whole."""
     state = tmp_path / "state.json"
     Result(drive.reference, CONVERGED, camera_frame="camera", lidar_frame="velodyne").save(state)
     saved = state.read_bytes()
-    with node_process(**LONG_SEARCH, online__min_keyframes=1, state_file=state) as node, Observer() as client:
-        played(street_bag, "--rate", "8")
+    with node_process(**long, state_file=state) as node, Observer() as client:
+        played(street_bag, "--rate", "2")
         client.until(lambda: client.count("estimate load") > 0.5, "an estimate under way")
         assert client.count("keyframes so far") > 0
         assert client.count("estimates accepted") == 0
         assert_broken_off(end(node))
     assert state.read_bytes() == saved
-
-
-@pytest.mark.slow
-def test_sigint_during_a_long_estimate_of_the_thesis_objective(street_bag, drive):
-    """Two smoothings of eq. 3.12 over six frames take a minute; the node ends without them."""
-    long = {"refine__objective": "thesis", "search__rotation_deg": 0.0, "search__translation_m": 0.0}
-    start = se3.perturb(drive.reference, [0.5, -0.4, 0.3], [0.03, -0.02, 0.03])
-    with node_process(*initial(start), **long, online__min_keyframes=6) as node, Observer() as client:
-        played(street_bag, "--rate", "2")
-        client.until(lambda: client.count("estimate load") > 0.5, "an estimate under way")
-        assert_broken_off(end(node))
 
 
 @pytest.mark.parametrize(
@@ -230,7 +233,7 @@ class Signal:
 sys.meta_path.insert(0, Signal())
 sys.exit({entry_point}() + 3)
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S)
+    done = ran("-c", program)
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -255,7 +258,7 @@ def signalled(*args, **named):
 {owner}.{name} = signalled
 sys.exit({entry_point}())
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S)
+    done = ran("-c", program)
     assert done.returncode == 0, done.stderr
     assert not [line for line in done.stderr.splitlines() if "[INFO]" not in line], done.stderr
 
@@ -271,9 +274,8 @@ sys.exit({entry_point}())
 )
 def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path, arguments, text):
     (tmp_path / "bad.yaml").write_text("/**:\n  ros__parameters:\n    search.seed: [1, 2\n")
-    command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args"]
-    command += [argument.format(bad=tmp_path / "bad.yaml") for argument in arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S)
+    given = [argument.format(bad=tmp_path / "bad.yaml") for argument in arguments]
+    done = ran("-m", "calib_ros.ros.process", "--ros-args", *given)
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if "[WARN]" not in line]
     assert len(lines) == 1, done.stderr
@@ -343,7 +345,7 @@ def test_the_node_calibrates_without_the_packages_beside_it(street_bag, drive):
 )
 def test_the_command_line_does_without_what_the_packages_bring(arguments, code):
     program = WITHOUT + f"from calib_ros.cli.main import main\nsys.exit(main({arguments!r}))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S)
+    done = ran("-c", program)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     assert "evaluate" in done.stdout or code == 2

@@ -261,8 +261,3 @@ def test_the_node_becomes_reliable_and_loses_nothing(street, drive):
         assert all(subscription.reliable for subscription in peer.calibration.sensors.adaptive)
         assert peer.new_values()["share of images paired"] == "1.00"
         assert peer.calibration.health.errors == 0
-
-
-def test_the_node_names_a_compressed_topic(across_processes):
-    with Peer(initial_from_tf=False) as peer, stranger(CompressedImage, "image"):
-        peer.until(lambda: "set image_transport: compressed" in peer.last_error())

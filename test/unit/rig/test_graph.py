@@ -86,8 +86,7 @@ def test_which_edge_of_a_single_loop_is_wrong_is_not_claimed() -> None:
 
 def test_contradictions_apart_from_each_other_are_all_told() -> None:
     """Two cameras of one LiDAR, each with an edge that contradicts its prior."""
-    poses = rig(1, 4)
-    rng = np.random.default_rng(8)
+    poses, rng = rig(1, 4), np.random.default_rng(8)
     measured = edges(poses, [(f"c{k}", "l0") for k in range(4)], rng)
     for k in (0, 2):
         measured[k] = replace(measured[k], T=se3.exp(np.r_[0.2 - 0.05 * k, 0, 0, 0, 0, 0]) @ measured[k].T)
@@ -98,8 +97,7 @@ def test_contradictions_apart_from_each_other_are_all_told() -> None:
 
 def test_many_equal_contradictions_end() -> None:
     """Priors of another frame than the reference: every camera's edge and prior contradict each other by as much."""
-    poses = rig(1, 12)
-    rng = np.random.default_rng(9)
+    poses, rng = rig(1, 12), np.random.default_rng(9)
     measured = edges(poses, [(f"c{k}", "l0") for k in range(12)], rng)
     off = se3.exp(np.r_[0.0, 0.0, 0.0, 1.0, 0.0, 0.5])
     known = {name: (off @ poses[name], 1e-2 * C) for name, (_, C) in priors(poses, rng).items()}
@@ -135,10 +133,8 @@ def test_what_no_edge_tells_rests_on_the_prior() -> None:
 
 def test_priors_of_two_sensors_joined_by_an_edge_are_no_measurement() -> None:
     """Together they tell twice as much as one alone of where both are."""
-    poses = rig(1, 2)
-    rng = np.random.default_rng(9)
-    measured = edges(poses, [("c0", "c1")], rng)
-    solution = solve(measured, priors(poses, rng), "l0")
+    poses, rng = rig(1, 2), np.random.default_rng(9)
+    solution = solve(edges(poses, [("c0", "c1")], rng), priors(poses, rng), "l0")
     assert solution.open["c0"].shape == solution.open["c1"].shape == (6, 6)
 
 
@@ -149,8 +145,6 @@ def test_an_edge_of_an_unknown_sensor_is_named() -> None:
 
 def test_the_same_input_gives_the_same_bits() -> None:
     poses, pairs = RIGS["loops"]
-    solutions = []
-    for _ in range(2):
-        rng = np.random.default_rng(8)
-        solutions.append(solve(edges(poses, pairs, rng), priors(poses, rng), "l0"))
-    assert all((solutions[0].poses[n] == solutions[1].poses[n]).all() for n in poses)
+    rngs = [np.random.default_rng(8) for _ in range(2)]
+    one, other = (solve(edges(poses, pairs, rng), priors(poses, rng), "l0") for rng in rngs)
+    assert all((one.poses[n] == other.poses[n]).all() for n in poses)

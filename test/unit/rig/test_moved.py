@@ -7,13 +7,19 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from graphs import RIGS, edges, priors
+from graphs import RIGS, Pairs, edges, priors
 
 from calib_ros import se3
-from calib_ros.rig.graph import Edge, solve
+from calib_ros.rig.graph import Edge, RigSolution, solve
 from calib_ros.rig.moved import CLOCK, MOVED, NOTHING, RigHypothesis, hypotheses, verdict
 
 VELOCITY = np.array([0.01, 0.02, 0.3, 8.0, 0.5, 0.1])  # rad/s, m/s
+
+
+def solved(name: str, seed: int) -> tuple[dict[str, np.ndarray], Pairs, np.random.Generator, RigSolution]:
+    """A rig's poses and pairs, what errors come from, and its solution before anything happens."""
+    (poses, pairs), rng = RIGS[name], np.random.default_rng(seed)
+    return poses, pairs, rng, solve(edges(poses, pairs, rng), priors(poses, rng), "l0")
 
 
 def is_right(found: RigHypothesis, group: tuple[str, ...]) -> bool:
@@ -44,9 +50,7 @@ def test_two_hundred_displacements_are_told_by_name() -> None:
 
 
 def test_size_and_displacement_are_those_of_the_knock() -> None:
-    poses, pairs = RIGS["ring"]
-    rng = np.random.default_rng(1)
-    before = solve(edges(poses, pairs, rng), priors(poses, rng), "l0")
+    poses, pairs, rng, before = solved("ring", 1)
     about = se3.from_parts(np.eye(3), poses["c2"][:3, 3])
     D = about @ se3.exp(np.r_[0, np.deg2rad(1.5), 0, 0.08, 0, 0]) @ se3.inverse(about)
     best, text = verdict(hypotheses(before, edges(poses | {"c2": D @ poses["c2"]}, pairs, rng)))
@@ -69,9 +73,7 @@ def test_one_camera_and_one_lidar_cannot_be_told_apart() -> None:
 
 
 def test_a_knock_below_the_noise_is_not_named() -> None:
-    poses, pairs = RIGS["loops"]
-    rng = np.random.default_rng(3)
-    before = solve(edges(poses, pairs, rng), priors(poses, rng), "l0")
+    poses, pairs, rng, before = solved("loops", 3)
     moved = poses | {"c0": se3.exp(np.full(6, 1e-5)) @ poses["c0"]}
     assert hypotheses(before, edges(moved, pairs, rng))[0].kind == NOTHING
 
@@ -104,9 +106,7 @@ def test_a_clock_that_jumped_is_no_displacement(known: bool) -> None:
 
 
 def test_two_things_at_once_are_not_taken_for_one() -> None:
-    poses, pairs = RIGS["ring"]
-    rng = np.random.default_rng(5)
-    before = solve(edges(poses, pairs, rng), priors(poses, rng), "l0")
+    poses, pairs, rng, before = solved("ring", 5)
     turns = {"c0": np.r_[0.03, 0, 0, 0, 0, 0], "c3": np.r_[0, 0, 0.03, 0, 0.1, 0]}
     moved = poses | {n: se3.exp(xi) @ poses[n] for n, xi in turns.items()}
     likely, text = verdict(hypotheses(before, edges(moved, pairs, rng)))
@@ -115,9 +115,8 @@ def test_two_things_at_once_are_not_taken_for_one() -> None:
 
 
 def test_posteriors_are_of_all_ways_to_divide_the_rig() -> None:
-    poses, pairs = RIGS["loops"]
-    rng = np.random.default_rng(6)
-    found = hypotheses(solve(edges(poses, pairs, rng), priors(poses, rng), "l0"), edges(poses, pairs, rng))
+    poses, pairs, rng, before = solved("loops", 6)
+    found = hypotheses(before, edges(poses, pairs, rng))
     assert sum(h.posterior for h in found) == pytest.approx(1)
     groups = {frozenset(h.sensors) for h in found if h.kind == MOVED}
     assert groups == {frozenset(c) for m in (1, 2) for c in combinations(poses, m)}
@@ -138,11 +137,6 @@ def test_what_the_edges_would_not_show_is_said_where_nothing_seems_to_have_chang
     assert likely[0].kind == NOTHING
     assert text.startswith("nothing has changed, as far as it shows: ")
     assert text.endswith(": c0 with l0; c1 with c2")
-    assert (
-        verdict(
-            hypotheses(
-                solve(edges(given, [*own, ("c2", "l0")], rng), priors(given, rng), "l0"), edges(given, [*own, ("c2", "l0")], rng)
-            )
-        )[1]
-        == "nothing has changed"
-    )
+    joined = [*own, ("c2", "l0")]
+    before = solve(edges(given, joined, rng), priors(given, rng), "l0")
+    assert verdict(hypotheses(before, edges(given, joined, rng)))[1] == "nothing has changed"
