@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -86,6 +87,10 @@ def test_bag_played_into_the_node(street_bag, drive, tmp_path):
         assert client.new_values()["pairs dropped by a busy worker"] == "0"
         client.until(lambda: client.get_extrinsic()[2].frames_used >= 7, "an estimate over the whole bag")
         assert_found(client, drive.reference)
+        for _ in range(100):  # it is drawn after the extrinsic is published
+            if client.overlays:
+                break
+            time.sleep(0.1)
         assert client.overlays > 0
 
         def is_saved() -> bool:
@@ -133,9 +138,9 @@ def test_a_looping_bag_with_its_clock(street_bag, drive):
 @pytest.mark.parametrize(
     "long",
     [
-        {**LONG_SEARCH, "online__min_keyframes": 1},
+        {**LONG_SEARCH, "online__min_keyframes": 1, "rate": 8},
         # Two smoothings of eq. 3.12 over six frames take a minute.
-        pytest.param({**NO_SEARCH, "refine__objective": "thesis", "online__min_keyframes": 6}, marks=pytest.mark.slow),
+        pytest.param({**NO_SEARCH, "refine__objective": "thesis", "online__min_keyframes": 6, "rate": 2}, marks=pytest.mark.slow),
     ],
 )
 def test_signal_during_an_estimate(street_bag, drive, tmp_path, long):
@@ -143,8 +148,9 @@ def test_signal_during_an_estimate(street_bag, drive, tmp_path, long):
     state = tmp_path / "state.json"
     Result(drive.reference, CONVERGED, camera_frame="camera", lidar_frame="velodyne").save(state)
     saved = state.read_bytes()
-    with node_process(**long, state_file=state) as node, Observer() as client:
-        played(street_bag, "--rate", "2")
+    settings = {name: value for name, value in long.items() if name != "rate"}
+    with node_process(**settings, state_file=state) as node, Observer() as client:
+        played(street_bag, "--rate", str(long["rate"]))
         client.until(lambda: client.count("estimate load") > 0.5, "an estimate under way")
         assert client.count("keyframes so far") > 0
         assert client.count("estimates accepted") == 0
@@ -308,7 +314,7 @@ def test_a_kitti_drive_played_into_the_node(kitti_root, tmp_path):
         # Whether the last keyframes, a second apart, make the monitor doubt it depends on which estimates there was time for.
         T = client.get_extrinsic()[2].T_camera_lidar
         assert is_near(source.reference, T, 0.35, 0.10)
-        assert client.overlays > 0
+        client.until(lambda: client.overlays > 0, "an overlay")
         end(node, signal.SIGTERM)
 
 
