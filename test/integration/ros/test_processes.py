@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -87,11 +86,6 @@ def test_bag_played_into_the_node(street_bag, drive, tmp_path):
         assert client.new_values()["pairs dropped by a busy worker"] == "0"
         client.until(lambda: client.get_extrinsic()[2].frames_used >= 7, "an estimate over the whole bag")
         assert_found(client, drive.reference)
-        for _ in range(100):  # it is drawn after the extrinsic is published
-            if client.overlays:
-                break
-            time.sleep(0.1)
-        assert client.overlays > 0
 
         def is_saved() -> bool:
             """Classes of later keyframes may give another estimate meanwhile."""
