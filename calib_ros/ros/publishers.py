@@ -134,7 +134,7 @@ class OverlayPublisher(NodeService):
     """~/overlay and ~/overlay/compressed: the diagnostic picture, drawn once for both while someone listens to either, at most
     once per overlay_period_s.
 
-    Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset.
+    Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset and for a new listener.
     """
 
     def __init__(self, node: Node, pipeline: Pipeline, parameters: Callable[[], Parameters]) -> None:
@@ -142,11 +142,19 @@ class OverlayPublisher(NodeService):
         self.publisher = node.create_publisher(Image, "~/overlay", 1)
         self.compressed = node.create_publisher(CompressedImage, "~/overlay/compressed", 1)
         self._last = 0.0
+        self._listeners = 0  # of both, a second ago
 
     def destroy(self) -> None:
         """See `NodeService`."""
         for publisher in (self.publisher, self.compressed):
             self._node.destroy_publisher(publisher)
+
+    def check(self) -> None:
+        """Who begins to listen sees the newest keyframe at once: a node at rest draws none for a long time."""
+        before = self._listeners
+        self._listeners = sum(own.get_subscription_count() for own in (self.publisher, self.compressed))
+        if self._listeners > before:
+            self._publish(self._pipeline.last_keyframe)
 
     def add(self, event: Any) -> None:
         """Draw a frame, and a new extrinsic at once, whatever the period."""

@@ -86,6 +86,7 @@ def test_bag_played_into_the_node(street_bag, drive, tmp_path):
         assert client.new_values()["pairs dropped by a busy worker"] == "0"
         client.until(lambda: client.get_extrinsic()[2].frames_used >= 7, "an estimate over the whole bag")
         assert_found(client, drive.reference)
+        client.until(lambda: client.overlays > 0, "an overlay, though the bag may have ended before anyone listened to it")
 
         def is_saved() -> bool:
             """Classes of later keyframes may give another estimate meanwhile."""
