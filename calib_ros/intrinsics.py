@@ -15,8 +15,10 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 
-FOCAL, CENTRE, RADIAL = "focal_length_share", ("principal_point_x_px", "principal_point_y_px"), "k1"  # names in files
-NAMES = (FOCAL, *CENTRE, RADIAL)
+# Names in files. The aspect is that of fy, the focal length that of fx.
+FOCAL, ASPECT, RADIAL = "focal_length_share", "aspect_share", "k1"
+CENTRE = ("principal_point_x_px", "principal_point_y_px")
+NAMES = (FOCAL, ASPECT, *CENTRE, RADIAL)
 COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}  # of a camera that had none, as ROS writes them
 
 
@@ -111,6 +113,8 @@ def changed(camera: Camera, name: str, value: float) -> Camera:
     K, D = camera.K.copy(), camera.D.copy()
     if name == FOCAL:
         K[[0, 1], [0, 1]] *= 1 + value
+    elif name == ASPECT:
+        K[1, 1] *= 1 + value
     elif name == RADIAL:
         D = D if len(D) else np.zeros(COEFFICIENTS[camera.model])
         D[0] += value
@@ -123,6 +127,8 @@ def change_between(given: Camera, camera: Camera, name: str) -> float:
     """By how much `camera` differs from the given one in one of its intrinsics, as `changed` changes it."""
     if name == FOCAL:
         return float(camera.K[0, 0] / given.K[0, 0] - 1)
+    if name == ASPECT:
+        return float(camera.K[1, 1] / given.K[1, 1] * given.K[0, 0] / camera.K[0, 0] - 1)
     if name == RADIAL:
         return float(np.r_[camera.D, 0.0][0] - np.r_[given.D, 0.0][0])
     axis = CENTRE.index(name)

@@ -11,10 +11,9 @@ from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import ESTIMATE
 from calib_ros.registration.acceptance.refusal import AS_RAW
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.nuisance.lens import CENTRE
 from calib_ros.result import RefusalCode, Result
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, Tolerance
-from calib_ros_check.sensors import LensChange, LensFit, scaled
+from calib_ros_check.sensors import CENTRE, LensChange, LensFit, scaled
 
 MIXED_UP = (Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.CLOUD_FRAME, Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
 OF_CAMERAS = (Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.OTHER_CAMERA, Cause.NOT_RECTIFIED, Cause.ALREADY_RECTIFIED)

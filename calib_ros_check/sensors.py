@@ -21,7 +21,6 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.lens import PERSPECTIVE
-from calib_ros.registration.nuisance.lens import CENTRE, FOCAL
 from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, REACH, noise_of
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import PointScore
@@ -30,6 +29,8 @@ from calib_ros_check.evidence import PARAMETER_PENALTY, Candidate, fit, shows_no
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.tolerance import CONFIDENCE
 
+FOCAL = (-0.06, -0.04, -0.02, -0.01, 0.01, 0.02, 0.04, 0.06)  # shares of the focal length
+CENTRE = (-0.03, -0.015, 0.015, 0.03)  # shares of the image width, each way
 # Displacement at the corner of the image, as a share of the radius: 0.15 is KITTI's lens before it is rectified, 0.45 a fisheye.
 BARREL = (-0.3, -0.2, -0.12, -0.06, -0.03, 0.03, 0.06, 0.12, 0.2, 0.3, 0.45)
 SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)  # of the image to which intrinsics may belong, and of this one

@@ -18,7 +18,7 @@ from calib_ros.config.sensors import REFINE
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, RefinedCamera, camera_info_yaml
+from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera, camera_info_yaml
 from calib_ros.io import check_output, write_atomically
 from calib_ros.lidar.deskew import used_twist
 from calib_ros.registration.initial_guess import nominal
@@ -98,6 +98,8 @@ def refined_words(refined: RefinedCamera) -> str:
     for name, change in changes.items():
         if name == FOCAL:
             parts.append(f"fx {K[0, 0]:.1f} fy {K[1, 1]:.1f} px ({change.value:+.2%}, 1 sigma {change.sigma:.2%})")
+        elif name == ASPECT:
+            parts.append(f"fy against fx {change.value:+.2%}, 1 sigma {change.sigma:.2%}")
         elif name == RADIAL:
             parts.append(f"k1 {refined.camera.D[0]:.4f} ({change.value:+.4f}, 1 sigma {change.sigma:.4f})")
         else:

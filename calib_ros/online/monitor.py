@@ -20,7 +20,8 @@ from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import REGIONS, covariance, distance, effective_frames, effective_points
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.nuisance.time_offset import STAMP_SCATTER_S, ClockOffset
+from calib_ros.registration.nuisance.clock_offset import ClockOffset
+from calib_ros.registration.nuisance.time_offset import STAMP_SCATTER_S
 from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
 

@@ -21,7 +21,7 @@ from calib_ros.config import Config
 from calib_ros.config.sensors import REFINE
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.intrinsics import RefinedCamera
+from calib_ros.intrinsics import change_between
 from calib_ros.registration.acceptance.checks import Acceptance, leaves_doubt
 from calib_ros.registration.acceptance.refusal import MAYBE_RAW, SUSPECT_INTRINSICS, joined
 from calib_ros.registration.acceptance.split_half import inflation
@@ -33,10 +33,10 @@ from calib_ros.registration.features import FeatureExtractor, FrameFeatures, Sca
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import JointSearch
+from calib_ros.registration.judgement.lens import LensEstimate, estimate_lens, lens_unknowns
 from calib_ros.registration.motion_guess.registration import best_registration, from_anything, from_motion
-from calib_ros.registration.nuisance.refinement import joint_optimum
-from calib_ros.registration.objective import ObjectiveMaker
-from calib_ros.registration.progress import SILENT, Callback, Progress
+from calib_ros.registration.objective import Objective, ObjectiveMaker
+from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result
 
@@ -121,12 +121,6 @@ class Calibrator:
             search = SearchBox(0.0, 0.0)  # as None, but intrinsics are searched
         first = self._calibrated(frames, initial, search, progress, consecutive)
         started, box = time.perf_counter(), search or SEMANTIC_BOX
-        anchor = first.initial if isinstance(initial, str) else se3.as_transform(initial, "the initial extrinsic")
-
-        def near(camera: Camera, T: Transform) -> Result:
-            again = self._with_camera(camera)
-            used, _ = usable_frames([replace(frame, camera=camera) for frame in frames], again.extract, None, SILENT)
-            return again.estimate([features for _, features in used], T, anchor=anchor)
 
         def whole(camera: Camera) -> Result:
             start = nominal() if first.initial is None else first.initial
@@ -136,7 +130,7 @@ class Calibrator:
         # Of other objectives the edges confirm the place, not the covariance; see Acceptance.refusal.
         asked = not box.is_empty and other_objective(self.config) is None
         limits = self.config.refine if asked else None
-        result = refined_with_camera(first, self.extract.source_camera, near, whole, self.config.camera, limits)
+        result = refined_with_camera(first, self.extract.source_camera, whole, self.config.camera, limits)
         return replace(result, origin=first.origin, elapsed_s=first.elapsed_s + time.perf_counter() - started)
 
     def _with_camera(self, camera: Camera) -> Calibrator:
@@ -235,34 +229,34 @@ class Calibrator:
             alignment = reject_outlier_frames(objective, optimised.T, watch)
             alignment = refine_start(objective, alignment, start, watch)
             # Covariance, with what intrinsics and clocks leave open.
-            acceptance = Acceptance(self.config, self.extract.source_camera.width, box)
+            acceptance = Acceptance(self.config, self.extract.source_camera, box)
             evidence = acceptance.evidence(objective, alignment, optimised.search)
             inflated = inflation(evidence.disagreement)
             pose = observable_pose(
                 objective, alignment.T, start, box, inflated, optimised.search.nearby if optimised.search else ()
             )
-            intrinsics = acceptance.intrinsics(objective, alignment, evidence)
-            found = Estimate(initial, start, optimised, alignment, evidence, *pose, intrinsics)
-            shared, clocks = found.nuisance(self.config, intrinsics if self._given is None else ())
+            lens = self._lens(objective, alignment.T, inflated)
+            found = Estimate(initial, start, optimised, alignment, evidence, *pose, lens)
+            shared, clocks = found.nuisance(self.config, lens if self._given is None else None)
             # Accept, or say why not.
             refusal = acceptance.refusal(found, watch)
             if refusal is not None and refusal.code in SUSPECT_INTRINSICS and self.extract.source_camera.said_rectified:
                 notes = [MAYBE_RAW, *notes]
             result = found.result(shared, clocks, refusal, self.config.motion, notes)
-            if self.config.camera.intrinsics == REFINE:
-                result = replace(result, refined_camera=self._refined(found, acceptance))
+            if self.config.camera.intrinsics == REFINE and lens is not None:
+                result = replace(result, refined_camera=lens.refined_camera(self.extract.source_camera, found.covariance))
             self.objectives.keep_maps(objective)
         except TooFewFeaturesError as error:
             result = insufficient(error, initial, len(features), notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
 
-    def _refined(self, found: Estimate, acceptance: Acceptance) -> RefinedCamera | None:
-        """What the scenes tell of the camera at an optimum, all intrinsics at once."""
-        objective, camera, limits = found.objective, self.extract.source_camera, found.objective.constraints.limits
-        inflated, search = inflation(found.evidence.disagreement), acceptance.box is not None and self._given is None
-        score, prior, T = objective.edges.score, objective.constraints.prior, found.alignment.T
-        extrinsic = found.covariance
-        return joint_optimum(score, T, limits, prior, camera, self.config.camera, inflated, extrinsic, search, self._given)
+    def _lens(self, objective: Objective, T: Transform, inflated: float) -> LensEstimate | None:
+        """What the scenes tell of the lens at an optimum (4, 4)."""
+        camera, score = self.extract.source_camera, objective.edges.score
+        unknowns = lens_unknowns(self.config.camera, camera, score.camera)
+        given = self._given or camera
+        centre = np.array([-change_between(given, camera, own.name) / own.unit for own in unknowns])
+        return estimate_lens(score, T, objective.constraints.limits, unknowns, inflated, centre)
 
     def estimate_in_doubt(
         self,

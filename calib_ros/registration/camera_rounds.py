@@ -18,35 +18,29 @@ from calib_ros.registration.acceptance.checks import check_uncertainty
 from calib_ros.registration.acceptance.refusal import Refusal, joined
 from calib_ros.result import REFUSED, Result
 
-ROUNDS = 3  # after two, changes are those by which pictures differ that are rectified a fraction of a pixel apart
+ROUNDS = 3  # at most: after two, changes are those by which pictures differ that are rectified a fraction of a pixel apart
 
 
 def refined_with_camera(
-    first: Result,
-    given: Camera,
-    near: Callable[[Camera, Transform], Result],
-    whole: Callable[[Camera], Result],
-    camera: CameraConfig,
-    limits: RefineConfig | None,
+    first: Result, given: Camera, whole: Callable[[Camera], Result], camera: CameraConfig, limits: RefineConfig | None
 ) -> Result:
     """The estimate with intrinsics of its own; where it is refused, there are none.
 
-    first: by the given camera. near, whole: the estimate by another camera, refined from an extrinsic (4, 4), and from the start.
-    limits: to which uncertainty the extrinsic has to be known; None = to any.
+    first: by the given camera. whole: the estimate by another camera, from the same start. limits: to which uncertainty the
+    extrinsic has to be known; None = to any.
     """
-    found = first.refined_camera
+    found, result = first.refined_camera, first
     if found is None:  # too little is seen to estimate anything
         return first
     for _ in range(ROUNDS):
-        left = near(found.camera, found.T_camera_lidar).refined_camera
-        if left is None:
-            break
-        found = left
+        result = whole(found.camera)
+        left = result.refined_camera
+        if left is None or not result.converged or result.covariance is None:
+            return replace(result, refined_camera=None)
         if left.settled:
             break
-    result = whole(found.camera)
-    left = result.refined_camera
-    if left is None or not result.converged or result.covariance is None:
+        found = left
+    else:
         return replace(result, refined_camera=None)
     refusal = None if limits is None else _uncertain(left, given, camera, limits)
     if refusal is not None:

@@ -13,8 +13,10 @@ from calib_ros.errors import CalibrationError
 from calib_ros.registration.acceptance.refusal import KEPT, LEFT_OUT, NO_INTENSITY, ONE_FRAME, Refusal, joined
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.joint import Optimised
-from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate
-from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
+from calib_ros.registration.judgement.lens import LensEstimate
+from calib_ros.registration.nuisance.clock_offset import ClockOffset
+from calib_ros.registration.nuisance.parameters import Effect
+from calib_ros.registration.nuisance.time_offset import with_known_motion
 from calib_ros.registration.objective import Objective, penalised
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.chance import NullDistribution, null_distribution
@@ -38,7 +40,8 @@ class Alignment:
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it. T: the
-    extrinsic (4, 4), with its covariance (6, 6), and the directions that no scene shows, along which it is the start."""
+    extrinsic (4, 4), with its covariance (6, 6), and the directions that no scene shows, along which it is the start. lens: what
+    the scenes tell of it, None = nothing."""
 
     initial: Transform
     start: Transform
@@ -48,15 +51,15 @@ class Estimate:
     T: Transform
     covariance: Covariance
     unobservable: tuple[Direction, ...]
-    intrinsics: Sequence[NuisanceEstimate]
+    lens: LensEstimate | None
 
     @property
     def objective(self) -> Objective:
         """Of the features that the optimum is one of."""
         return self.optimised.objective
 
-    def nuisance(self, config: Config, intrinsics: Sequence[NuisanceEstimate]) -> tuple[Covariance, Effect | None]:
-        """What these intrinsics and the clocks leave open of the optimum, however many such scenes there are: covariance (6, 6),
+    def nuisance(self, config: Config, lens: LensEstimate | None) -> tuple[Covariance, Effect | None]:
+        """What this lens and the clocks leave open of the optimum, however many such scenes there are: covariance (6, 6),
         and the effect of an offset as large as motion.max_time_offset_s; None where the motion is not known."""
         T, covariance, constraints = self.T, self.covariance, self.objective.constraints
         score = self.objective.smooth_score(T)
@@ -66,8 +69,9 @@ class Estimate:
         shared = np.zeros((6, 6))
         if not limits.open_axes.any():
             return shared, None
-        for estimate in intrinsics:
-            shared += estimate.added_covariance(constraints, covariance)
+        if lens is not None:
+            kept = [axis for direction in self.unobservable for axis in direction.axes]
+            shared += lens.added_covariance(constraints, covariance, kept)
         moving = with_known_motion(self.optimised.features, score)
         if moving is None:
             return shared, None
@@ -116,7 +120,7 @@ class Estimate:
             evidence=self.evidence,
             frame_scores=tuple(float(s) for s in objective.frame_scores(self.T)),
             starts=None if search is None else (search.agreed, search.optimised),
-            intrinsics={e.parameter.name: e.in_files for e in self.intrinsics},
+            intrinsics={} if self.lens is None else self.lens.in_files(),
             covariance=None if refusal else self.covariance + shared,
             shared_covariance=None if refusal else shared,
             clock_direction=None if refusal or clocks is None else clocks.direction,

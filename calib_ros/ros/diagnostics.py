@@ -16,7 +16,7 @@ from calib_ros.config.options import has_room
 from calib_ros.config.sensors import REFINE
 from calib_ros.errors import defect, raised_at
 from calib_ros.extensions import NodeService
-from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, RefinedCamera
+from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
 from calib_ros.online.events import ExtrinsicUpdated, Problem, QuietLog
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
 from calib_ros.online.pairing.health import PairingHealth
@@ -349,7 +349,13 @@ class Diagnostics:
 
 def refined_values(refined: RefinedCamera | None) -> dict[str, str]:
     """What the keyframes tell of the intrinsics, with standard deviations; the published extrinsic is that of the stated ones."""
-    titles = {FOCAL: "focal length, px", CENTRE[0]: "principal point x, px", CENTRE[1]: "principal point y, px", RADIAL: "k1"}
+    titles = {
+        FOCAL: "focal length, px",
+        ASPECT: "fy, px",
+        CENTRE[0]: "principal point x, px",
+        CENTRE[1]: "principal point y, px",
+        RADIAL: "k1",
+    }
     values = {f"refined {title}": "unknown" for title in titles.values()}
     if refined is None:
         return values
@@ -358,6 +364,8 @@ def refined_values(refined: RefinedCamera | None) -> dict[str, str]:
         digits, scale = 1, 1.0
         if name == FOCAL:
             value, scale = K[0, 0], K[0, 0] / (1 + change.value)  # a share of the stated one
+        elif name == ASPECT:
+            value, scale = K[1, 1], K[1, 1] / (1 + change.value)
         elif name == RADIAL:
             value, digits = np.r_[refined.camera.D, 0.0][0], 4
         else:

@@ -9,7 +9,7 @@ from pathlib import Path
 from paths import ROOT
 
 JUDGES = (
-    *("calib_ros/registration/acceptance/*.py", "calib_ros/registration/nuisance/*.py", "calib_ros/registration/covariance.py"),
+    *(f"calib_ros/registration/{name}.py" for name in ("acceptance/*", "nuisance/*", "judgement/*", "covariance")),
     *(
         "calib_ros/registration/score/chance.py",
         "calib_ros/registration/estimate.py",

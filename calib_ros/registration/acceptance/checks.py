@@ -13,6 +13,7 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
+from calib_ros.camera import Camera
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config
 from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
 from calib_ros.registration.acceptance.refusal import (
@@ -31,9 +32,8 @@ from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.estimate import Alignment, Estimate
 from calib_ros.registration.features import views_of
 from calib_ros.registration.joint import Optimised, estimates_offset
-from calib_ros.registration.nuisance.lens import intrinsics
-from calib_ros.registration.nuisance.parameters import NuisanceEstimate, estimate_parameters, wrong_parameter
-from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
+from calib_ros.registration.nuisance.clock_offset import ClockOffset, estimate_clocks
+from calib_ros.registration.nuisance.time_offset import with_known_motion
 from calib_ros.registration.objective import Objective, penalised, trust_region
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, UNDOUBTED_Z, null_extrinsics, p_value
@@ -54,10 +54,10 @@ RATIO_CONSISTENT, RATIO_INCONSISTENT = 5.0, 1 / 7.0
 
 @dataclass(frozen=True, eq=False)
 class Acceptance:
-    """The checks of an estimate. image_width: px, of the recorded image. box: that was searched, if any."""
+    """The checks of an estimate. camera: as it is stated. box: that was searched, if any."""
 
     config: Config
-    image_width: int
+    camera: Camera
     box: SearchBox | None
 
     @property
@@ -117,31 +117,24 @@ class Acceptance:
         decoy_z = HIGHEST_DECOY_Z if decoy_z is None else decoy_z
         return not_significant(evidence.z_score, decoy_z, evidence.p_value, largest * ratio, ratio < 1)
 
-    def intrinsics(self, objective: Objective, alignment: Alignment, evidence: Evidence) -> tuple[NuisanceEstimate, ...]:
-        """What the scenes tell of the intrinsics at the optimum; far from the given ones only where that may refuse it."""
-        parameters = intrinsics(self.config.camera, self.image_width)
-        search, inflated = self._asks_sensors(evidence), inflation(evidence.disagreement)
-        return estimate_parameters(parameters, objective.edges.score, alignment.T, objective.constraints.limits, inflated, search)
-
-    def _asks_sensors(self, evidence: Evidence) -> bool:
-        """Of a search, whose optimum is new, where it is not one of chance, and something is asked of the extrinsic."""
-        refine = self.config.refine
-        limited = refine.tolerance_deg < NO_LIMIT_DEG or refine.tolerance_m < NO_LIMIT_M
-        return self.searched and limited and evidence.p_value <= refine.max_p_value
-
     def _check_intrinsics_and_clocks(self, found: Estimate) -> Refusal | None:
-        """Are the intrinsics others than given, or the offset of the clocks?"""
-        optimised, objective, evidence = found.optimised, found.objective, found.evidence
-        wrong = self._check_offset(optimised)
-        if wrong is not None or not self._asks_sensors(evidence):
+        """Are the intrinsics others than given, or the offset of the clocks? Where something is asked of the extrinsic."""
+        optimised, objective, evidence, refine = found.optimised, found.objective, found.evidence, self.config.refine
+        wrong, tolerance = self._check_offset(optimised), (refine.tolerance_deg, refine.tolerance_m)
+        limited = tolerance[0] < NO_LIMIT_DEG or tolerance[1] < NO_LIMIT_M
+        if wrong is not None or not limited or evidence.p_value > refine.max_p_value:
             return wrong
-        refine, limits, unknowns = self.config.refine, objective.constraints.limits, list(found.intrinsics)
+        wrong = None if found.lens is None else found.lens.refusal(self.camera, *tolerance)
+        if wrong is not None or not self.searched:
+            return wrong
         moving = with_known_motion(optimised.features, objective.edges.score)
         # An offset that was found may be the best of those that were looked at only.
         if moving is not None and (optimised.seconds != 0 or not estimates_offset(optimised.features, self.config)):
             clocks, inflated = ClockOffset(self.config.motion.time_offset_sigma_s, moving[1]), inflation(evidence.disagreement)
-            unknowns += estimate_parameters([clocks], moving[0], found.alignment.T, limits, inflated, search=True)
-        return wrong_parameter(unknowns, refine.tolerance_deg, refine.tolerance_m)
+            limits = objective.constraints.limits
+            estimate = estimate_clocks(clocks, moving[0], found.alignment.T, limits, inflated)
+            return None if estimate is None else estimate.refusal(*tolerance)
+        return None
 
     def _check_offset(self, optimised: Optimised) -> Refusal | None:
         """Is the time offset one that can be used, or does nothing near match?"""

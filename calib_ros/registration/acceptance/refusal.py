@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL
 from calib_ros.registration.covariance import Direction
 from calib_ros.result import RefusalCode
 
@@ -113,20 +114,30 @@ def objectives_disagree(rotation_deg: float, translation_m: float) -> Refusal:
     return _refusal(RefusalCode.OBJECTIVES_DISAGREE, text, rotation_deg=rotation_deg, translation_m=translation_m)
 
 
-def wrong_intrinsics(focal: float, u: float, v: float, deviations: float) -> Refusal:
-    """Another focal length or principal point matches better. focal: share of the focal length; u, v: px of the recorded image;
-    deviations: how far it is off, in standard deviations of the scenes and of what is known in advance together."""
-    if focal:
-        what = f"with a focal length about {abs(focal):.1%} {'longer' if focal > 0 else 'shorter'}"
-    elif u:
-        what = f"with the principal point about {abs(u):.3g} px further to the {'right' if u > 0 else 'left'}"
+def wrong_intrinsics(main: str, values: Mapping[str, float], width: int, stated: float, deviations: float) -> Refusal:
+    """Another lens matches better. main: which of the values, by their names, matters most: shares of the focal length, the
+    aspect, the image width and the corner's radius. stated: what the distortion that is given moves the corner by, likewise.
+    deviations: how far `main` is off, in standard deviations of the scenes and of what is known in advance together."""
+    value, px, cure = values[main], width * values[main], "check K and D in camera_info, the image size they are for, and "
+    cure += "image_is_rectified (--rectified)"
+    if main == FOCAL:
+        what = f"with a focal length about {abs(value):.1%} {'longer' if value > 0 else 'shorter'}"
+    elif main == ASPECT:
+        what = f"with fy about {abs(value):.1%} {'longer' if value > 0 else 'shorter'} against fx"
+    elif main == CENTRE[0]:
+        what = f"with the principal point about {abs(px):.3g} px further to the {'right' if value > 0 else 'left'}"
+    elif main == CENTRE[1]:
+        what = f"with the principal point about {abs(px):.3g} px further {'down' if value > 0 else 'up'}"
+    elif abs(stated + value) < 0.5 * abs(stated):
+        what = "without the lens distortion of camera_info, as if the images were rectified already"
+        cure = "set image_is_rectified (--rectified), or check D"
     else:
-        what = f"with the principal point about {abs(v):.3g} px further {'down' if v > 0 else 'up'}"
-    text = (
-        f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); check K and D "
-        "in camera_info, the image size they are for, and image_is_rectified (--rectified)"
-    )
-    return _refusal(RefusalCode.WRONG_INTRINSICS, text, focal=focal, u=u, v=v, deviations=deviations)
+        missing = "that camera_info does not state" if not stated else "other than camera_info states"
+        what = f"with a lens distortion {missing}, which moves the corners of the image by {value:+.1%} of their radius"
+    text = f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); {cure}"
+    units = {FOCAL: ("focal", 1), ASPECT: ("aspect", 1), CENTRE[0]: ("u", width), CENTRE[1]: ("v", width), RADIAL: ("radial", 1)}
+    figures = {units[name][0]: units[name][1] * value for name, value in values.items()}
+    return _refusal(RefusalCode.WRONG_INTRINSICS, text, **figures, deviations=deviations)
 
 
 def wrong_times(seconds: float, deviations: float) -> Refusal:

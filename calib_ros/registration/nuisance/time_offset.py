@@ -8,7 +8,7 @@ alike that is one direction of the extrinsic, and nothing can be told; where the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
-from calib_ros.registration.acceptance.refusal import Refusal, wrong_times
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.nuisance.clock_offset import ClockOffset
 from calib_ros.registration.nuisance.parameters import (
     LEVELS,
     MIN_FRAMES,
@@ -26,9 +26,7 @@ from calib_ros.registration.nuisance.parameters import (
     REACH,
     SIGNIFICANT_Z,
     TOLERANCE_DEG,
-    Changed,
     Effect,
-    NuisanceParameter,
     noise_of,
     refined,
 )
@@ -47,29 +45,6 @@ LEAST_S = 1e-3  # s; no stamps are better
 STAMP_SCATTER_S = MotionConfig.time_offset_sigma_s  # by which stamps scatter at most, where clocks are not better known
 SINGULAR = 1e-9  # of the largest eigenvalue, below which rounding decides
 OBSERVABLE_SIGMAS = 2.0  # by which an offset of motion.max_time_offset_s must differ from 0 to count as observable
-
-
-@dataclass(frozen=True, eq=False)
-class ClockOffset(NuisanceParameter):
-    """The offset of the clocks, s, as a change of motion.time_offset_s. twists: (n_frames, 6) of the LiDAR, rad/s and m/s."""
-
-    name: str = field(default="time_offset_s", init=False)
-    twists: Matrix
-    gross = 0.05
-    step = 0.03  # 3 px at a turn of 5 deg/s, or at 10 m/s and 20 m beside the way
-    alternatives = (-0.1, -0.075, -0.05, -0.025, 0.025, 0.05, 0.075, 0.1)  # up to one scan at 10 Hz
-
-    def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
-        """What all frames have in common of their motion turns the extrinsic back."""
-        weight = np.bincount(score.frame, score.weights, len(self.twists))
-        common = weight @ self.twists / weight.sum()
-        return score.moved(self.twists, value), T @ se3.exp(-common * value)
-
-    def observable_in(self, score: PointScore) -> bool:
-        return bool(self.twists.any())  # a vehicle at rest shows no offset of its own
-
-    def refusal(self, value: float, deviations: float) -> Refusal:
-        return wrong_times(value, deviations)
 
 
 def with_known_motion(features: Sequence[FrameFeatures], score: PointScore) -> tuple[PointScore, Matrix] | None:

@@ -12,12 +12,10 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig, update
 from calib_ros.errors import BadInputError
-from calib_ros.intrinsics import CENTRE, FOCAL, NAMES, RADIAL, IntrinsicEstimate, RefinedCamera, change_between, changed
+from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, NAMES, RADIAL, IntrinsicEstimate, RefinedCamera, change_between, changed
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.camera_rounds import refined_with_camera
-from calib_ros.registration.nuisance.lens import Intrinsic
-from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate, wrong_parameter
-from calib_ros.registration.nuisance.refinement import joint_optimum, lens_parameters
+from calib_ros.registration.judgement.lens import LensEstimate, estimate_lens, lens_unknowns
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import CONVERGED, RefusalCode, Result
 
@@ -35,7 +33,7 @@ LENSES = [
 def wrong(camera: Camera, focal: float = 0.0, u: float = 0.0, v: float = 0.0, corner: float = 0.0) -> Camera:
     """A focal length that is off by a share, a principal point by pixels, and a k1 that moves the corner by a share of its
     radius."""
-    unit = lens_parameters(CameraConfig(), camera, camera.rectified())[-1].unit
+    unit = lens_unknowns(CameraConfig(), camera, camera.rectified())[-1].unit
     for name, value in ((FOCAL, focal), (CENTRE[0], u), (CENTRE[1], v), (RADIAL, corner * unit)):
         camera = changed(camera, name, value) if value else camera
     return camera
@@ -53,7 +51,7 @@ def calibrated(scene: Scene, seen_by: Camera, box: SearchBox | None = BOX, confi
 
 @pytest.mark.parametrize(
     ("focal", "u", "v", "says"),
-    [(0.03, 0, 0, "shorter"), (-0.04, 0, 0, "longer"), (0, 16, 0, "further to the left"), (0, 0, -16, "further down")],
+    [(0.03, 0, 0, "shorter"), (-0.04, 0, 0, "longer"), (0, 16, 0, "further to the left")],
 )
 def test_wrong_intrinsics_are_refused_and_named(scene, focal, u, v, says):
     result = calibrated(scene, wrong(scene.camera, focal, u, v))
@@ -62,6 +60,15 @@ def test_wrong_intrinsics_are_refused_and_named(scene, focal, u, v, says):
     assert says in result.reason
     assert [result.refusal_figures[name] for name in "uv"] == pytest.approx([-u, -v], abs=6)
     assert result.refusal_figures["focal"] == pytest.approx(-focal, abs=0.01)
+
+
+def test_another_principal_point_is_a_turn_of_the_camera_that_is_stated(scene):
+    result = calibrated(scene, wrong(scene.camera, v=-16))
+    assert result.converged
+    assert se3.translation_error_m(result.T_camera_lidar, scene.truth) < 0.06
+    off = se3.log(result.T_camera_lidar @ se3.inverse(scene.truth))
+    assert np.linalg.norm(off[:2]) > np.deg2rad(0.5)  # which its whole covariance knows
+    assert off @ np.linalg.solve(result.covariance, off) < 22.5
 
 
 def test_of_images_that_are_said_to_be_rectified_the_refusal_says_how_to_take_them_as_raw(scene):
@@ -77,7 +84,7 @@ def test_right_intrinsics_are_estimated_as_given(scene):
     result = calibrated(scene, scene.camera)
     scene.assert_found(result)
     assert result.refined_camera is None  # unless asked for
-    assert set(result.intrinsics) == {FOCAL, *CENTRE}
+    assert set(result.intrinsics) == set(NAMES)
     focal = result.intrinsics[FOCAL]
     assert focal.observable
     assert abs(focal.value) < 4 * focal.sigma < 0.02
@@ -99,33 +106,37 @@ def test_a_focal_length_one_per_cent_off_is_an_unknown_and_no_reason_to_refuse(s
     assert told > 1.5 * without  # by how much the camera looks nearer or farther away
 
 
-def unknown(value: float, sigma: float, prior: float, shift_m: float) -> NuisanceEstimate:
-    """A focal length that shifts the optimum by so much."""
-    direction = np.array([0, 0, 0, 0, 0, shift_m / value])
-    return NuisanceEstimate(Intrinsic(prior), value, Effect(direction, 1 / sigma**2))
+def shown(name: str, value: float, sigma: float, shift_m: float) -> LensEstimate:
+    """The scenes show a change of an intrinsic by `value`, which shifts the optimum by so much forward."""
+    unknowns = [own for own in lens_unknowns(CameraConfig(), LENSES[0], LENSES[0]) if own.name == name]
+    forward = np.array([[0, 0, 0, 0, 0, shift_m / value]]).T
+    T, x, information = se3.exp(forward[:, 0] * value), np.array([value]), np.array([[sigma**-2.0]])
+    return LensEstimate(tuple(unknowns), x, T, information, forward, np.eye(4), 100.0, np.zeros(1))
 
 
 @pytest.mark.parametrize(
-    ("count", "value", "sigma", "shift_m", "refusal"),
+    ("name", "value", "sigma", "shift_m", "refusal"),
     [
-        (1, 0.03, 0.002, 0.3, RefusalCode.WRONG_INTRINSICS),
-        (1, 0.01, 0.002, 0.3, None),  # within what calibrations differ by
-        (1, 0.03, 0.02, 0.3, None),  # the scenes hardly tell
-        (1, 0.03, 0.002, 0.05, None),  # it does not matter
-        (1, 0.0182, 0.002, 0.3, RefusalCode.WRONG_INTRINSICS),  # p = 0.0007
-        (3, 0.0182, 0.002, 0.3, RefusalCode.TOO_UNCERTAIN),  # it is as likely as not that one of them is plainly wrong
-        (3, 0.0182, 0.002, 0.09, None),  # it hardly matters
+        (FOCAL, 0.03, 0.002, 0.3, RefusalCode.WRONG_INTRINSICS),
+        (FOCAL, 0.01, 0.002, 0.12, None),  # within what calibrations differ by
+        (FOCAL, 0.01, 0.001, 0.2, RefusalCode.WRONG_INTRINSICS),  # these too: the scenes are sure that it matters
+        (FOCAL, 0.03, 0.02, 0.3, None),  # the scenes hardly tell
+        (FOCAL, 0.03, 0.002, 0.05, None),  # it does not matter
+        (FOCAL, 0.03, 0.008, 0.3, RefusalCode.TOO_UNCERTAIN),  # it may be plainly wrong
+        (ASPECT, 0.03, 0.005, 0.3, RefusalCode.WRONG_INTRINSICS),
+        (RADIAL, -0.05, 0.005, 0.3, RefusalCode.WRONG_INTRINSICS),
     ],
 )
-def test_what_is_refused_is_significant_and_matters(count, value, sigma, shift_m, refusal):
-    found = wrong_parameter([unknown(value, sigma, 0.005, shift_m)] * count, 0.5, 0.1)
+def test_what_is_refused_is_significant_and_matters(name, value, sigma, shift_m, refusal):
+    found = shown(name, value, sigma, shift_m).refusal(LENSES[0], 0.5, 0.1)
     assert (found and found.code) == refusal
 
 
-def test_they_are_checked_where_something_is_searched_and_it_is_wanted(scene):
+def test_they_are_checked_where_it_is_wanted(scene):
     camera = wrong(scene.camera, -0.04)
     unchecked = calibrated(scene, camera, refine={"tolerance_deg": 180.0, "tolerance_m": 100.0})
-    assert RefusalCode.WRONG_INTRINSICS not in (calibrated(scene, camera, None).refusal, unchecked.refusal)
+    assert unchecked.refusal is not RefusalCode.WRONG_INTRINSICS
+    assert calibrated(scene, camera, None).refusal is RefusalCode.WRONG_INTRINSICS  # without a search, too
 
 
 # --- refined --------------------------------------------------------------------------------------------------------------
@@ -156,8 +167,8 @@ def test_a_wrong_camera_is_corrected_with_the_extrinsic(scene, focal, corner, bo
 )
 def test_of_models_without_a_radial_coefficient_focal_length_and_centre_are_refined(model, D):
     camera = Camera(K, 1280, 720, model, np.array(D))
-    assert [own.name for own in lens_parameters(CameraConfig(), camera, camera.rectified())] == [FOCAL, *CENTRE]
-    assert lens_parameters(CameraConfig(focal_sigma=0.0), camera, camera.rectified()) == ()
+    assert [own.name for own in lens_unknowns(CameraConfig(), camera, camera.rectified())] == [FOCAL, ASPECT, *CENTRE]
+    assert lens_unknowns(CameraConfig(focal_sigma=0.0), camera, camera.rectified()) == ()
 
 
 def test_unrolled_pictures_show_no_intrinsics(scene):
@@ -165,14 +176,15 @@ def test_unrolled_pictures_show_no_intrinsics(scene):
     with pytest.raises(BadInputError, match="not observable"):
         calibrator.calibrate(scene.frames, scene.truth)
     score = calibrator.objectives([calibrator.extract(f) for f in scene.frames[:1]], scene.truth, scene.truth).edges.score
-    assert joint_optimum(score, scene.truth, unlimited(scene.truth), None, scene.camera, CameraConfig(), 1.0, np.eye(6)) is None
+    assert lens_unknowns(CameraConfig(), scene.camera, score.camera) == ()
+    assert estimate_lens(score, scene.truth, unlimited(scene.truth), ()) is None
 
 
 @pytest.mark.parametrize("camera", LENSES)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_effect_of_a_lens_on_rays_is_that_of_its_own_model(camera, name):
     flat = camera.rectified()
-    own = next(own for own in lens_parameters(CameraConfig(), camera, flat) if own.name == name)
+    own = next(own for own in lens_unknowns(CameraConfig(), camera, flat) if own.name == name)
     value = 1e-3
     other = changed(camera, name, own.unit * value)
     h, w = own.field.shape[:2]
@@ -188,7 +200,7 @@ def test_the_effect_of_a_lens_on_rays_is_that_of_its_own_model(camera, name):
 # --- in rounds ------------------------------------------------------------------------------------------------------------
 
 
-def estimate(change: float, sigma: float, shift_m: float = 0.1, **options: object) -> Result:
+def estimate(change: float, sigma: float = 0.001, shift_m: float = 0.1, **options: object) -> Result:
     """Of a focal length, a standard deviation of which shifts the extrinsic by so much."""
     along = np.array([0, 0, 0, 0, 0, shift_m / sigma])
     covariance = np.zeros((7, 7))
@@ -205,22 +217,21 @@ def estimate(change: float, sigma: float, shift_m: float = 0.1, **options: objec
 def test_rounds_end_where_nothing_is_left_and_the_covariance_is_about_the_camera_that_is_told():
     asked = []
 
-    def near(camera: Camera, T: np.ndarray) -> Result:
+    def whole(camera: Camera) -> Result:
         asked.append(camera)
-        return estimate(0.02 if len(asked) == 1 else 0.0005, 0.001)
+        return estimate(0.02) if len(asked) == 1 else estimate(0.0005, shift_m=0.01)
 
-    last = estimate(0.0005, 0.001, 0.01)
-    result = refined_with_camera(estimate(0.03, 0.001), LENSES[0], near, lambda camera: last, CameraConfig(), REFINE.refine)
+    result = refined_with_camera(estimate(0.03), LENSES[0], whole, CameraConfig(), REFINE.refine)
     assert len(asked) == 2
     assert result.converged
-    assert result.refined_camera.changes[FOCAL].value == pytest.approx(0.0005)  # of the camera that the last round has told
+    assert result.refined_camera.changes[FOCAL].value == pytest.approx(0.02)  # of the camera that was used last
     sigma = np.sqrt(result.refined_camera.covariance[6, 6])
     assert sigma == pytest.approx(np.hypot(0.001, 0.0005))
     assert np.sqrt(result.covariance[5, 5]) == pytest.approx(np.hypot(0.001, 0.01 * np.hypot(1, 0.5)))
 
 
 def in_rounds(last: Result) -> Result:
-    return refined_with_camera(last, LENSES[0], lambda c, T: last, lambda c: last, CameraConfig(), REFINE.refine)
+    return refined_with_camera(last, LENSES[0], lambda camera: last, CameraConfig(), REFINE.refine)
 
 
 def test_what_the_scenes_leave_too_open_is_refused():

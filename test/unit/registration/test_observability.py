@@ -7,7 +7,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ConstraintsConfig, RefineConfig
+from calib_ros.config import CameraConfig, Config, ConstraintsConfig, RefineConfig
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.calibrator import Calibrator
@@ -120,9 +120,10 @@ START = se3.exp(np.array([0.3 * DEG, 0.5 * DEG, 0.2 * DEG, 0.05, 0.03, 0.1])) @ 
 
 
 def calibrator(constraints: ConstraintsConfig | None = None) -> Calibrator:
-    """Level lines stand out less than is asked of a whole scene; the directions are what counts here."""
+    """Level lines stand out less than is asked of a whole scene, and of an exact lens; the directions are what counts here."""
     accepting = RefineConfig(max_p_value=1.0, tolerance_deg=180.0, tolerance_m=100.0)
-    return Calibrator(CAMERA, Config(constraints=constraints or ConstraintsConfig(), refine=accepting))
+    exact = CameraConfig(focal_sigma=0.0)
+    return Calibrator(CAMERA, Config(constraints=constraints or ConstraintsConfig(), refine=accepting, camera=exact))
 
 
 def twist(T: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

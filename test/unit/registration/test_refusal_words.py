@@ -7,7 +7,17 @@ import math
 import pytest
 
 from calib_ros.errors import defect
+from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL
 from calib_ros.registration.acceptance.refusal import left_open, low_score, wrong_intrinsics, wrong_times
+
+LENS = {FOCAL: 0.0, ASPECT: 0.0, CENTRE[0]: 0.0, CENTRE[1]: 0.0, RADIAL: 0.0}
+LENSES = [
+    (CENTRE[0], 0.00042, 0.0, "about 0.42 px further to the right"),
+    (ASPECT, -0.03, 0.0, "with fy about 3.0% shorter against fx"),
+    (RADIAL, 0.1, -0.1, "as if the images were rectified already (3.6 standard deviations); set image_is_rectified"),
+    (RADIAL, -0.05, 0.0, "a lens distortion that camera_info does not state, which moves the corners of the image by -5.0%"),
+    (RADIAL, -0.05, -0.1, "a lens distortion other than camera_info states"),
+]
 
 
 @pytest.mark.parametrize(
@@ -16,7 +26,7 @@ from calib_ros.registration.acceptance.refusal import left_open, low_score, wron
         (wrong_times(-0.6, 0.0), "the clocks set 600 ms apart, which the scenes do not confirm: images"),
         (low_score(math.nan), "the image shows nothing where the LiDAR sees edges; check"),
         (left_open("time_offset_s", 0.0, math.inf, 0.13, 0.25, 0.05), "the scenes do not show time_offset_s, and leave open"),
-        (wrong_intrinsics(0.0, 0.42, 0.0, 3.6), "about 0.42 px further to the right"),
+        *((wrong_intrinsics(main, LENS | {main: value}, 1000, stated, 3.6), text) for main, value, stated, text in LENSES),
         (defect(AssertionError()), "unexpected AssertionError; please report it"),
     ],
 )

@@ -1,0 +1,365 @@
+"""Does the camera fit the scenes? All that may be wrong of its lens, estimated at once, at the optimum of an extrinsic.
+
+Focal length, aspect, principal point and radial distortion are free together with the extrinsic: damped Gauss-Newton steps in
+6 + n unknowns on the edge points of the optimum. A change of the lens moves the rays of the points instead of the pictures, to
+first order. How the score bends down around the optimum tells how well the scenes show each, and how each moves the extrinsic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import product
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.camera import Camera
+from calib_ros.config import CameraConfig
+from calib_ros.intrinsics import (
+    ASPECT,
+    CENTRE,
+    COEFFICIENTS,
+    FOCAL,
+    RADIAL,
+    IntrinsicEstimate,
+    RefinedCamera,
+    changed,
+)
+from calib_ros.registration.acceptance.refusal import Refusal, left_open, wrong_intrinsics
+from calib_ros.registration.acceptance.split_half import disagreement, inflation
+from calib_ros.registration.covariance import LEAST_CURVATURE, NO_NOISE, REGIONS, STEP, effective_frames
+from calib_ros.registration.nuisance.parameters import GROSSLY, NEAR_LEVELS, OPEN_PROBABILITY, POINTS, REACH, noise_of
+from calib_ros.registration.objective import SYSTEMATIC_ERROR
+from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.search.constraints import Limits, PoseConstraints
+from calib_ros.registration.search.optimizers import JointView, ascend_jointly, linearised
+from calib_ros.registration.starts import Sobol
+
+LEVELS = (2, 3, 4)  # blurred as far as a lens that is 5 % off moves the border of a picture
+NODES = (65, 49)  # across and down, at which the effect on rays is computed; between, it is smooth
+DIFFERENCE = 1e-4  # of rays and unknowns, for derivatives in float64
+AT_ONCE = 30000  # points that OpenCV samples at once
+# Standard deviations in advance of aspect and radial distortion, the latter as a displacement of the corner, a share of its
+# radius: pixels are square to 0.2 %, and calibrations of one lens differ by 1 to 3 px. And of values that are plainly wrong.
+ASPECT_USUAL, RADIAL_USUAL, GROSS = 0.002, 0.004, 0.03
+DRAWS = 512  # from an explanation: tell a probability to 1 %
+OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes then tell as much
+
+
+@dataclass(frozen=True, eq=False)
+class LensUnknown:
+    """A change of a camera. name: of `calib_ros.intrinsics`. unit: by which values are multiplied for files. usual: standard
+    deviation in advance. field: (h, w, 2) shift of the ray at every node of the working image, per unit of the value."""
+
+    name: str
+    unit: float
+    usual: float
+    field: NDArray[np.float32]
+
+
+def lens_unknowns(config: CameraConfig, source: Camera, working: Camera) -> tuple[LensUnknown, ...]:
+    """What may be wrong of a camera whose pictures are rectified to the pinhole `working`; nothing of one that is exact, or of
+    unrolled pictures, where a shift is a rotation, and lenses of another focal length are unrolled otherwise."""
+    if working.is_sphere or not config.focal_sigma:
+        return ()
+    u, v = np.meshgrid(np.linspace(0, working.width - 1, NODES[0]), np.linspace(0, working.height - 1, NODES[1]))
+    K = working.K
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
+    shift, width = _shifts(source, rays), float(source.width)
+    out = [
+        LensUnknown(FOCAL, 1.0, config.focal_sigma, _grid(shift(FOCAL, DIFFERENCE))),
+        LensUnknown(ASPECT, 1.0, ASPECT_USUAL, _grid(shift(ASPECT, DIFFERENCE))),
+        *(LensUnknown(name, width, config.centre_sigma, _grid(shift(name, 1.0) * width)) for name in CENTRE),
+    ]
+    if source.model in COEFFICIENTS:  # of the other models the first coefficient is no share of the radius
+        radial = shift(RADIAL, DIFFERENCE)
+        radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
+        corner = int(radius.argmax())
+        share = float(np.linalg.norm(radial[corner])) / radius[corner]  # by which a k1 of 1 moves the corner
+        out.append(LensUnknown(RADIAL, 1 / share, RADIAL_USUAL, _grid(radial / share)))
+    return tuple(out)
+
+
+def _shifts(camera: Camera, rays: Matrix) -> Callable[[str, float], Matrix]:
+    """Shift (n, 2) of rays (n, 2) per unit of a change of the lens, by steps of it; 0 where the lens does not see."""
+
+    def pixels(camera: Camera, rays: Matrix) -> Matrix:
+        return camera.project(np.c_[rays, np.ones(len(rays))])[0]
+
+    off = DIFFERENCE * np.eye(2)
+    slope = np.stack([(pixels(camera, rays + d) - pixels(camera, rays - d)) / (2 * DIFFERENCE) for d in off], axis=-1)
+
+    def shift(name: str, step: float) -> Matrix:
+        ahead, behind = (pixels(changed(camera, name, sign * step), rays) for sign in (1, -1))
+        pixel = (ahead - behind) / (2 * step)
+        seen = np.isfinite(pixel).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
+        out = np.zeros_like(pixel)
+        out[seen] = np.linalg.solve(slope[seen], pixel[seen][..., None])[..., 0]
+        return out
+
+    return shift
+
+
+def _grid(shift: Matrix) -> NDArray[np.float32]:
+    """(n, 2) -> (h, w, 2) of the nodes."""
+    return np.ascontiguousarray(shift.reshape(NODES[1], NODES[0], 2), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class LensHypothesis:
+    """One way in which a lens may be wrong. wrong: (n,) which unknowns are plainly so, the others as usual. probability: of it.
+    mean, covariance: (n,) and (n, n) of the change if it holds."""
+
+    wrong: NDArray[np.bool_]
+    probability: float
+    mean: Matrix
+    covariance: Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class LensEstimate:
+    """What the scenes tell of a lens.
+
+    change: (n,) where they match best, with T (4, 4), the extrinsic there; information: (n, n) of it, noise counted, the
+    extrinsic free. directions: (6, n) twist of the extrinsic, rad and m, per unit of each. T_given: (4, 4), the optimum by the
+    lens as it is. freedom: degrees of freedom of the noise. centre: (n,) change that is expected: back to the stated camera,
+    where this one corrects it.
+    """
+
+    unknowns: tuple[LensUnknown, ...]
+    change: Matrix
+    T: Transform
+    information: Matrix
+    directions: Matrix
+    T_given: Transform
+    freedom: float
+    centre: Matrix
+
+    @cached_property
+    def usual(self) -> Matrix:
+        """Standard deviations (n,) in advance."""
+        return np.array([own.usual for own in self.unknowns])
+
+    @cached_property
+    def sigma(self) -> Matrix:
+        """Standard deviations (n,) by the scenes alone."""
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.information))))
+
+    @cached_property
+    def explanations(self) -> list[LensHypothesis]:
+        """All ways in which it may be wrong, the most probable first: each unknown is plainly wrong as rarely as GROSSLY."""
+        found, n, off = [], len(self.unknowns), self.change - self.centre
+        for wrong in product((False, True), repeat=n):
+            mask = np.array(wrong)
+            prior = np.where(mask, np.hypot(GROSS, self.usual), self.usual)
+            covariance = np.asarray(np.linalg.inv(self.information + np.diag(prior**-2.0)), float)
+            mean = covariance @ (self.information @ self.change + self.centre / prior**2)
+            # What the scenes show differs from what is expected by their noise and as far as this explanation has it.
+            spread = np.linalg.inv(self.information) + np.diag(prior**2)
+            distance = float(off @ np.linalg.solve(spread, off))
+            log_density = -0.5 * (self.freedom + n) * np.log1p(distance / self.freedom) - 0.5 * np.linalg.slogdet(spread)[1]
+            found.append((log_density + mask.sum() * np.log(GROSSLY / (1 - GROSSLY)), mask, mean, covariance))
+        logs = np.array([own[0] for own in found])
+        odds: Matrix = np.exp(logs - logs.max())
+        out = [LensHypothesis(mask, float(p), mean, C) for p, (_, mask, mean, C) in zip(odds / odds.sum(), found, strict=True)]
+        return sorted(out, key=lambda own: -own.probability)
+
+    @cached_property
+    def posterior(self) -> tuple[Matrix, Matrix]:
+        """Mean (n,) and covariance (n, n) of the change, over all explanations."""
+        mean = sum((own.probability * own.mean for own in self.explanations), np.zeros(len(self.unknowns)))
+        spread = (own.probability * (own.covariance + np.outer(own.mean - mean, own.mean - mean)) for own in self.explanations)
+        return mean, np.asarray(sum(spread))
+
+    @cached_property
+    def moves(self) -> Matrix:
+        """(6, n) twist of the extrinsic per unit of each change, such that the one to the optimum is included: farther away than
+        a step, the score bends otherwise (the secant of Broyden 1965)."""
+        missing = se3.log(self.T @ se3.inverse(self.T_given)) - self.directions @ self.change
+        weighed = self.information @ self.change
+        return self.directions + np.outer(missing, weighed) / (float(self.change @ weighed) + 1)
+
+    def added_covariance(self, constraints: PoseConstraints, covariance: Covariance, kept: Sequence[int] = ()) -> Covariance:
+        """Second moment (6, 6) of the extrinsic about the optimum by the lens as it is, whose own covariance is `covariance`, if
+        it is another. kept: axes that are those of the start, whatever the lens."""
+        moves, (mean, spread) = self.moves.copy(), self.posterior
+        moves[list(kept)] = 0.0
+        if constraints.prior:
+            moves = moves - covariance @ (constraints.information()[:, None] * moves)
+        moment = spread + np.outer(mean, mean)
+        farthest = constraints.limits.half[:, None] / np.sqrt(np.diag(moment))
+        moves = np.clip(moves, -farthest, farthest)
+        return np.asarray(moves @ moment @ moves.T)
+
+    def refined_camera(self, camera: Camera, extrinsic: Covariance) -> RefinedCamera:
+        """The camera with the change that is expected by now. extrinsic: covariance (6, 6) of the optimum by a known camera."""
+        mean, spread = self.posterior
+        units = np.array([own.unit for own in self.unknowns])
+        T = se3.exp(self.moves @ (mean - self.change)) @ self.T
+        changes = {}
+        for own, value, sigma in zip(self.unknowns, mean * units, np.sqrt(np.diag(spread)) * units, strict=True):
+            camera = changed(camera, own.name, float(value))
+            changes[own.name] = IntrinsicEstimate(float(value), float(sigma), bool(sigma < OBSERVABLE * own.unit * own.usual))
+        lens, along = spread * np.outer(units, units), self.moves / units
+        both = np.block([[extrinsic + along @ lens @ along.T, along @ lens], [lens @ along.T, lens]])
+        return RefinedCamera(camera, T, changes, both)
+
+    def in_files(self) -> dict[str, IntrinsicEstimate]:
+        """What the scenes alone tell of each unknown."""
+        return {
+            own.name: IntrinsicEstimate(float(own.unit * value), float(own.unit * sigma), bool(sigma < own.usual))
+            for own, value, sigma in zip(self.unknowns, self.change, self.sigma, strict=True)
+        }
+
+    def refusal(self, camera: Camera, deg: float, m: float) -> Refusal | None:
+        """Why an extrinsic is not to be used: by another lens it is more than deg or m elsewhere; None where it may be right.
+
+        A turn across the view does not count: it looks like another principal point, and who projects with the camera as it is
+        stated never sees it.
+        """
+        moves = self.moves[2:] / np.array([[np.deg2rad(deg)], [m], [m], [m]])
+        best, off = self.explanations[0], [self._off(own, moves) if own.wrong.any() else 0.0 for own in self.explanations]
+        surely = farther(moves @ best.mean, moves @ best.covariance @ moves.T, self.freedom) > np.log(1 / OPEN_PROBABILITY - 1)
+        if not surely and sum(off) <= OPEN_PROBABILITY:
+            return None
+        explanation = best if surely else self.explanations[int(np.argmax(off))]
+        k = int(np.linalg.norm(moves * explanation.mean, axis=0).argmax())  # what moves the extrinsic farthest
+        name, unit = self.unknowns[k].name, self.unknowns[k].unit
+        if not surely and sum(off) < 1 - OPEN_PROBABILITY:
+            return left_open(name, unit * self.change[k], unit * self.sigma[k], sum(off), deg, m)
+        values = dict(zip([own.name for own in self.unknowns], explanation.mean, strict=True))
+        deviations = float(abs(self.change[k] - self.centre[k]) / np.hypot(self.sigma[k], self.usual[k]))
+        stated = camera.D[0] / unit if name == RADIAL and len(camera.D) else 0.0
+        return wrong_intrinsics(name, values, camera.width, stated, deviations)
+
+    def _off(self, explanation: LensHypothesis, moves: Matrix) -> float:
+        """Probability that it holds, and the extrinsic is off. moves: (4, n), see `refusal`, per unit of each change."""
+        draws = np.linalg.cholesky(explanation.covariance) @ _draws(len(self.unknowns))
+        ends = moves @ (explanation.mean[:, None] + draws)
+        return explanation.probability * float(((np.abs(ends[0]) > 1) | (np.linalg.norm(ends[1:], axis=0) > 1)).mean())
+
+
+@cache
+def _draws(n: int) -> Matrix:
+    """(n, k) of a standard normal distribution, evenly spread."""
+    return np.asarray(ndtri(0.5 + 0.5 * Sobol(n, 0).next(DRAWS)).T)
+
+
+def farther(mean: Matrix, covariance: Matrix, freedom: float) -> float:
+    """Log-likelihood ratio of an offset (4,) of this covariance against the nearest one within 1: of its first component, and of
+    the norm of the others. 0 for one within."""
+    distances = [0.0]
+    if abs(mean[0]) > 1:
+        distances.append((abs(mean[0]) - 1) ** 2 / covariance[0, 0])
+    v, C = mean[1:], covariance[1:, 1:]
+    if np.linalg.norm(v) > 1:
+        information = np.linalg.inv(C + 1e-12 * np.eye(3))
+        low, high = 0.0, 1e12
+        for _ in range(100):  # the multiplier at which the nearest one is on the ball
+            middle = np.sqrt(max(low, 1e-12) * high)
+            near = np.linalg.solve(information + middle * np.eye(3), information @ v)
+            low, high = (middle, high) if np.linalg.norm(near) > 1 else (low, middle)
+        distances.append(float((v - near) @ information @ (v - near)))
+    return 0.5 * (freedom + 1) * float(np.log1p(max(distances) / freedom))
+
+
+def estimate_lens(
+    score: PointScore,
+    T: Transform,
+    limits: Limits,
+    unknowns: Sequence[LensUnknown],
+    inflated: float = 1.0,
+    centre: Matrix | None = None,
+) -> LensEstimate | None:
+    """The joint optimum near T (4, 4), that of a score by the lens as it is; None where nothing is unknown.
+
+    limits: axes that are fixed stay so. inflated: factor of the noise, by the disagreement of halves at T. centre: (n,), see
+    `LensEstimate`.
+    """
+    if not unknowns or not limits.open_axes.any():
+        return None
+    n, half = len(unknowns), np.where(limits.open_axes, np.inf, 0.0)
+    part, free = score.subset(POINTS, np.random.default_rng(0)), Limits(T, half)
+    see, as_it_is = _seeing(part, unknowns), np.zeros(n)
+    T_given = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))[0]
+    starts = (T, LEVELS), (T_given, NEAR_LEVELS)
+    ends = [ascend_jointly(see, start, as_it_is, levels, free)[:3] for start, levels in starts]
+    T, change, _ = max(ends, key=lambda end: end[2])
+    there, own = see(T, change)[0], Limits(np.eye(4), half)
+    # Halves may disagree because of the wrong lens.
+    noise = noise_of(there, np.eye(4), own) * min(inflated, inflation(disagreement(there, np.eye(4), own)))
+    bending = _bending(see, T, change, np.flatnonzero(limits.open_axes), unknowns, part, noise)
+    freedom = max(REGIONS * effective_frames(score) - 6 - n, 1.0)
+    return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, as_it_is if centre is None else centre)
+
+
+def _seeing(score: PointScore, unknowns: Sequence[LensUnknown]) -> Callable[[Transform, Matrix], JointView]:
+    """What sees the points of a score from an extrinsic (4, 4) with a change (n,) of the lens, in the camera's axes."""
+    fields, n = np.concatenate([own.field for own in unknowns], axis=2), len(unknowns)
+    points, K, camera = score.points.astype(np.float64), score.camera.K, score.camera
+    scale = (NODES[0] - 1) / (camera.width - 1), (NODES[1] - 1) / (camera.height - 1)
+
+    def see(T: Transform, change: Matrix) -> JointView:
+        P = T[:3, :3] @ points + T[:3, 3:]
+        z = np.maximum(P[2], 1e-3)
+        node = [((K[i, i] * P[i] / z + K[i, 2]) * scale[i]).clip(-1, 2 * NODES[i]).astype(np.float32)[None] for i in (0, 1)]
+        shifts = np.empty((2 * n, P.shape[1]))
+        for first in range(0, P.shape[1], AT_ONCE):
+            own = slice(first, first + AT_ONCE)
+            at = [np.ascontiguousarray(part[:, own]) for part in node]
+            shifts[:, own] = cv2.remap(fields, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].T
+        shifts = shifts.reshape(n, 2, -1) * z
+        P[:2] += np.einsum("k,kin->in", change, shifts)
+        # Slopes by a shift of the point across and down, of which each unknown makes so many m.
+        return score.with_points(P.astype(np.float32)), np.eye(4), lambda J: J[3] * shifts[:, 0] + J[4] * shifts[:, 1]
+
+    return see
+
+
+def _bending(
+    see: Callable[[Transform, Matrix], JointView],
+    T: Transform,
+    change: Matrix,
+    axes: NDArray[np.intp],
+    unknowns: Sequence[LensUnknown],
+    score: PointScore,
+    noise: float,
+) -> tuple[Matrix, Matrix]:
+    """Information (n, n) of a change and the twist (6, n) of the extrinsic per unit of it: by central differences of the
+    gradient, over steps as far as those of the extrinsic's own covariance move a picture."""
+    n, K, level = len(unknowns), score.camera.K, score.n_levels - 1
+    moved = [np.sqrt(np.mean((own.field * np.diag(K)[:2]) ** 2)) for own in unknowns]
+    steps = np.r_[STEP, STEP[0] * K[0, 0] / np.maximum(moved, 1e-9)]
+    used = np.r_[axes, 6 + np.arange(n)]
+    H = np.zeros((6 + n, 6 + n))
+    for k in used:
+        off = np.zeros(6 + n)
+        off[k] = steps[k]
+        ahead, behind = (linearised(see(se3.exp(sign * off[:6]) @ T, change + sign * off[6:]), n, level)[0] for sign in (1, -1))
+        H[k] = (behind - ahead) / (2 * steps[k])
+    H = 0.5 * (H + H.T)[np.ix_(used, used)]
+    # It may be indefinite: its eigenvalues relative to the Gauss-Newton scale rise to LEAST_CURVATURE.
+    units = np.outer(steps[used], steps[used])
+    scale = linearised(see(T, change), n, level)[1][np.ix_(used, used)]
+    # What no point shows of the extrinsic lies within reach.
+    nothing = np.diag(noise * np.r_[REACH[axes], np.full(n, np.inf)] ** -2.0)
+    H, scale = H + nothing, scale + nothing
+    values, vectors = np.linalg.eigh(scale * units)
+    root = vectors / np.sqrt(np.maximum(values, NO_NOISE * values.max()))
+    values, vectors = np.linalg.eigh(root.T @ (H * units) @ root)
+    half = root @ vectors
+    C = units * ((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)
+    k = len(axes)
+    lens = C[k:, k:]
+    directions = np.zeros((6, n))
+    directions[axes] = C[:k, k:] @ np.linalg.inv(lens)
+    # What shifts the border of the image as far as the systematic error of a rotation does.
+    px = SYSTEMATIC_ERROR[0] * K[0, 0]
+    systematic = np.array([px / score.camera.width * (1.0 if own.name in CENTRE else 2.0) for own in unknowns])
+    return np.linalg.inv(noise * lens + np.diag(systematic**2)), directions
