@@ -26,7 +26,7 @@ from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import search, search_decoy
 from calib_ros.result import CONVERGED, Evidence, RefusalCode, Result
 from calib_ros_check.cameras import AsTaken, CameraGuess, camera_guesses, turned_over
-from calib_ros_check.causes import MIXED_UP, OFF, OTHER_FITS, distorts, instead, lens_findings, not_mixed_up, of_cameras
+from calib_ros_check.causes import MIXED_UP, OFF, OTHER_FITS, changed_findings, distorts, instead, not_mixed_up, of_cameras
 from calib_ros_check.evidence import EVEN, Candidate, H, Match, convinces, evidence, fit, log_odds, rare_odds
 from calib_ros_check.hypotheses import MixUp, hypotheses, of_pictures, says_more_than, simplest, upside_down
 from calib_ros_check.outcome import CauseFinding, Tolerance
@@ -155,10 +155,10 @@ class Alternatives:
         Which one it may be a few of the frames tell, and all of them whether it is: each takes all pictures anew.
         """
         some = spread_positions(FEW_FRAMES, len(features))
-        lens, changes = self._other_lens(features, some, inputs), list(lenses(features[0].camera, wide=True))
+        lens, changes = self._other_lens(features, some, inputs), list(lenses(features[0].camera))
         count = tried + len(changes)
         if lens is not None and self._stands(lens, given, count, rare_odds(count)):
-            findings = lens_findings(lens, NOT_JUDGED, self.camera)
+            findings = changed_findings(lens, self.camera)
             return _explanation(lens, features, inputs.T, (*findings, *not_mixed_up(OTHER_FITS)))
         guesses = list(camera_guesses(self.camera))
         count += len(guesses)
@@ -203,7 +203,7 @@ class Alternatives:
             if not judged(of_all):
                 return None
             score = self.score([features[k] for k in some], inputs.T)
-            best = fit_lens(score, inputs.T, wide=True, progress=Progress(inputs.progress, LENS))
+            best = fit_lens(score, inputs.T, Progress(inputs.progress, LENS))
             return replace(best, score=best.hypothesis.seen_by(of_all)) if best.significant else None
         except TooFewFeaturesError:
             return None

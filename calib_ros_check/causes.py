@@ -9,8 +9,11 @@ import numpy as np
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import ESTIMATE
+from calib_ros.intrinsics import CENTRE as CENTRE_NAMES
+from calib_ros.intrinsics import RADIAL
 from calib_ros.registration.acceptance.refusal import AS_RAW
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.judgement.lens import LensEstimate, LensFault
 from calib_ros.result import RefusalCode, Result
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, Tolerance
 from calib_ros_check.sensors import CENTRE, LensChange, LensFit, scaled
@@ -71,19 +74,33 @@ def findings(causes: Iterable[Cause], state: CauseState, message: str) -> tuple[
     return tuple(CauseFinding(cause, state, message) for cause in causes)
 
 
-def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[CauseFinding, ...]:
-    """Do focal length, principal point and distortion fit? fit: None = not judged, and why_not. camera: as it is claimed."""
-    if fit is None:
+def lens_findings(
+    lens: LensEstimate | None, fault: LensFault | None, why_not: str, camera: Camera, tolerance: Tolerance
+) -> tuple[CauseFinding, ...]:
+    """Do focal length, principal point and distortion fit? lens: None = not judged, and why_not. camera: as it is claimed."""
+    if lens is None:
         return findings(of_cameras(camera), CauseState.NOT_JUDGED, why_not)
-    best = fit.hypothesis
-    found = cause_of(fit, camera) if fit.significant else None
+    if fault is None:
+        return findings(of_cameras(camera), CauseState.EXCLUDED, "no other camera matches clearly better")
+    refusal = fault.refusal(camera, tolerance.deg, tolerance.m)
+    main = lens.unknowns[fault.k].name
+    cause = Cause.PRINCIPAL_POINT if main in CENTRE_NAMES else Cause.FOCAL_LENGTH
+    if main == RADIAL:
+        cause = Cause.ALREADY_RECTIFIED if fault.removes_distortion(camera) else Cause.NOT_RECTIFIED
+    names = {"focal": "focal", "aspect": "aspect", "u": "u_px", "v": "v_px"}
+    values = {names[name]: value for name, value in refusal.figures.items() if name in names}
+    values["barrel"] = -refusal.figures.get("radial", 0.0)
+    return instead(CauseFinding(cause, CauseState.FOUND, str(refusal), values), of_cameras(camera))
+
+
+def changed_findings(fit: LensFit, camera: Camera) -> tuple[CauseFinding, ...]:
+    """That the camera is quite another. camera: as it is claimed."""
+    best, found = fit.hypothesis, cause_of(fit, camera)
     values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
-    if found is not None:
-        better = f"{fit.deviations:.1f} standard deviations better"
-        advice = AS_RAW if found is Cause.NOT_RECTIFIED and camera.said_rectified else _INTRINSICS
-        message = f"{_lens_words(best, found, camera)} ({better}); {advice}"
-        return instead(CauseFinding(found, CauseState.FOUND, message, values), of_cameras(camera))
-    return findings(of_cameras(camera), CauseState.EXCLUDED, "no other camera matches clearly better")
+    better = f"{fit.deviations:.1f} standard deviations better"
+    advice = AS_RAW if found is Cause.NOT_RECTIFIED and camera.said_rectified else _INTRINSICS
+    message = f"{_lens_words(best, found, camera)} ({better}); {advice}"
+    return instead(CauseFinding(found, CauseState.FOUND, message, values), of_cameras(camera))
 
 
 def instead(found: CauseFinding, causes: Iterable[Cause]) -> tuple[CauseFinding, ...]:

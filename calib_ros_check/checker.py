@@ -25,6 +25,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
+from calib_ros.registration.judgement.lens import LensUnknown, estimate_lens, lens_unknowns
 from calib_ros.registration.nuisance.parameters import noise_of
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z
@@ -33,7 +34,6 @@ from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import FRUITLESS_ROUNDS
 from calib_ros.result import CONVERGED, RefusalCode, Result
 from calib_ros_check.alternatives import (
-    LENS,
     NEAR,
     NOT_JUDGED,
     Alternatives,
@@ -68,12 +68,13 @@ from calib_ros_check.causes import (
 )
 from calib_ros_check.evidence import PARAMETER_PENALTY, Candidate, freedom, is_off, shows_noise
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
-from calib_ros_check.sensors import LensChange, LensFit, centre_instead, centre_of, fit_lens, judged, moves_by, without_change
+from calib_ros_check.sensors import LensChange, centre_instead, centre_of, judged
 from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, undecided, unknown
 
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
+ACCUSATION = 0.01  # largest probability that what is accused is right
 CENTRES = 3  # principal points that are tried, one after the other
 NOT_THE_CLOCKS = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
@@ -184,47 +185,45 @@ class Checker:
         as_stamped = features
         features, result, clocks = self._on_right_clocks(features, result, inputs)
         if clocks.state is CauseState.FOUND:
-            better = self._lens_instead(as_stamped, features, result, inputs.progress)
+            better = self._lens_instead(as_stamped, features, result, inputs)
             if better is not None:
                 features, result = as_stamped, better
                 clocks = NOT_THE_CLOCKS
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
-        fit = self._other_lens(score, found, inputs) if judged(score) else None
-        lens = lens_findings(fit, NOT_JUDGED, self.camera)
+        turned = None if se3.rotation_error_deg(inputs.T, found) <= inputs.tolerance.deg else inputs.T
+        unknowns = self._unknowns(score) if judged(score) else ()
+        lens = estimate_lens(score, found, unlimited(found), unknowns, turned=turned)
+        fault = None if lens is None else lens.fault(inputs.tolerance.deg, inputs.tolerance.m, ACCUSATION)
+        fault = fault if fault is not None and fault.probability == 1 else None
+        causes = lens_findings(lens, fault, NOT_JUDGED, self.camera, inputs.tolerance)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
         others = self._other_cameras(score, found, inputs, offset)
-        least = max(fit.penalised_gain if fit else 0.0, 0.0)
+        least = 0.0 if lens is None or fault is None else max(lens.gain - PARAMETER_PENALTY, 0.0)
         significant = [own for own in others if own.significant and own.penalised_gain > least]
         if significant:
             found, score, C = significant[0].T, significant[0].score, None
-            lens = instead(significant[0].hypothesis.finding, of_cameras(self.camera))
+            causes = instead(significant[0].hypothesis.finding, of_cameras(self.camera))
             if clocks.state is CauseState.FOUND:
                 clocks = NOT_THE_CLOCKS
-        elif fit is not None and fit.significant:
-            found, score, C = fit.T, fit.hypothesis.seen_by(score), None
-        elif fit is not None and clocks.state is not CauseState.FOUND and not inputs.tolerance.covers(inputs.T, found):
-            own = self._possible_centre(score, found, inputs, others)
-            lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
+        elif lens is not None and not inputs.tolerance.covers(inputs.T, found):
+            _, T = seen = lens.seen(score)
+            if fault is not None or inputs.tolerance.covers(inputs.T, T):  # a usual lens explains it
+                (score, found), C = seen, None
+            elif clocks.state is not CauseState.FOUND:
+                own = self._possible_centre(score, found, inputs, others)
+                causes = tuple(own if own is not None and own.cause is finding.cause else finding for finding in causes)
         shared = None if C is None else result.shared_covariance
         C = covariance_of(score, found) if C is None else C
-        causes = (clocks, *lens)
+        causes = (clocks, *causes)
         why = AS_GIVEN if inputs.tolerance.covers(inputs.T, found) else OFF
         if any(own.state is CauseState.FOUND for own in causes):
             why = OTHER_FITS
         return Explanation(score, found, C, inputs.T, result, (*causes, *not_mixed_up(why)), shared)
 
-    def _other_lens(self, score: PointScore, found: Matrix, inputs: CheckInputs) -> LensFit:
-        """The change of the camera that matches best around the optimum (4, 4) of a score. One within the tolerance, like an
-        extrinsic within it, is none: it counts where it moves points by more, or is needed to explain the optimum."""
-        T, tolerance = inputs.T, inputs.tolerance
-        turned = None if se3.rotation_error_deg(T, found) <= tolerance.deg else T
-        fit = fit_lens(
-            score, found, progress=Progress(inputs.progress, LENS), T_checked=None if distorts(self.camera) else turned
-        )
-        needed = tolerance.covers(T, fit.T) and not tolerance.covers(T, found)
-        return fit if needed or moves_by(fit, score.camera) > tolerance.deg else without_change(fit, found, score)
+    def _unknowns(self, score: PointScore) -> tuple[LensUnknown, ...]:
+        return lens_unknowns(self.config.camera, self.camera, score.camera)
 
     def _other_cameras(
         self, score: PointScore, found: Matrix, inputs: CheckInputs, offset_s: float
@@ -293,11 +292,12 @@ class Checker:
         return features, result, finding
 
     def _lens_instead(
-        self, as_stamped: Sequence[FrameFeatures], moved: Sequence[FrameFeatures], result: Result, progress: Callback | None
+        self, as_stamped: Sequence[FrameFeatures], moved: Sequence[FrameFeatures], result: Result, inputs: CheckInputs
     ) -> Result | None:
         """The estimate at the clocks as stamped, if another camera explains the frames better than the offset that was found; one
         may look like the other."""
-        without = self._at_stamps.estimate(as_stamped, result.T_camera_lidar, None, progress)
+        tolerance = inputs.tolerance
+        without = self._at_stamps.estimate(as_stamped, result.T_camera_lidar, None, inputs.progress)
         T = without.T_camera_lidar if without.converged else without.optimum
         if T is None:
             return None
@@ -306,8 +306,9 @@ class Checker:
             return None
         noise = noise_of(before, T, unlimited(T))
         gain = (after.at(-1).value(result.T_camera_lidar) - before.at(-1).value(T)) / noise
-        fit = fit_lens(before, T, progress=Progress(progress, LENS))
-        better = fit.significant and fit.penalised_gain > gain - PARAMETER_PENALTY
+        lens = estimate_lens(before, T, unlimited(T), self._unknowns(before))
+        fault = None if lens is None else lens.fault(tolerance.deg, tolerance.m, ACCUSATION)
+        better = lens is not None and fault is not None and lens.gain > gain
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 
     def _judged(self, found: Explanation, inputs: CheckInputs) -> CheckResult:

@@ -1,8 +1,8 @@
-"""Do the intrinsics fit, at the optimum of the extrinsic? Focal length, principal point and lens distortion, tried and compared.
+"""Is the camera quite another? Focal length, principal point and lens distortion, tried and compared where nothing matches.
 
-A wrong focal length, principal point or distortion moves the extrinsic that matches best, and the match gets worse than with the
-right ones. Every family of changes is one more hypothesis about the same data: it is preferred where it gains clearly more than
-noise, and the family with the highest likelihood, its number of unknowns paid for, names the cause.
+Every family of changes is one more hypothesis about the same data: it is preferred where it gains clearly more than noise, and
+the family with the highest likelihood, its number of unknowns paid for, names the cause. What is wrong by little is told at an
+optimum (registration/judgement/lens.py).
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from operator import attrgetter
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtri
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
@@ -27,7 +26,6 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros_check.evidence import PARAMETER_PENALTY, Candidate, fit, shows_noise
 from calib_ros_check.outcome import Tolerance
-from calib_ros_check.tolerance import CONFIDENCE
 
 FOCAL = (-0.06, -0.04, -0.02, -0.01, 0.01, 0.02, 0.04, 0.06)  # shares of the focal length
 CENTRE = (-0.03, -0.015, 0.015, 0.03)  # shares of the image width, each way
@@ -69,27 +67,14 @@ LensFit = Candidate[LensChange]
 PENALISED_GAIN = attrgetter("penalised_gain")
 
 
-def moves_by(fitted: LensFit, camera: Camera) -> float:
-    """How far a change moves points at least, deg, with a probability of CONFIDENCE. What gains g standard deviations is known to
-    a share 1 / g of itself."""
-    sure = 1 - float(ndtri(CONFIDENCE)) / fitted.deviations if fitted.deviations else 0.0
-    return max(sure, 0.0) * moved_deg(fitted.hypothesis, camera)
-
-
-def without_change(fitted: LensFit, T: Transform, score: PointScore) -> LensFit:
-    """The camera as it is given instead, with its optimum T (4, 4) of a score."""
-    return Candidate(score, T, LensChange(), score.at(-1).value(T), tried=fitted.tried)
-
-
-def lenses(camera: Camera, wide: bool) -> Iterator[LensChange]:
-    """Changes of a camera that are tried. wide: those of quite another camera as well."""
+def lenses(camera: Camera) -> Iterator[LensChange]:
+    """Changes of a camera that are tried where nothing matches."""
     yield from (LensChange(focal=x) for x in FOCAL)
     yield from (LensChange(u=x) for x in CENTRE)
     yield from (LensChange(v=x) for x in CENTRE)
     yield from (LensChange(barrel=x) for x in BARREL)
-    if wide:
-        yield from (LensChange(focal=x) for x in FAR_FOCAL)
-        yield from (scaled(camera, x) for x in SIZES)
+    yield from (LensChange(focal=x) for x in FAR_FOCAL)
+    yield from (scaled(camera, x) for x in SIZES)
 
 
 def scaled(camera: Camera, scale: float) -> LensChange:
@@ -103,24 +88,13 @@ def judged(score: PointScore) -> bool:
     return shows_noise(score) and not score.camera.is_sphere
 
 
-def fit_lens(
-    score: PointScore, T: Transform, wide: bool = False, progress: Progress = SILENT, T_checked: Transform | None = None
-) -> LensFit:
-    """The change of the camera that matches best around T (4, 4), the extrinsic refined for each.
-
-    Without any gain it is `LensChange()`. wide: cameras that are quite different are tried as well, for where nothing matches at
-    all. progress: of the changes that are always tried. T_checked: (4, 4) whose rotation another principal point may explain,
-    however far beside it lies.
-    """
-    tried = [(lens, T) for lens in lenses(score.camera, wide)]
-    if T_checked is not None:
-        centre, start = _as_checked(score.camera, T_checked, T)
-        steps = np.rint(np.array([centre.u, centre.v]) / STEPS[-1]) * STEPS[-1] + 0.0  # no -0.0
-        tried.append((LensChange(u=float(steps[0]), v=float(steps[1])), start))
+def fit_lens(score: PointScore, T: Transform, progress: Progress = SILENT) -> LensFit:
+    """The change of the camera, to one that may be quite another, that matches best around T (4, 4), the extrinsic refined for
+    each. Without any gain it is `LensChange()`. progress: of the changes that are always tried."""
+    tried = list(lenses(score.camera))
     fitting = _Fitting(score, T, progress, len(tried))
-    ends = (fitting.end(lens, start, LEVELS) for lens, start in tried)  # one after the other: each may hold maps of its own
-    if wide:
-        ends = (fitting.descend(end, STEPS[0]) for end in nlargest(BEST, ends, key=lambda end: end.value))
+    ends = (fitting.end(lens, T, LEVELS) for lens in tried)  # one after the other: each may hold maps of its own
+    ends = (fitting.descend(end, STEPS[0]) for end in nlargest(BEST, ends, key=lambda end: end.value))
     best = max(chain([fitting.given], ends), key=PENALISED_GAIN)
     if best.significant:
         for step in STEPS:
@@ -146,19 +120,6 @@ def centre_of(camera: Camera, T_checked: Transform, T_found: Transform) -> LensC
     across = np.array([turn[1], -turn[0]])
     u, v = camera.focal * (across if camera.model not in PERSPECTIVE else np.tan(across))
     return LensChange(u=float(u) / camera.width, v=float(v) / camera.width)
-
-
-def moved_deg(lens: LensChange, camera: Camera) -> float:
-    """How far a change of the camera moves a point at most, deg, in the middle of the image, at its borders or in its corners."""
-    size = np.array([camera.width - 1.0, camera.height - 1.0])
-    px = np.array([[*(share * size), 1.0] for share in product((0.0, 0.5, 1.0), repeat=2)]).T
-    before = np.linalg.inv(camera.K) @ px
-    radius = np.sum(before[:2] ** 2, axis=0)
-    after = before.copy()
-    after[:2] *= (1 + lens.focal) * (1 - lens.barrel * radius / radius.max())
-    after[:2] += camera.width * np.array([[lens.u], [lens.v]]) / np.diag(camera.K)[:2, None]
-    cosine = np.sum(before * after, axis=0) / np.linalg.norm(before, axis=0) / np.linalg.norm(after, axis=0)
-    return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)).max()))
 
 
 def _as_checked(camera: Camera, T_checked: Transform, T_found: Transform) -> tuple[LensChange, Matrix]:

@@ -124,9 +124,11 @@ class Acceptance:
         limited = tolerance[0] < NO_LIMIT_DEG or tolerance[1] < NO_LIMIT_M
         if wrong is not None or not limited or evidence.p_value > refine.max_p_value:
             return wrong
-        wrong = None if found.lens is None else found.lens.refusal(self.camera, *tolerance)
-        if wrong is not None or not self.searched:
-            return wrong
+        fault = None if found.lens is None else found.lens.fault(*tolerance)
+        if fault is not None:
+            return fault.refusal(self.camera, *tolerance)
+        if not self.searched:
+            return None
         moving = with_known_motion(optimised.features, objective.edges.score)
         # An offset that was found may be the best of those that were looked at only.
         if moving is not None and (optimised.seconds != 0 or not estimates_offset(optimised.features, self.config)):

@@ -114,9 +114,11 @@ def objectives_disagree(rotation_deg: float, translation_m: float) -> Refusal:
     return _refusal(RefusalCode.OBJECTIVES_DISAGREE, text, rotation_deg=rotation_deg, translation_m=translation_m)
 
 
-def wrong_intrinsics(main: str, values: Mapping[str, float], width: int, stated: float, deviations: float) -> Refusal:
+def wrong_intrinsics(
+    main: str, values: Mapping[str, float], width: int, distorts: bool, removed: bool, deviations: float
+) -> Refusal:
     """Another lens matches better. main: which of the values, by their names, matters most: shares of the focal length, the
-    aspect, the image width and the corner's radius. stated: what the distortion that is given moves the corner by, likewise.
+    aspect, the image width and the corner's radius. distorts, removed: a distortion is stated, and hardly any is seen.
     deviations: how far `main` is off, in standard deviations of the scenes and of what is known in advance together."""
     value, px, cure = values[main], width * values[main], "check K and D in camera_info, the image size they are for, and "
     cure += "image_is_rectified (--rectified)"
@@ -128,11 +130,11 @@ def wrong_intrinsics(main: str, values: Mapping[str, float], width: int, stated:
         what = f"with the principal point about {abs(px):.3g} px further to the {'right' if value > 0 else 'left'}"
     elif main == CENTRE[1]:
         what = f"with the principal point about {abs(px):.3g} px further {'down' if value > 0 else 'up'}"
-    elif abs(stated + value) < 0.5 * abs(stated):
+    elif removed:
         what = "without the lens distortion of camera_info, as if the images were rectified already"
         cure = "set image_is_rectified (--rectified), or check D"
     else:
-        missing = "that camera_info does not state" if not stated else "other than camera_info states"
+        missing = "other than camera_info states" if distorts else "that camera_info does not state"
         what = f"with a lens distortion {missing}, which moves the corners of the image by {value:+.1%} of their radius"
     text = f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); {cure}"
     units = {FOCAL: ("focal", 1), ASPECT: ("aspect", 1), CENTRE[0]: ("u", width), CENTRE[1]: ("v", width), RADIAL: ("radial", 1)}

@@ -15,6 +15,7 @@ from itertools import product
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from calib_ros import se3
@@ -55,12 +56,14 @@ OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes th
 @dataclass(frozen=True, eq=False)
 class LensUnknown:
     """A change of a camera. name: of `calib_ros.intrinsics`. unit: by which values are multiplied for files. usual: standard
-    deviation in advance. field: (h, w, 2) shift of the ray at every node of the working image, per unit of the value."""
+    deviation in advance. field: (h, w, 2) shift of the ray at every node of the working image, per unit of the value. bend: (k,
+    3) how far some of the rays turn, rad, but for a common turn."""
 
     name: str
     unit: float
     usual: float
     field: NDArray[np.float32]
+    bend: Matrix
 
 
 def lens_unknowns(config: CameraConfig, source: Camera, working: Camera) -> tuple[LensUnknown, ...]:
@@ -72,18 +75,15 @@ def lens_unknowns(config: CameraConfig, source: Camera, working: Camera) -> tupl
     K = working.K
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
     shift, width = _shifts(source, rays), float(source.width)
-    out = [
-        LensUnknown(FOCAL, 1.0, config.focal_sigma, _grid(shift(FOCAL, DIFFERENCE))),
-        LensUnknown(ASPECT, 1.0, ASPECT_USUAL, _grid(shift(ASPECT, DIFFERENCE))),
-        *(LensUnknown(name, width, config.centre_sigma, _grid(shift(name, 1.0) * width)) for name in CENTRE),
-    ]
+    out = [(FOCAL, 1.0, config.focal_sigma, shift(FOCAL, DIFFERENCE)), (ASPECT, 1.0, ASPECT_USUAL, shift(ASPECT, DIFFERENCE))]
+    out += [(name, width, config.centre_sigma, shift(name, 1.0) * width) for name in CENTRE]
     if source.model in COEFFICIENTS:  # of the other models the first coefficient is no share of the radius
         radial = shift(RADIAL, DIFFERENCE)
         radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
         corner = int(radius.argmax())
         share = float(np.linalg.norm(radial[corner])) / radius[corner]  # by which a k1 of 1 moves the corner
-        out.append(LensUnknown(RADIAL, 1 / share, RADIAL_USUAL, _grid(radial / share)))
-    return tuple(out)
+        out.append((RADIAL, 1 / share, RADIAL_USUAL, radial / share))
+    return tuple(LensUnknown(name, unit, usual, _grid(moved), _bend(rays, moved)) for name, unit, usual, moved in out)
 
 
 def _shifts(camera: Camera, rays: Matrix) -> Callable[[str, float], Matrix]:
@@ -104,6 +104,17 @@ def _shifts(camera: Camera, rays: Matrix) -> Callable[[str, float], Matrix]:
         return out
 
     return shift
+
+
+def _bend(rays: Matrix, shift: Matrix) -> Matrix:
+    """How far every 16th of the nodes across and down is turned, (k, 3) rad, but for the turn that all have in common."""
+    some = np.arange(NODES[0] * NODES[1]).reshape(NODES[1], NODES[0])[::16, ::16].ravel()
+    r, d = np.c_[rays[some], np.ones(len(some))], np.c_[shift[some], np.zeros(len(some))]
+    length = np.linalg.norm(r, axis=1, keepdims=True)
+    u = r / length
+    turned = (d - u * np.sum(u * d, axis=1, keepdims=True)) / length
+    common = np.concatenate([np.cross(axis, u)[..., None] for axis in np.eye(3)], axis=2).reshape(-1, 3)
+    return np.asarray(turned - (common @ np.linalg.lstsq(common, turned.ravel(), rcond=None)[0]).reshape(-1, 3))
 
 
 def _grid(shift: Matrix) -> NDArray[np.float32]:
@@ -128,8 +139,8 @@ class LensEstimate:
 
     change: (n,) where they match best, with T (4, 4), the extrinsic there; information: (n, n) of it, noise counted, the
     extrinsic free. directions: (6, n) twist of the extrinsic, rad and m, per unit of each. T_given: (4, 4), the optimum by the
-    lens as it is. freedom: degrees of freedom of the noise. centre: (n,) change that is expected: back to the stated camera,
-    where this one corrects it.
+    lens as it is. gain: log-likelihood over that. freedom: degrees of freedom of the noise. centre: (n,) change that is expected:
+    back to the stated camera, where this one corrects it.
     """
 
     unknowns: tuple[LensUnknown, ...]
@@ -140,6 +151,7 @@ class LensEstimate:
     T_given: Transform
     freedom: float
     centre: Matrix
+    gain: float
 
     @cached_property
     def usual(self) -> Matrix:
@@ -217,26 +229,37 @@ class LensEstimate:
             for own, value, sigma in zip(self.unknowns, self.change, self.sigma, strict=True)
         }
 
-    def refusal(self, camera: Camera, deg: float, m: float) -> Refusal | None:
-        """Why an extrinsic is not to be used: by another lens it is more than deg or m elsewhere; None where it may be right.
+    def fault(self, deg: float, m: float, doubt: float = 0.5) -> LensFault | None:
+        """What is wrong such that it matters, with a probability of 1 - doubt, or of OPEN_PROBABILITY if it is plainly so: points
+        are seen more than deg elsewhere, or the extrinsic is more than deg or m elsewhere; None where all may be right.
 
         A turn across the view does not count: it looks like another principal point, and who projects with the camera as it is
         stated never sees it.
         """
         moves = self.moves[2:] / np.array([[np.deg2rad(deg)], [m], [m], [m]])
+        bends = np.stack([own.bend for own in self.unknowns], axis=-1) / np.deg2rad(deg)
         best, off = self.explanations[0], [self._off(own, moves) if own.wrong.any() else 0.0 for own in self.explanations]
-        surely = farther(moves @ best.mean, moves @ best.covariance @ moves.T, self.freedom) > np.log(1 / OPEN_PROBABILITY - 1)
+        farthest = bends[int(np.linalg.norm(bends @ best.mean, axis=1).argmax())]
+        ratios = [
+            _ratio(_beyond(part @ best.mean, part @ best.covariance @ part.T), self.freedom)
+            for part in (farthest, moves[:1], moves[1:])
+        ]
+        surely = max(ratios) > np.log(1 / doubt - 1)
         if not surely and sum(off) <= OPEN_PROBABILITY:
             return None
-        explanation = best if surely else self.explanations[int(np.argmax(off))]
-        k = int(np.linalg.norm(moves * explanation.mean, axis=0).argmax())  # what moves the extrinsic farthest
-        name, unit = self.unknowns[k].name, self.unknowns[k].unit
-        if not surely and sum(off) < 1 - OPEN_PROBABILITY:
-            return left_open(name, unit * self.change[k], unit * self.sigma[k], sum(off), deg, m)
-        values = dict(zip([own.name for own in self.unknowns], explanation.mean, strict=True))
-        deviations = float(abs(self.change[k] - self.centre[k]) / np.hypot(self.sigma[k], self.usual[k]))
-        stated = camera.D[0] / unit if name == RADIAL and len(camera.D) else 0.0
-        return wrong_intrinsics(name, values, camera.width, stated, deviations)
+        explanation, part = best, (farthest, moves[:1], moves[1:])[int(np.argmax(ratios))]
+        if not surely:
+            explanation, part = self.explanations[int(np.argmax(off))], moves
+        k = int(np.linalg.norm(part * explanation.mean, axis=0).argmax())  # what moves most
+        return LensFault(self, k, explanation.mean, 1.0 if surely or sum(off) >= 1 - doubt else sum(off))
+
+    def seen(self, score: PointScore) -> tuple[PointScore, Transform]:
+        """A score as it is by the lens that is expected by now, and the extrinsic (4, 4) there."""
+        mean = self.posterior[0]
+        T = se3.exp(self.moves @ (mean - self.change)) @ self.T
+        P = _seeing(score, self.unknowns)(T, mean)[0].points
+        back = se3.inverse(T).astype(np.float32)
+        return score.with_points(back[:3, :3] @ P + back[:3, 3:]), T
 
     def _off(self, explanation: LensHypothesis, moves: Matrix) -> float:
         """Probability that it holds, and the extrinsic is off. moves: (4, n), see `refusal`, per unit of each change."""
@@ -251,22 +274,59 @@ def _draws(n: int) -> Matrix:
     return np.asarray(ndtri(0.5 + 0.5 * Sobol(n, 0).next(DRAWS)).T)
 
 
-def farther(mean: Matrix, covariance: Matrix, freedom: float) -> float:
-    """Log-likelihood ratio of an offset (4,) of this covariance against the nearest one within 1: of its first component, and of
-    the norm of the others. 0 for one within."""
-    distances = [0.0]
-    if abs(mean[0]) > 1:
-        distances.append((abs(mean[0]) - 1) ** 2 / covariance[0, 0])
-    v, C = mean[1:], covariance[1:, 1:]
-    if np.linalg.norm(v) > 1:
-        information = np.linalg.inv(C + 1e-12 * np.eye(3))
-        low, high = 0.0, 1e12
-        for _ in range(100):  # the multiplier at which the nearest one is on the ball
-            middle = np.sqrt(max(low, 1e-12) * high)
-            near = np.linalg.solve(information + middle * np.eye(3), information @ v)
-            low, high = (middle, high) if np.linalg.norm(near) > 1 else (low, middle)
-        distances.append(float((v - near) @ information @ (v - near)))
-    return 0.5 * (freedom + 1) * float(np.log1p(max(distances) / freedom))
+def _beyond(mean: Matrix, covariance: Matrix) -> float:
+    """Squared distance of an offset (k,) of this covariance from the nearest one within 1, in standard deviations: 0 within."""
+    if np.linalg.norm(mean) <= 1:
+        return 0.0
+    information, near = np.linalg.inv(covariance + 1e-9 * np.eye(len(mean))), mean
+    low, high = 0.0, 1e12
+    for _ in range(100):  # the multiplier at which the nearest one is on the ball
+        middle = np.sqrt(max(low, 1e-12) * high)
+        near = np.linalg.solve(information + middle * np.eye(len(mean)), information @ mean)
+        low, high = (middle, high) if np.linalg.norm(near) > 1 else (low, middle)
+    return float((mean - near) @ information @ (mean - near))
+
+
+def _ratio(distance: float, freedom: float) -> float:
+    """Log-likelihood ratio of a squared distance by Student's distribution."""
+    return 0.5 * (freedom + 1) * float(np.log1p(distance / freedom))
+
+
+@dataclass(frozen=True, eq=False)
+class LensFault:
+    """What is wrong of a lens. k: the unknown that matters most. change: (n,). probability: less than 1 where it is left open."""
+
+    estimate: LensEstimate
+    k: int
+    change: Matrix
+    probability: float
+
+    @property
+    def values(self) -> dict[str, float]:
+        """By name: shares of the focal length, the aspect, the image width and the corner's radius."""
+        return dict(zip([own.name for own in self.estimate.unknowns], map(float, self.change), strict=True))
+
+    @property
+    def deviations(self) -> float:
+        """How far the one that matters most is off, in standard deviations of the scenes and in advance together."""
+        e, k = self.estimate, self.k
+        return float(abs(e.change[k] - e.centre[k]) / np.hypot(e.sigma[k], e.usual[k]))
+
+    def refusal(self, camera: Camera, deg: float, m: float) -> Refusal:
+        """Why an extrinsic is not to be used. camera: as it is stated. deg, m: the tolerance."""
+        own, k = self.estimate.unknowns[self.k], self.k
+        if self.probability < 1:
+            value, sigma = own.unit * self.estimate.change[k], own.unit * self.estimate.sigma[k]
+            return left_open(own.name, value, sigma, self.probability, deg, m)
+        return wrong_intrinsics(
+            own.name, self.values, camera.width, len(camera.D) > 0, self.removes_distortion(camera), self.deviations
+        )
+
+    def removes_distortion(self, camera: Camera) -> bool:
+        """Whether the scenes show hardly any of the distortion that is stated."""
+        own, value = self.estimate.unknowns[self.k], self.change[self.k]
+        stated = camera.D[0] / own.unit if own.name == RADIAL and len(camera.D) else 0.0
+        return bool(abs(stated + value) < 0.5 * abs(stated))
 
 
 def estimate_lens(
@@ -276,27 +336,34 @@ def estimate_lens(
     unknowns: Sequence[LensUnknown],
     inflated: float = 1.0,
     centre: Matrix | None = None,
+    turned: Transform | None = None,
 ) -> LensEstimate | None:
     """The joint optimum near T (4, 4), that of a score by the lens as it is; None where nothing is unknown.
 
     limits: axes that are fixed stay so. inflated: factor of the noise, by the disagreement of halves at T. centre: (n,), see
-    `LensEstimate`.
+    `LensEstimate`. turned: (4, 4) whose rotation another principal point may explain, however far beside it lies.
     """
     if not unknowns or not limits.open_axes.any():
         return None
     n, half = len(unknowns), np.where(limits.open_axes, np.inf, 0.0)
     part, free = score.subset(POINTS, np.random.default_rng(0)), Limits(T, half)
     see, as_it_is = _seeing(part, unknowns), np.zeros(n)
-    T_given = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))[0]
-    starts = (T, LEVELS), (T_given, NEAR_LEVELS)
-    ends = [ascend_jointly(see, start, as_it_is, levels, free)[:3] for start, levels in starts]
-    T, change, _ = max(ends, key=lambda end: end[2])
+    T_given, _, lower, _ = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))
+    starts = [(T, as_it_is, LEVELS), (T_given, as_it_is, NEAR_LEVELS)]
+    if turned is not None:
+        across = Rotation.from_matrix(T[:3, :3] @ turned[:3, :3].T).as_rotvec()[:2] * score.camera.K[0, 0] / score.camera.width
+        looks = {CENTRE[0]: across[1], CENTRE[1]: -across[0]}
+        change = np.array([looks.get(own.name, 0.0) for own in unknowns])
+        starts.append((se3.from_parts(turned[:3, :3], T[:3, 3]), change, LEVELS))
+    ends = [ascend_jointly(see, *start, free)[:3] for start in starts]
+    T, change, higher = max(ends, key=lambda end: end[2])
     there, own = see(T, change)[0], Limits(np.eye(4), half)
     # Halves may disagree because of the wrong lens.
     noise = noise_of(there, np.eye(4), own) * min(inflated, inflation(disagreement(there, np.eye(4), own)))
     bending = _bending(see, T, change, np.flatnonzero(limits.open_axes), unknowns, part, noise)
     freedom = max(REGIONS * effective_frames(score) - 6 - n, 1.0)
-    return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, as_it_is if centre is None else centre)
+    centre, gain = as_it_is if centre is None else centre, max(higher - lower, 0.0) / noise
+    return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, centre, gain)
 
 
 def _seeing(score: PointScore, unknowns: Sequence[LensUnknown]) -> Callable[[Transform, Matrix], JointView]:

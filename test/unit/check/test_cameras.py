@@ -15,11 +15,11 @@ from calib_ros.config import Config, MotionConfig, SearchConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.result import CONVERGED, Result
 from calib_ros_check.cameras import camera_guesses, turned_over
-from calib_ros_check.causes import KNOW_CLOCKS, clock_finding, lens_findings
+from calib_ros_check.causes import KNOW_CLOCKS, changed_findings, clock_finding
 from calib_ros_check.checker import Checker
 from calib_ros_check.evidence import Candidate
 from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
-from calib_ros_check.sensors import LensChange, moved_deg, moves_by
+from calib_ros_check.sensors import LensChange
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 QUICK = Config(search=SearchConfig(rounds=1, starts=64))
@@ -55,17 +55,6 @@ def test_the_more_cameras_are_tried_the_more_one_has_to_gain(gain, tried, found)
     assert fitted(LensChange(u=0.02), gain, tried).significant is found
 
 
-def test_a_camera_moves_points_by_what_it_turns_them():
-    camera = Camera(np.array([[500.0, 0, 319.5], [0, 500.0, 119.5], [0, 0, 1]]), 640, 240)
-    assert moved_deg(LensChange(u=10 / 640), camera) == pytest.approx(np.rad2deg(10 / 500), rel=0.01)
-    corner = np.hypot(319.5, 119.5) / 500
-    for lens, there in ((LensChange(focal=0.1), 1.1 * corner), (LensChange(barrel=0.1), 0.9 * corner)):
-        assert moved_deg(lens, camera) == pytest.approx(abs(np.rad2deg(np.arctan(there) - np.arctan(corner))))
-    fit = fitted(LensChange(u=10 / 640), 5.0)
-    assert 0.7 * moved_deg(fit.hypothesis, camera) < moves_by(fit, camera) < 0.8 * moved_deg(fit.hypothesis, camera)
-    assert moves_by(fitted(LensChange(), 0.0), camera) == 0.0
-
-
 @pytest.mark.parametrize(
     ("model", "D"),
     [
@@ -96,7 +85,7 @@ def test_raw_images_that_are_taken_for_rectified_are_to_be_taken_as_raw():
     bent = replace(fitted(LensChange(barrel=0.1), 9.0), parts={"barrel": 40.0})
     for said, cure in ((True, "--no-rectified, or image_is_rectified: false to the node"), (False, "take the rectified topic")):
         own = replace(camera, said_rectified=said)
-        found = [lens_findings(bent, "", own)[0], *(guess.finding for guess in camera_guesses(own))]
+        found = [changed_findings(bent, own)[0], *(guess.finding for guess in camera_guesses(own))]
         assert [(finding.cause, cure in finding.message) for finding in found] == [(Cause.NOT_RECTIFIED, True)] * 2
 
 

@@ -111,25 +111,26 @@ def shown(name: str, value: float, sigma: float, shift_m: float) -> LensEstimate
     unknowns = [own for own in lens_unknowns(CameraConfig(), LENSES[0], LENSES[0]) if own.name == name]
     forward = np.array([[0, 0, 0, 0, 0, shift_m / value]]).T
     T, x, information = se3.exp(forward[:, 0] * value), np.array([value]), np.array([[sigma**-2.0]])
-    return LensEstimate(tuple(unknowns), x, T, information, forward, np.eye(4), 100.0, np.zeros(1))
+    return LensEstimate(tuple(unknowns), x, T, information, forward, np.eye(4), 100.0, np.zeros(1), 10.0)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "sigma", "shift_m", "refusal"),
     [
         (FOCAL, 0.03, 0.002, 0.3, RefusalCode.WRONG_INTRINSICS),
-        (FOCAL, 0.01, 0.002, 0.12, None),  # within what calibrations differ by
+        (FOCAL, 0.01, 0.002, 0.1, None),  # within what calibrations differ by
         (FOCAL, 0.01, 0.001, 0.2, RefusalCode.WRONG_INTRINSICS),  # these too: the scenes are sure that it matters
         (FOCAL, 0.03, 0.02, 0.3, None),  # the scenes hardly tell
-        (FOCAL, 0.03, 0.002, 0.05, None),  # it does not matter
+        (FOCAL, 0.008, 0.001, 0.05, None),  # it does not matter
+        (FOCAL, 0.03, 0.002, 0.05, RefusalCode.WRONG_INTRINSICS),  # points at the border are seen 0.7 deg elsewhere
         (FOCAL, 0.03, 0.008, 0.3, RefusalCode.TOO_UNCERTAIN),  # it may be plainly wrong
         (ASPECT, 0.03, 0.005, 0.3, RefusalCode.WRONG_INTRINSICS),
         (RADIAL, -0.05, 0.005, 0.3, RefusalCode.WRONG_INTRINSICS),
     ],
 )
 def test_what_is_refused_is_significant_and_matters(name, value, sigma, shift_m, refusal):
-    found = shown(name, value, sigma, shift_m).refusal(LENSES[0], 0.5, 0.1)
-    assert (found and found.code) == refusal
+    fault = shown(name, value, sigma, shift_m).fault(0.5, 0.1)
+    assert (fault and fault.refusal(LENSES[0], 0.5, 0.1).code) == refusal
 
 
 def test_they_are_checked_where_it_is_wanted(scene):

@@ -12,11 +12,16 @@ from calib_ros.registration.acceptance.refusal import left_open, low_score, wron
 
 LENS = {FOCAL: 0.0, ASPECT: 0.0, CENTRE[0]: 0.0, CENTRE[1]: 0.0, RADIAL: 0.0}
 LENSES = [
-    (CENTRE[0], 0.00042, 0.0, "about 0.42 px further to the right"),
-    (ASPECT, -0.03, 0.0, "with fy about 3.0% shorter against fx"),
-    (RADIAL, 0.1, -0.1, "as if the images were rectified already (3.6 standard deviations); set image_is_rectified"),
-    (RADIAL, -0.05, 0.0, "a lens distortion that camera_info does not state, which moves the corners of the image by -5.0%"),
-    (RADIAL, -0.05, -0.1, "a lens distortion other than camera_info states"),
+    (CENTRE[0], 0.00042, (False, False), "about 0.42 px further to the right"),
+    (ASPECT, -0.03, (False, False), "with fy about 3.0% shorter against fx"),
+    (RADIAL, 0.1, (True, True), "as if the images were rectified already (3.6 standard deviations); set image_is_rectified"),
+    (
+        RADIAL,
+        -0.05,
+        (False, False),
+        "that camera_info does not state, which moves the corners of the image by -5.0%",
+    ),
+    (RADIAL, -0.05, (True, False), "a lens distortion other than camera_info states"),
 ]
 
 
@@ -26,7 +31,7 @@ LENSES = [
         (wrong_times(-0.6, 0.0), "the clocks set 600 ms apart, which the scenes do not confirm: images"),
         (low_score(math.nan), "the image shows nothing where the LiDAR sees edges; check"),
         (left_open("time_offset_s", 0.0, math.inf, 0.13, 0.25, 0.05), "the scenes do not show time_offset_s, and leave open"),
-        *((wrong_intrinsics(main, LENS | {main: value}, 1000, stated, 3.6), text) for main, value, stated, text in LENSES),
+        *((wrong_intrinsics(main, LENS | {main: value}, 1000, *given, 3.6), text) for main, value, given, text in LENSES),
         (defect(AssertionError()), "unexpected AssertionError; please report it"),
     ],
 )
