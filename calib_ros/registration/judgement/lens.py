@@ -38,7 +38,7 @@ from calib_ros.registration.covariance import LEAST_CURVATURE, NO_NOISE, REGIONS
 from calib_ros.registration.nuisance.parameters import GROSSLY, NEAR_LEVELS, OPEN_PROBABILITY, POINTS, REACH, noise_of
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.constraints import Limits, PoseConstraints
+from calib_ros.registration.search.constraints import Limits, PoseConstraints, unlimited
 from calib_ros.registration.search.optimizers import JointView, ascend_jointly, linearised
 from calib_ros.registration.starts import Sobol
 
@@ -49,6 +49,7 @@ AT_ONCE = 30000  # points that OpenCV samples at once
 # Standard deviations in advance of aspect and radial distortion, the latter as a displacement of the corner, a share of its
 # radius: pixels are square to 0.2 %, and calibrations of one lens differ by 1 to 3 px. And of values that are plainly wrong.
 ASPECT_USUAL, RADIAL_USUAL, GROSS = 0.002, 0.004, 0.03
+ACCUSING = float(ndtri(0.995))  # standard deviations of what is accused: a right one shows as much in 1 % of cases
 DRAWS = 512  # from an explanation: tell a probability to 1 %
 OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes then tell as much
 
@@ -140,7 +141,7 @@ class LensEstimate:
     change: (n,) where they match best, with T (4, 4), the extrinsic there; information: (n, n) of it, noise counted, the
     extrinsic free. directions: (6, n) twist of the extrinsic, rad and m, per unit of each. T_given: (4, 4), the optimum by the
     lens as it is. gain: log-likelihood over that. freedom: degrees of freedom of the noise. centre: (n,) change that is expected:
-    back to the stated camera, where this one corrects it.
+    back to the stated camera, where this one corrects it. open_axes: (6,) of the extrinsic, which a lens may move.
     """
 
     unknowns: tuple[LensUnknown, ...]
@@ -152,6 +153,7 @@ class LensEstimate:
     freedom: float
     centre: Matrix
     gain: float
+    open_axes: NDArray[np.bool_]
 
     @cached_property
     def usual(self) -> Matrix:
@@ -195,7 +197,8 @@ class LensEstimate:
         a step, the score bends otherwise (the secant of Broyden 1965)."""
         missing = se3.log(self.T @ se3.inverse(self.T_given)) - self.directions @ self.change
         weighed = self.information @ self.change
-        return self.directions + np.outer(missing, weighed) / (float(self.change @ weighed) + 1)
+        moves = self.directions + np.outer(missing, weighed) / (float(self.change @ weighed) + 1)
+        return np.where(self.open_axes[:, None], moves, 0.0)
 
     def added_covariance(self, constraints: PoseConstraints, covariance: Covariance, kept: Sequence[int] = ()) -> Covariance:
         """Second moment (6, 6) of the extrinsic about the optimum by the lens as it is, whose own covariance is `covariance`, if
@@ -244,14 +247,16 @@ class LensEstimate:
             _ratio(_beyond(part @ best.mean, part @ best.covariance @ part.T), self.freedom)
             for part in (farthest, moves[:1], moves[1:])
         ]
-        surely = max(ratios) > np.log(1 / doubt - 1)
-        if not surely and sum(off) <= OPEN_PROBABILITY:
+        part = (farthest, moves[:1], moves[1:])[int(np.argmax(ratios))]
+        fault = LensFault(self, _main(part, best), best.mean, 1.0)
+        # What is not shown, and only expected to be as it may be usually, accuses nothing.
+        shown = abs(self.change[fault.k]) > ACCUSING * self.sigma[fault.k]
+        if shown and max(ratios) > np.log(1 / doubt - 1):
+            return fault
+        if sum(off) <= OPEN_PROBABILITY:
             return None
-        explanation, part = best, (farthest, moves[:1], moves[1:])[int(np.argmax(ratios))]
-        if not surely:
-            explanation, part = self.explanations[int(np.argmax(off))], moves
-        k = int(np.linalg.norm(part * explanation.mean, axis=0).argmax())  # what moves most
-        return LensFault(self, k, explanation.mean, 1.0 if surely or sum(off) >= 1 - doubt else sum(off))
+        most = self.explanations[int(np.argmax(off))]
+        return LensFault(self, _main(moves, most), most.mean, 1.0 if sum(off) >= 1 - doubt else sum(off))
 
     def seen(self, score: PointScore) -> tuple[PointScore, Transform]:
         """A score as it is by the lens that is expected by now, and the extrinsic (4, 4) there."""
@@ -266,6 +271,11 @@ class LensEstimate:
         draws = np.linalg.cholesky(explanation.covariance) @ _draws(len(self.unknowns))
         ends = moves @ (explanation.mean[:, None] + draws)
         return explanation.probability * float(((np.abs(ends[0]) > 1) | (np.linalg.norm(ends[1:], axis=0) > 1)).mean())
+
+
+def _main(part: Matrix, explanation: LensHypothesis) -> int:
+    """Which unknown moves most. part: (k, n) what each moves."""
+    return int(np.linalg.norm(part * explanation.mean, axis=0).argmax())
 
 
 @cache
@@ -340,13 +350,13 @@ def estimate_lens(
 ) -> LensEstimate | None:
     """The joint optimum near T (4, 4), that of a score by the lens as it is; None where nothing is unknown.
 
-    limits: axes that are fixed stay so. inflated: factor of the noise, by the disagreement of halves at T. centre: (n,), see
-    `LensEstimate`. turned: (4, 4) whose rotation another principal point may explain, however far beside it lies.
+    limits: axes that are fixed are free here, for what is fixed wrongly is no lens, but no lens moves them. inflated: factor of
+    the noise, by the disagreement of halves at T. centre: (n,), see `LensEstimate`. turned: (4, 4) whose rotation
+    another principal point may explain, however far beside it lies.
     """
     if not unknowns or not limits.open_axes.any():
         return None
-    n, half = len(unknowns), np.where(limits.open_axes, np.inf, 0.0)
-    part, free = score.subset(POINTS, np.random.default_rng(0)), Limits(T, half)
+    n, part, free = len(unknowns), score.subset(POINTS, np.random.default_rng(0)), unlimited(T)
     see, as_it_is = _seeing(part, unknowns), np.zeros(n)
     T_given, _, lower, _ = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))
     starts = [(T, as_it_is, LEVELS), (T_given, as_it_is, NEAR_LEVELS)]
@@ -357,13 +367,13 @@ def estimate_lens(
         starts.append((se3.from_parts(turned[:3, :3], T[:3, 3]), change, LEVELS))
     ends = [ascend_jointly(see, *start, free)[:3] for start in starts]
     T, change, higher = max(ends, key=lambda end: end[2])
-    there, own = see(T, change)[0], Limits(np.eye(4), half)
+    there, own = see(T, change)[0], unlimited(np.eye(4))
     # Halves may disagree because of the wrong lens.
     noise = noise_of(there, np.eye(4), own) * min(inflated, inflation(disagreement(there, np.eye(4), own)))
-    bending = _bending(see, T, change, np.flatnonzero(limits.open_axes), unknowns, part, noise)
+    bending = _bending(see, T, change, unknowns, part, noise)
     freedom = max(REGIONS * effective_frames(score) - 6 - n, 1.0)
     centre, gain = as_it_is if centre is None else centre, max(higher - lower, 0.0) / noise
-    return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, centre, gain)
+    return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, centre, gain, limits.open_axes)
 
 
 def _seeing(score: PointScore, unknowns: Sequence[LensUnknown]) -> Callable[[Transform, Matrix], JointView]:
@@ -393,7 +403,6 @@ def _bending(
     see: Callable[[Transform, Matrix], JointView],
     T: Transform,
     change: Matrix,
-    axes: NDArray[np.intp],
     unknowns: Sequence[LensUnknown],
     score: PointScore,
     noise: float,
@@ -403,29 +412,26 @@ def _bending(
     n, K, level = len(unknowns), score.camera.K, score.n_levels - 1
     moved = [np.sqrt(np.mean((own.field * np.diag(K)[:2]) ** 2)) for own in unknowns]
     steps = np.r_[STEP, STEP[0] * K[0, 0] / np.maximum(moved, 1e-9)]
-    used = np.r_[axes, 6 + np.arange(n)]
     H = np.zeros((6 + n, 6 + n))
-    for k in used:
+    for k in range(6 + n):
         off = np.zeros(6 + n)
         off[k] = steps[k]
         ahead, behind = (linearised(see(se3.exp(sign * off[:6]) @ T, change + sign * off[6:]), n, level)[0] for sign in (1, -1))
         H[k] = (behind - ahead) / (2 * steps[k])
-    H = 0.5 * (H + H.T)[np.ix_(used, used)]
+    H = 0.5 * (H + H.T)
     # It may be indefinite: its eigenvalues relative to the Gauss-Newton scale rise to LEAST_CURVATURE.
-    units = np.outer(steps[used], steps[used])
-    scale = linearised(see(T, change), n, level)[1][np.ix_(used, used)]
+    units = np.outer(steps, steps)
+    scale = linearised(see(T, change), n, level)[1]
     # What no point shows of the extrinsic lies within reach.
-    nothing = np.diag(noise * np.r_[REACH[axes], np.full(n, np.inf)] ** -2.0)
+    nothing = np.diag(noise * np.r_[REACH, np.full(n, np.inf)] ** -2.0)
     H, scale = H + nothing, scale + nothing
     values, vectors = np.linalg.eigh(scale * units)
     root = vectors / np.sqrt(np.maximum(values, NO_NOISE * values.max()))
     values, vectors = np.linalg.eigh(root.T @ (H * units) @ root)
     half = root @ vectors
     C = units * ((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)
-    k = len(axes)
-    lens = C[k:, k:]
-    directions = np.zeros((6, n))
-    directions[axes] = C[:k, k:] @ np.linalg.inv(lens)
+    lens = C[6:, 6:]
+    directions = C[:6, 6:] @ np.linalg.inv(lens)
     # What shifts the border of the image as far as the systematic error of a rotation does.
     px = SYSTEMATIC_ERROR[0] * K[0, 0]
     systematic = np.array([px / score.camera.width * (1.0 if own.name in CENTRE else 2.0) for own in unknowns])

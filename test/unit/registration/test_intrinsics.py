@@ -111,7 +111,7 @@ def shown(name: str, value: float, sigma: float, shift_m: float) -> LensEstimate
     unknowns = [own for own in lens_unknowns(CameraConfig(), LENSES[0], LENSES[0]) if own.name == name]
     forward = np.array([[0, 0, 0, 0, 0, shift_m / value]]).T
     T, x, information = se3.exp(forward[:, 0] * value), np.array([value]), np.array([[sigma**-2.0]])
-    return LensEstimate(tuple(unknowns), x, T, information, forward, np.eye(4), 100.0, np.zeros(1), 10.0)
+    return LensEstimate(tuple(unknowns), x, T, information, forward, np.eye(4), 100.0, np.zeros(1), 10.0, np.ones(6, bool))
 
 
 @pytest.mark.parametrize(
