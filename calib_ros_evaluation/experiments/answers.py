@@ -13,8 +13,8 @@ from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
-from calib_ros_evaluation.experiments.trial import averaging, cost, loss_curves, similarities, trial, trust
-from calib_ros_evaluation.protocols.definitions import PROTOCOLS
+from calib_ros_evaluation.experiments.trial import averaging, checked, cost, loss_curves, similarities, trial, trust
+from calib_ros_evaluation.protocols.definitions import MISCALIBRATION, PROTOCOLS
 from calib_ros_evaluation.results import (
     SCORES,
     TWIST_AXES,
@@ -32,6 +32,7 @@ Answers = Mapping[str, Answer]  # by the keys of their jobs
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
 KINDS: dict[str, Callable[[WorkerCache, EvaluationJob], Answer]] = {
     **dict.fromkeys((*TRIALS, *PROTOCOLS), trial),
+    MISCALIBRATION: checked,
     "curves": loss_curves,
     "averaging": averaging,
     "similarity": similarities,

@@ -27,6 +27,7 @@ from calib_ros.datasets.positions import frame_positions
 from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame
+from calib_ros_check.checker import Checker
 from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.registry import methods
 
@@ -113,6 +114,7 @@ class WorkerCache:
         self.source = lru_cache(maxsize=None)(self._opened)
         self.frame = lru_cache(FRAMES)(self._read)
         self.features = lru_cache(FEATURES)(self._made)
+        self.checker = lru_cache(maxsize=1)(lambda label: Checker(self.source(label).camera, self.config))
 
     def _opened(self, label: str) -> Source:
         """The source of a scene."""

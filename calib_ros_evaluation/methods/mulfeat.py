@@ -4,7 +4,7 @@ arXiv 2207.07228), as the thesis describes it: eq. 4.6, tables 4.2 and 4.3."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,9 +149,8 @@ class Mulfeat(Viewing):
     evaluations: int = 240
     margin: float = 0.3
     min_points: int = 200
-    config: Config = field(default_factory=Config)
-    name: str = "mulfeat"
-    title: str = "MulFEAT (Zhang et al. 2022): edges of depth, reflectivity and objects on a cylinder on image edges"
+    name = "mulfeat"
+    title = "MulFEAT (Zhang et al. 2022): edges of depth, reflectivity and objects on a cylinder on image edges"
 
     def features(self, frame: Frame) -> PointFeatures:
         """P(E^L) and E^C. TooFewFeaturesError for fewer than min_points points with P above 0."""

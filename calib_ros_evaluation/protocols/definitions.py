@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
-from calib_ros.errors import BadInputError
+from calib_ros_check.outcome import Tolerance
 
 Matrix = NDArray[np.float64]
 COUNTS = (1, 3, 5, 10)  # frames per trial, unless said otherwise
@@ -56,11 +58,15 @@ BORER = Protocol("borer", (Size(10, 0), Size(0.5, 0.5)), 0.5, 0.2)
 # UniCalib states mean errors and no limits of success; those of SINGLE_FRAME tell how many of our trials are meant.
 UNICALIB = Protocol("unicalib", (Size(5, 0.1), Size(10, 0.25)), 2.0, 0.05)
 MISCALIBRATION = "miscalibration"  # which checks extrinsics and calibrates nothing, see detection.py
+SHIFT, ROTATION = ("x_m", "y_m", "z_m"), ("rx_deg", "ry_deg", "rz_deg")  # columns of its published perturbations
+DOUBLED = 2.0  # the published code turns by twice the degrees of its table, and so do the published figures
+TOLERANCE = Tolerance(1.0, 0.05)  # what the set of right ones lies within: up to 1.0 deg and 3.5 cm
 PROTOCOLS = {one.name: one for one in (SINGLE_FRAME, BORER, UNICALIB)}
 NAMES = (SINGLE_FRAME.name, MISCALIBRATION, BORER.name, UNICALIB.name)
 
 
-def check_name(name: str) -> None:
-    """BadInputError for a protocol that there is not."""
-    if name not in NAMES:
-        raise BadInputError(f"there is no protocol '{name}'; choose among {', '.join(NAMES)}")
+def displacement(values: Mapping[str, Any]) -> Matrix:
+    """(4, 4) that the right extrinsic is multiplied with from the right, T_camera_lidar D: a rotation vector of DOUBLED the
+    printed degrees, and the shift."""
+    shift, turn = ([float(values[name]) for name in names] for names in (SHIFT, ROTATION))
+    return se3.from_parts(Rotation.from_rotvec(DOUBLED * np.deg2rad(turn)).as_matrix(), shift)

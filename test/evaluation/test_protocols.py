@@ -20,7 +20,16 @@ from calib_ros.errors import BadInputError
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.experiments.answers import read_answers, run_jobs, trial_of
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, SourceSummary
-from calib_ros_evaluation.protocols.definitions import BORER, NAMES, PROTOCOLS, SINGLE_FRAME, UNICALIB, Protocol, Size
+from calib_ros_evaluation.protocols.definitions import (
+    BORER,
+    NAMES,
+    PROTOCOLS,
+    SINGLE_FRAME,
+    UNICALIB,
+    Protocol,
+    Size,
+    displacement,
+)
 from calib_ros_evaluation.protocols.detection import (
     COLUMNS,
     INCONCLUSIVE,
@@ -29,7 +38,6 @@ from calib_ros_evaluation.protocols.detection import (
     Detection,
     accuracy_table,
     detection_jobs,
-    displacement,
     kind_of,
     read_perturbations,
     sets_table,
@@ -169,7 +177,7 @@ def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> No
     setup = Setup(SETUP.scenes, Config(search=SearchConfig(rounds=1, starts=64)))
     study = Detection(rows, (3,))
     jobs = study.jobs(setup, [summary(3)])
-    answers = {one.key: answer for one, answer in zip(jobs, study.work(setup, jobs), strict=True)}
+    answers = {one.key: answer for one, answer in zip(jobs, run_jobs(setup, jobs), strict=True)}
     report = study.report(setup, jobs, answers)
     found = report.table
     assert found.error_deg.tolist() == pytest.approx([0, 3.2], abs=1e-6)
