@@ -13,29 +13,18 @@ from calib_ros_evaluation.protocols.definitions import BORER, MISCALIBRATION, SI
 from calib_ros_evaluation.report.sections import Section
 from calib_ros_evaluation.report.table import Table
 
-TITLES = {
-    SINGLE_FRAME.name: "One harness for learned and classical systems (ProjFusion)",
-    MISCALIBRATION: "Miscalibration detection on KITTI odometry 00",
-    BORER.name: "Geometric mutual information (Borer et al.)",
-    UNICALIB.name: "Mean errors (UniCalib)",
-}
-INTRODUCTIONS = {
-    SINGLE_FRAME.name: "Starts are drawn as by the published code: an amplitude uniform in 0 to the size, once for the rotation "
-    "and once for the shift, then each axis uniform within it. Success: below 2 deg and 5 cm.",
-    MISCALIBRATION: "Published perturbations, rotations doubled as by the published code. Right is a pass of the set pos and a "
-    "fail of any other set, by the check with a tolerance of 1 deg and 5 cm.",
-    BORER.name: "Each axis of a start is uniform within the size. Success: below 0.5 deg and 20 cm.",
-    UNICALIB.name: "Each axis of a start is uniform within the size. The publication reports mean errors and no limits of "
-    "success; success below 2 deg and 5 cm is shown for our trials only.",
-}
 OURS = (
     "This project: the frames of each trial are drawn uniformly of all frames of the source, good or bad. Starts are left "
     "perturbations in the camera's frame, the region searched is the size of the start error. A refused trial counts as a "
     "failure; it hands back its start, whose error counts in the mean of all trials. Wrong: accepted, but beyond the limits. "
     "Constants were chosen on KITTI drive 0005, odometry 00 and synthetic drives.",
 )
-CAVEATS = {
+# Title, introduction, and what to know before comparing.
+TEXTS = {
     SINGLE_FRAME.name: (
+        "One harness for learned and classical systems (ProjFusion)",
+        "Starts are drawn as by the published code: an amplitude uniform in 0 to the size, once for the rotation and once for "
+        "the shift, then each axis uniform within it. Success: below 2 deg and 5 cm.",
         "Published: tables of ProjFusion, the code of NativeCross (Ou et al., RA-L 2026, arXiv:2603.29414), single "
         "frames; success is its L2. NativeCross was trained on KITTI odometry 00, 02-08, 10, 12, 21 or on nuScenes, for "
         "each size of start error anew, and tested on KITTI odometry 13-16, 18 or other nuScenes scenes: other drives of "
@@ -45,14 +34,22 @@ CAVEATS = {
         "error times the distance of the sensors, 5 mm for 1 deg on KITTI.",
     ),
     MISCALIBRATION: (
+        "Miscalibration detection on KITTI odometry 00",
+        "Published perturbations, rotations doubled as by the published code. Right is a pass of the set pos and a fail of any "
+        "other set, by the check with a tolerance of 1 deg and 5 cm.",
         "Published: the learned detector of TUM (MiscalibrationDetection) and two rivals as it reports them, of many more frames "
         "of the same sequence; it was trained on KITTI. It tells right from wrong without a tolerance, and always decides.",
     ),
     BORER.name: (
+        "Geometric mutual information (Borer et al.)",
+        "Each axis of a start is uniform within the size. Success: below 0.5 deg and 20 cm.",
         "Published: Borer et al., From Chaos to Calibration (arXiv:2311.01905), classical, 25 frames per trial. How the "
         "directions of its starts are drawn is not known to us.",
     ),
     UNICALIB.name: (
+        "Mean errors (UniCalib)",
+        "Each axis of a start is uniform within the size. The publication reports mean errors and no limits of success; success "
+        "below 2 deg and 5 cm is shown for our trials only.",
         "Published: UniCalib (WACV 2026), learned, trained per rig, on a GPU. How many frames a figure rests on, and how its "
         "starts are drawn, is not known to us.",
     ),
@@ -98,7 +95,7 @@ ACCURACIES = {"TUM detector": (99.1, 99.0, 99.97), "rival 1": (95.1, 86.3, 92.1)
 
 def protocol_report(name: str, tables: Sequence[Table], notes: Sequence[str], file: str, rows: pd.DataFrame) -> StudyReport:
     """The report of a protocol: one section, whose caveats and notes stand below its last table."""
-    tables = [*tables[:-1], replace(tables[-1], notes=(*CAVEATS[name], *notes))]
-    section = Section(name, TITLES[name], INTRODUCTIONS[name], tables=tables)
+    title, introduction, *caveats = TEXTS[name]
+    tables = [*tables[:-1], replace(tables[-1], notes=(*caveats, *notes))]
     said = [line for one in tables for line in (one.title, one.text(), "")]
-    return StudyReport(f"Published protocol: {section.heading}", [section], said, file, rows)
+    return StudyReport(f"Published protocol: {title}", [Section(name, title, introduction, tables=tables)], said, file, rows)

@@ -112,22 +112,11 @@ def called_right(trusts: Sequence[Trust], size: tuple[float, float] | None) -> f
     return float(np.mean(said))
 
 
-def in_order(results: Results, found: Iterable[str]) -> list[str]:
-    """Names of methods in the order of the titles; those without a title come last."""
-    known = dict.fromkeys(found)
-    return [*(name for name in results.titles if name in known), *(name for name in known if name not in results.titles)]
-
-
-def all_methods(results: Results) -> list[str]:
-    """Every method that has a title or a result."""
-    others = (item.method for part in (results.curves, results.costs) for item in part)
-    return in_order(results, [*results.titles, *results.trials.method, *others])
-
-
 def trials_of(results: Results, experiment: str) -> dict[str, pd.DataFrame]:
     """Method -> its trials of an experiment; methods without any are left out."""
     own = extended(results.trials[results.trials.experiment == experiment])
-    return {name: own[own.method == name] for name in in_order(results, own.method)}
+    found = {name: own[own.method == name] for name in results.titles}
+    return {name: trials for name, trials in found.items() if len(trials)}
 
 
 def extended(trials: pd.DataFrame) -> pd.DataFrame:
@@ -151,12 +140,12 @@ def groups(trials: dict[str, pd.DataFrame], key: str) -> tuple[list[Any], dict[s
 def curves_of_scenes(results: Results) -> dict[str, dict[str, Curves]]:
     """Label of a scene -> method -> curves."""
     found: dict[str, dict[str, Curves]] = {}
-    for result in results.curves:
-        found.setdefault(result.label, {})[result.method] = result.curves
-    return {label: {name: own[name] for name in in_order(results, own)} for label, own in found.items()}
+    for one in results.curves:
+        found.setdefault(one.label, {})[one.method] = one.curves
+    return found
 
 
 def curves_of_methods(results: Results) -> dict[str, list[Curves]]:
-    """Method -> curves of all its scenes."""
-    names = in_order(results, (one.method for one in results.curves))
-    return {name: [one.curves for one in results.curves if one.method == name] for name in names}
+    """Method -> curves of all its scenes; methods without any are left out."""
+    found = {name: [one.curves for one in results.curves if one.method == name] for name in results.titles}
+    return {name: curves for name, curves in found.items() if curves}

@@ -13,7 +13,6 @@ import pandas as pd
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.report.statistics import (
     Matrix,
-    all_methods,
     area,
     axis_errors,
     basins,
@@ -67,7 +66,7 @@ def summary(results: Results) -> Table:
     """One row per method: the experiment "single", and the peaks of the loss curves."""
     trials, curves = trials_of(results, "single"), curves_of_methods(results)
     rows: Rows = []
-    for name in all_methods(results):
+    for name in results.titles:
         own = trials.get(name, results.trials.iloc[:0].assign(cm=0.0))
         peaks = np.array([peak_distances(c) for c in curves.get(name, [])]).reshape(-1, 6)
         if len(own) or len(peaks):
