@@ -7,6 +7,7 @@ import contextlib
 import time
 import tracemalloc
 import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,9 +28,10 @@ from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.experiments.job import EvaluationJob
-from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache, spread
+from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, spread, worker_cache
 from calib_ros_evaluation.methods.edges import LevinsonScore, worse_share
-from calib_ros_evaluation.protocols.definitions import PROTOCOLS, TOLERANCE, Size, displacement
+from calib_ros_evaluation.protocols.definitions import MISCALIBRATION, PROTOCOLS, TOLERANCE, Size, displacement
+from calib_ros_evaluation.results import OF_TRIALS
 from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_thesis.features import importance
 
@@ -231,3 +233,27 @@ def similarities(cache: WorkerCache, job: EvaluationJob) -> Answer:
         "threshold": cache.config.online.similarity_threshold,
         "histograms": {job.frames[k]: found[k].reshape(len(found[k]), BINS, -1).sum(axis=2).tolist() for k in shown},
     }
+
+
+KINDS: dict[str, Callable[[WorkerCache, EvaluationJob], Answer]] = {
+    **dict.fromkeys((*OF_TRIALS, *PROTOCOLS), trial),
+    MISCALIBRATION: checked,
+    "curves": loss_curves,
+    "averaging": averaging,
+    "similarity": similarities,
+    "cost": cost,
+    "trust": trust,
+}
+
+
+def run_jobs(setup: Setup, jobs: Sequence[EvaluationJob]) -> list[Answer]:
+    """The answers, in order. A method that cannot use its frames gives {"error": reason}; all other errors are raised."""
+    cache, answers = worker_cache(setup), []
+    for job in jobs:
+        try:
+            answers.append(KINDS[job.experiment](cache, job))
+        except NOT_THE_METHODS:
+            raise
+        except CalibrationError as error:
+            answers.append({"error": str(error)})
+    return answers

@@ -12,15 +12,14 @@ import pandas as pd
 
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.evaluate import Study, StudyReport
-from calib_ros_evaluation.experiments.answers import Answers, read_answers, trial_of
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary
 from calib_ros_evaluation.methods.own import Own
 from calib_ros_evaluation.protocols.definitions import Protocol, Size
 from calib_ros_evaluation.protocols.published import OURS, PUBLISHED, protocol_report
-from calib_ros_evaluation.report.statistics import extended, median
 from calib_ros_evaluation.report.table import NONE, Rows, Table, degrees, interval, number, percent, plural
-from calib_ros_evaluation.results import TRIALS, trials_table
+from calib_ros_evaluation.report.tables import extended, median
+from calib_ros_evaluation.results import TRIALS, Answers, read_answers, trial_of, trials_table
 
 HEADER = (
     *("system", "data", "frames", "trials", "success", "95 %", "refused", "wrong"),

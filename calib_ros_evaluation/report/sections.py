@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from calib_ros_evaluation.report import plots, tables
 from calib_ros_evaluation.report.plots import Plot, Styles, method_styles
-from calib_ros_evaluation.report.statistics import axis_errors, curves_of_methods, curves_of_scenes, trials_of
 from calib_ros_evaluation.report.table import Table
+from calib_ros_evaluation.report.tables import axis_errors, curves_of_methods, curves_of_scenes, trials_of
 from calib_ros_evaluation.results import Results
 
 MOST_SCENES = 4  # drawn one by one; the tables and the mean have all

@@ -23,9 +23,8 @@ from calib_ros.io import write_atomically
 from calib_ros_check.page import page_template
 from calib_ros_evaluation.steps.cloud import Cloud, cloud_steps, object_steps
 from calib_ros_evaluation.steps.image import edge_steps, preparation_steps
-from calib_ros_evaluation.steps.maps import map_steps
+from calib_ros_evaluation.steps.maps import map_steps, score_steps
 from calib_ros_evaluation.steps.pictures import Matrix, RegisteredFrame, Step
-from calib_ros_evaluation.steps.score import score_steps
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
 from calib_ros_semantics.models.segmentation import SegmentationModels
 

@@ -18,8 +18,8 @@ from calib_ros.config import Config, SearchConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
 from calib_ros_check.outcome import CheckVerdict
-from calib_ros_evaluation.experiments.answers import read_answers, run_jobs, trial_of
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, SourceSummary
+from calib_ros_evaluation.experiments.trial import run_jobs
 from calib_ros_evaluation.protocols.definitions import (
     BORER,
     NAMES,
@@ -43,7 +43,7 @@ from calib_ros_evaluation.protocols.detection import (
     sets_table,
 )
 from calib_ros_evaluation.protocols.trials import Calibrations, drawn, size_table
-from calib_ros_evaluation.results import read_trials, trials_table
+from calib_ros_evaluation.results import read_answers, read_trials, trial_of, trials_table
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
