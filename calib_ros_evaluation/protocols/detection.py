@@ -16,8 +16,8 @@ from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.evaluate import Study, StudyReport
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache
-from calib_ros_evaluation.protocols.definitions import MISCALIBRATION, ROTATION, SHIFT
-from calib_ros_evaluation.protocols.published import ACCURACIES, protocol_report
+from calib_ros_evaluation.protocols.definitions import ACCURACIES, MISCALIBRATION, ROTATION, SHIFT
+from calib_ros_evaluation.protocols.trials import protocol_report
 from calib_ros_evaluation.report.table import NONE, Rows, Table, interval, percent, plural
 from calib_ros_evaluation.report.tables import median
 from calib_ros_evaluation.results import Answers, numbers, read_answers, read_table
