@@ -33,6 +33,7 @@ IDENTITY = ("experiment", "method", "scene", "frames", "start_deg", "start_m", "
 STATUSES = ("done", "refused", "failed")  # refused: by the method itself: it then ends where it started; failed: with an error
 TWIST_AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
 END, START = ([f"{name}_{axis}" for axis in TWIST_AXES] for name in ("end", "start"))  # twists log(T T_ref^-1)
+COSTS = ("features_ms_per_frame", "evaluation_ms", "memory_mb")
 SCORES = ("score_start", "score_end", "score_reference")  # by the method's own score; NaN where there is none
 # Of the table of trials: a row for each calibration from a wrong start. Errors are those of eq. 2.19, cpu_s is without features.
 COLUMNS = (
@@ -170,17 +171,6 @@ def algorithm_6(matrix: Matrix, threshold: float) -> list[int]:
     return chosen
 
 
-class Cost(NamedTuple):
-    """What a method costs on so many frames, CPU time of one core. memory_mb: most that arrays took while features were made and
-    the score was evaluated."""
-
-    method: str
-    frames: int
-    features_ms_per_frame: float
-    evaluation_ms: float
-    memory_mb: float
-
-
 class Trust(NamedTuple):
     """F_C of Levinson and Thrun on one frame, the share of neighbours that score worse. right: at the reference. wrong: (deg, m,
     F_C) of extrinsics that are off by so much."""
@@ -196,7 +186,8 @@ class Results:
     titles: dict[str, str]
     trials: pd.DataFrame = field(default_factory=lambda: trials_table([]))
     curves: Sequence[CurveResult] = ()
-    costs: Sequence[Cost] = ()
+    # Method, frames, COSTS: on so many frames, CPU time of one core, and the most that arrays took meanwhile.
+    costs: Sequence[tuple[str, int, float, float, float]] = ()
     failures: Sequence[tuple[str, str]] = ()  # what other job failed, and why
     trusts: Sequence[Trust] = ()
     averagings: Sequence[Averaging] = ()
@@ -270,6 +261,6 @@ READ: dict[str, tuple[str, Callable[[EvaluationJob, Answer], Any]]] = {
     "curves": ("curves", lambda j, a: CurveResult(j.method, a["label"], _curves(a["offsets"], a["values"]))),
     "averaging": ("averagings", _averaging),
     "similarity": ("similarities", _similarity),
-    "cost": ("costs", lambda j, a: Cost(j.method, len(j.frames), *(a[name] for name in Cost._fields[2:]))),
+    "cost": ("costs", lambda j, a: (j.method, len(j.frames), *(a[name] for name in COSTS))),
     "trust": ("trusts", lambda j, a: Trust(a["right"], [(deg, m, share) for deg, m, share in a["wrong"]])),
 }

@@ -64,7 +64,12 @@ class Calibrations(Study):
         """See Study. A table for each size of start error."""
         trials = trials_table(read_answers(trial_of, planned, answers), self.protocol.limit_deg, self.protocol.limit_m)
         tables = [size_table(self.protocol, size, trials) for size in self.protocol.sizes]
-        return protocol_report(self.protocol.name, tables, [*OURS, f"CPU: {_cpu(extended(trials))}."], TRIALS, trials)
+        cpu = [
+            f"{median(own.cpu_s):.1f} s (mean {own.cpu_s.mean():.1f} s) with {plural(count)}"
+            for count, own in extended(trials).groupby("n")
+        ]
+        notes = [*OURS, f"CPU: median of a trial without features {', '.join(cpu)}."]
+        return protocol_report(self.protocol.name, tables, notes, TRIALS, trials)
 
 
 def check_counts(source: SourceSummary, counts: Sequence[int]) -> None:
@@ -104,13 +109,6 @@ def size_table(protocol: Protocol, size: Size, trials: pd.DataFrame) -> Table:
         errors = [text for part in (done, own) for text in (degrees(part.rotation_deg.mean()), number(part.cm.mean(), 2))]
         rows.append(["this project", scene, str(count), str(n), *cells, *errors])
     return Table(f"From {size.words}", HEADER, rows)
-
-
-def _cpu(trials: pd.DataFrame) -> str:
-    parts = [
-        f"{median(own.cpu_s):.1f} s (mean {own.cpu_s.mean():.1f} s) with {plural(count)}" for count, own in trials.groupby("n")
-    ]
-    return f"median of a trial without features {', '.join(parts)}"
 
 
 def protocol_report(name: str, tables: Sequence[Table], notes: Sequence[str], file: str, rows: pd.DataFrame) -> StudyReport:

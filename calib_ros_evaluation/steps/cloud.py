@@ -107,7 +107,7 @@ class Cloud:
 
 
 def cloud_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
-    """Raw scan and threshold filters."""
+    """Raw scan, threshold filters, the ground found and removed, then clusters of what is left."""
     yield wide_step(
         "Scan by depth",
         f"Figure 3.7a: all {len(cloud.xyz)} returns of the scan as a panorama; a row is a ring of the LiDAR, a column a "
@@ -129,6 +129,8 @@ def cloud_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
             cloud.draw(PLASMA[REFLECTIVITY.levels(cloud.reflectivity)], REFLECTIVITY),
         )
     yield from _filters(scene, cloud)
+    yield from _ground(scene, cloud)
+    yield from _clusters(scene, cloud)
 
 
 def _filters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
@@ -195,12 +197,6 @@ def _choices(scene: RegisteredFrame, cloud: Cloud) -> Iterator[tuple[str, str, s
         "5 to 30 m",
         by_range(xyz, 5, 30),
     )
-
-
-def object_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
-    """The ground found and removed, then clusters of what is left."""
-    yield from _ground(scene, cloud)
-    yield from _clusters(scene, cloud)
 
 
 def _ground(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:

@@ -21,7 +21,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.io import write_atomically
 from calib_ros_check.page import page_template
-from calib_ros_evaluation.steps.cloud import Cloud, cloud_steps, object_steps
+from calib_ros_evaluation.steps.cloud import Cloud, cloud_steps
 from calib_ros_evaluation.steps.image import edge_steps, preparation_steps
 from calib_ros_evaluation.steps.maps import map_steps, score_steps
 from calib_ros_evaluation.steps.pictures import Matrix, RegisteredFrame, Step
@@ -95,9 +95,7 @@ def make_steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) 
     scene = RegisteredFrame(frame, T, config, models(frame) if models.active else None)
     yield from preparation_steps(scene)
     yield from edge_steps(scene)
-    cloud = Cloud(scene)
-    yield from cloud_steps(scene, cloud)
-    yield from object_steps(scene, cloud)
+    yield from cloud_steps(scene, Cloud(scene))
     yield from map_steps(scene)
     yield from score_steps(scene, samples)
     yield from semantic_steps(scene)

@@ -22,7 +22,7 @@ from calib_ros_evaluation.report.page import write_report
 from calib_ros_evaluation.report.sections import sections
 from calib_ros_evaluation.report.table import Table, escaped, figures
 from calib_ros_evaluation.report.tables import area, basins, called_right, hits, median, peak_distances, quantile
-from calib_ros_evaluation.results import Averaging, Cost, CurveResult, Results, Similarity, Trust, algorithm_6
+from calib_ros_evaluation.results import Averaging, CurveResult, Results, Similarity, Trust, algorithm_6
 
 # Frame 1 is like 0; frame 2 is unlike 0, though like 1; frame 3 is like 2.
 ALIKE = np.array([[1, 0.8, 0.5, 0.1], [0.8, 1, 0.8, 0.2], [0.5, 0.8, 1, 0.9], [0.1, 0.2, 0.9, 1]])
@@ -58,7 +58,7 @@ def fake(methods: tuple[str, ...], n: int) -> Results:
         trials += [draw(*own, "starts", i, s, 1) for s in (0.5, 1.0, 2.0) for i in range(n // 2)]
         trials += [draw(*own, "frames", i, 2.0, count) for count in (1, 2, 4) for i in range(n // 2)]
     curves = [CurveResult(method, f"drive {k}", bell(0.1 * k)) for method in methods for k in range(2)]
-    costs = [Cost(method, 1, 20.0 * (k + 1), 0.05, 5.0) for k, method in enumerate(methods)]
+    costs = [(method, 1, 20.0 * (k + 1), 0.05, 5.0) for k, method in enumerate(methods)]
     titles = {method: f"{method.capitalize()} and others: edges of the one with edges of the other" for method in methods}
     trusts = [Trust(0.99, ((0.5, 0.0, 0.6 + 0.02 * k), (0.0, 0.1, 0.8))) for k in range(4)]
     shape = tuple("abc"), np.array([0.1, 0.3, 0.2]), np.full((3, 10), 0.1), (bell(0.1), bell(), bell(-0.1)), "by points"
@@ -208,7 +208,7 @@ def test_algorithm_6_compares_with_the_last_keyframe() -> None:
 
 
 def test_cost_of_features_and_of_a_whole_estimate() -> None:
-    costs = [Cost("nid", 1, 5.0, 2.0, 9.0), Cost("ours", 3, 20.0, 0.5, 10.0)]
+    costs = [("nid", 1, 5.0, 2.0, 9.0), ("ours", 3, 20.0, 0.5, 10.0)]
     found = tables.cost(Results({"ours": "Ours"}, table(*(trial(cpu_s=c) for c in (1.0, 2.0, 9.0))), costs=costs))
     assert found.rows == [
         ["nid", "1", "5.00", "2.00", "9.00", "–", "–"],
