@@ -64,7 +64,7 @@ class Tiling(NamedTuple):
         merged, weight = np.zeros((len(tiles[0]), *whole), np.float32), _towards_middle(shape)
         total = np.full(whole, SMALLEST, np.float32)
         for (place, part), own in zip(self._overlaps(whole, shape), tiles, strict=True):
-            planes = np.stack([_resized(np.asarray(plane, np.float32), shape) for plane in own])
+            planes = np.stack([enlarged(plane, shape) for plane in own])
             if not is_softmax(planes):
                 softmax(planes)
             for sums, plane in zip(merged, planes, strict=True):
@@ -126,12 +126,12 @@ def _starts(whole: int, part: int) -> list[int]:
     return [int(n) for n in np.linspace(0, whole - part, max(count, 2)).round()]
 
 
-def _resized(plane: Floats, size: Size) -> Floats:
-    return (
-        plane
-        if plane.shape == size
-        else np.asarray(cv2.resize(np.ascontiguousarray(plane), size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-    )
+def enlarged(plane: NDArray[np.generic], size: Size) -> Floats:
+    """A plane (h, w) of numbers at another size (height, width)."""
+    values = np.ascontiguousarray(plane, np.float32)
+    if values.shape == size:
+        return values
+    return np.asarray(cv2.resize(values, size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _towards_middle(size: Size) -> Floats:
