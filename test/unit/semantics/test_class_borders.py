@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from masks_of_pictures import assert_lies_on_edges, frame_of, later
+from masks_of_pictures import frame_of, later
 from onnx_graphs import segmentation
 from scenes import RenderedDrive
 from thesis_constants import with_constants
@@ -303,14 +303,3 @@ def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, 
     for sigma, own in zip(thesis_of(config).smoothing, features.image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(expected, sigma * focal / 720.0), atol=1e-3)
         assert abs(own - smoothed(gradient, sigma * focal / 720.0)).max() > 0.05
-
-
-@pytest.mark.kitti
-def test_borders_of_a_real_street_lie_on_edges_of_the_picture(kitti_root: Path) -> None:
-    image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
-    if image is None:
-        pytest.skip("no such KITTI frame")
-    edges = load_model(IMAGE, "builtin", SemanticsConfig())(frame_of(image, "000000"), later()).borders
-    assert edges.shape == (2, *image.shape[:2])
-    assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.2
-    assert_lies_on_edges(edges, image, sigma=2, shift=12, factor=1.15)
