@@ -38,9 +38,6 @@ class ClassOutput:
         by_number: Mapping[str, Names],
         conventions: str,
     ) -> None:
-        requested = model.sidecar.output
-        if requested and requested not in [t.name for t in model.outputs]:
-            raise model.error(f"there is no output '{requested}', which {model.yaml} asks for")
         self._model, self._feeds, self._size = model, *example
         self._by_count, self._by_number, self._conventions = by_count, by_number, conventions
         self.count: int | None = None
