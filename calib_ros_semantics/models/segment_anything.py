@@ -97,15 +97,11 @@ class Decoder:
         others = [t for t in outputs if t is not masks]
         self._score = _take(others, ("iou", "score"), lambda t: 1 <= len(t.shape) < len(masks.shape) - 1)
         self._nested = len(points.shape) == 4  # (1, prompts, points, 2)
+        self.is_efficient = self._nested and self._image_size is not None  # EfficientSAM, which scales points itself
         self._fixed = points.shape[1 if self._nested else 0]
         self.batch = self._fixed or PROMPT_BATCH
         # Exports with nested points pad them themselves; the others expect a padding point where there is no box.
         self._slots = points.shape[-2] or (1 if self._nested else 2)
-
-    @property
-    def is_efficient(self) -> bool:
-        """Whether points are in pixels of the original image: EfficientSAM, whose decoder scales them itself."""
-        return self._nested and self._image_size is not None
 
     def __call__(self, embedded: Embedded, points: Points, deadline: Deadline) -> Proposals:
         """Masks for prompts (n, 2), n <= batch, points in pixels of the image. Raises ModelError, BudgetError."""
