@@ -58,8 +58,7 @@ class OnnxModel:
     def __init__(self, path: str | Path, config: SemanticsConfig) -> None:
         self.path, self.sidecar = Path(path), Sidecar.beside(path)
         self.yaml = self.path.with_suffix(".yaml")  # where its description is, or would be
-        self._session, self.fallback = _session(self.path, config)
-        self.provider = provider_name(self._session)
+        self._session, self.provider, self.fallback = _session(self.path, config)
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)  # that the exporter wrote
         self.inputs = [_tensor(self.path, t) for t in self._session.get_inputs()]
         self.outputs = [_tensor(self.path, t) for t in self._session.get_outputs()]
@@ -259,8 +258,8 @@ def error_text(error: BaseException | None) -> str:
     return text if len(text) <= 300 else f"{text[:98]} ... {text[-197:]}"
 
 
-def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
-    """The session, and why it does not run on the configured provider; empty if it does."""
+def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str, str]:
+    """The session, its provider (cpu, cuda or tensorrt), and why that is not the configured one; empty if it is."""
     try:
         import onnxruntime
     except ImportError:
@@ -287,11 +286,11 @@ def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
             failed = error
     else:
         raise ModelError(f"model {path} cannot be loaded: {_load_error(failed, path, onnxruntime.__version__)}") from None
-    instead = provider_name(session)
+    own = str(session.get_providers()[0]).removesuffix("ExecutionProvider").lower()
     if PROVIDERS[asked][0] not in available:
-        return session, f"onnxruntime has no {asked} here: {path.name} runs on {instead}"
+        return session, own, f"onnxruntime has no {asked} here: {path.name} runs on {own}"
     why = "; check the driver and its libraries" if failed is None else f": {error_text(failed)}"
-    return session, f"{path.name} cannot run on {asked}, but on {instead}{why}" * (instead != asked)
+    return session, own, f"{path.name} cannot run on {asked}, but on {own}{why}" * (own != asked)
 
 
 def _load_error(error: BaseException | None, path: Path, version: str) -> str:
@@ -303,11 +302,6 @@ def _load_error(error: BaseException | None, path: Path, version: str) -> str:
     if OPSET.search(whole):
         return f"{text}; export it again, with an opset that onnxruntime {version} knows, or install a newer onnxruntime"
     return f"{text}; download or export it again"
-
-
-def provider_name(session: Any) -> str:
-    """Execution provider of a session: cpu, cuda or tensorrt."""
-    return str(session.get_providers()[0]).removesuffix("ExecutionProvider").lower()
 
 
 def _tensor(path: Path, node: Any) -> Tensor:
