@@ -171,11 +171,6 @@ head.addEventListener("click", () => {
 )
 
 
-def page_of_fleet() -> Any:
-    """The template. MissingDependencyError without Jinja2."""
-    return page_template(TEMPLATE)
-
-
 def write_fleet_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[str, str]) -> None:
     """Write the page, atomically. facts: further ones for its end. Frames that cannot be read here make no pictures."""
     checks, rows, certificates = options.options, fleet.rows, fleet.certificates
@@ -198,7 +193,7 @@ def write_fleet_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Map
         sections = [(own, None, plots(own, fleet.variances), [], [], [], []) for own in shown[:MOST_VEHICLES]]
     write_page(
         path,
-        page_of_fleet(),
+        page_template(TEMPLATE),
         checks.config,
         checks.tolerance,
         command="certify" if certificates else "check",
