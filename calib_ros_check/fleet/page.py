@@ -64,7 +64,6 @@ h3 { font-size: 1.1rem; margin: 2rem 0 .4rem; overflow-wrap: anywhere; }
 .changes li { padding: .5rem .9rem; margin: 0 0 .5rem; overflow-wrap: anywhere; }
 .changes span { display: block; color: var(--soft); font-size: .92rem; }
 {% endblock %}
-{% block contents %}{% endblock %}
 {% macro table(rows) %}
 <div class="table"><div class="scroll"><table>
 <thead><tr>{% for name in rows[0] %}<th scope="col"><button type="button">{{ name }}</button></th>
