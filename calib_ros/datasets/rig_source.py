@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations, product
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -94,12 +93,11 @@ class Sensor:
 @dataclass(frozen=True, eq=False)
 class RigDescription:
     """The sensors of a rig. reference: the one whose frame the others are stated in. pairs: those to be registered; None = all
-    that share a view by their priors. base_dir: of relative paths."""
+    that share a view by their priors."""
 
     sensors: tuple[Sensor, ...]
     reference: str
     pairs: tuple[tuple[str, str], ...] | None = None
-    base_dir: Path = Path()
 
     def __getitem__(self, name: str) -> Sensor:
         """The sensor of a name. KeyError if there is none."""

@@ -92,7 +92,7 @@ class _Reader:
         at = entries[reference]
         self._kind = at.get("kind") if isinstance(at, dict) else None
         sensors = tuple(self.sensor(name, value) for name, value in entries.items())
-        rig = RigDescription(sensors, reference, None, self.path.parent)
+        rig = RigDescription(sensors, reference)
         if len(sensors) < 2 or not rig.lidars:
             raise self.wrong("sensors", "must hold two or more, one of them of kind: lidar; add what is missing")
         own = rig[rig.reference].prior
@@ -102,7 +102,7 @@ class _Reader:
             self._unique(sensors, key)
         if top.get("pairs") is None:
             return rig
-        return RigDescription(sensors, rig.reference, self.pairs(top["pairs"], rig), self.path.parent)
+        return RigDescription(sensors, rig.reference, self.pairs(top["pairs"], rig))
 
     def _unique(self, sensors: tuple[Sensor, ...], key: str) -> None:
         seen: dict[tuple[str, str], str] = {}
