@@ -144,10 +144,9 @@ def test_calibrate_writes_result_and_overlay(
     assert code == 0
     second = yaml.safe_load(again.read_text())
     assert se3.rotation_error_deg(result["T_camera_lidar"], second["T_camera_lidar"]) < 0.03
-
-    first, second = (json.loads(run(capsys, *refine[:-1], "-")[1]) for _ in range(2))
-    assert first["status"] == "converged"
-    assert first | {"elapsed_s": 0, "stamp": 0} == second | {"elapsed_s": 0, "stamp": 0}
+    third = json.loads(run(capsys, *refine[:-1], "-")[1])
+    assert third["status"] == "converged"
+    assert third | {"elapsed_s": 0, "stamp": 0} == second | {"elapsed_s": 0, "stamp": 0}
 
 
 def test_a_refusal_is_drawn_with_its_optimum_or_the_start_alone(drive: SyntheticDrive, tmp_path: Path) -> None:
@@ -202,6 +201,8 @@ def test_not_converged_is_exit_code_1(bag: Path, quick: list[str], tmp_path: Pat
         (["calibrate", "{bag}", "--objective", "magic"], "--objective"),
         (["convert", "{bag}", "{bag}"], "exists"),
         (["play", "{bag}", "--rate", "-1"], "rate"),
+        (["play", "{tmp}/missing"], "{tmp}/missing"),
+        (["play", "{tmp}"], "{tmp}"),
         (["export", "{tmp}"], "cannot read"),
         (["export", "{bad_json}"], "neither valid JSON nor YAML"),
         (["export", "{flipped}"], "damaged or edited"),
