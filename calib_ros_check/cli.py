@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 
 from calib_ros.cli.inputs import configuration
 from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
-from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
+from calib_ros.datasets.rig import is_folder_rig
+from calib_ros.rig.description import read_rig
+from calib_ros_check.fleet.recordings import is_fleet
+from calib_ros_check.outcome import CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.recording import Checked, CheckOptions, check_source
+from calib_ros_check.report import check_report, write_report
+from calib_ros_check.rig.check import RigCheck, check_recording
+from calib_ros_check.rig.page import write_rig_page
 
+Found = tuple[CheckResult | RigCheck, str, Callable[[str], None]]  # with what is printed, and what writes its page
 EXIT = {CheckVerdict.PASS: 0, CheckVerdict.FAIL: 1, CheckVerdict.INCONCLUSIVE: 3}
 
 
@@ -30,23 +40,36 @@ def options_of(args: argparse.Namespace) -> CheckOptions:
     )
 
 
-def check_one(source: str, args: argparse.Namespace) -> int:
-    """Check one recording and say what was found; returns the exit code."""
+def is_one(sources: Sequence[str], rig: str | None) -> bool:
+    """Whether sources are one recording, if of the rig that a file describes also as folders of its cameras."""
+    if not is_fleet(sources):
+        return True
+    return rig is not None and len(sources) == 1 and is_folder_rig(Path(sources[0]).expanduser(), read_rig(rig))
+
+
+def check_one(args: argparse.Namespace) -> int:
+    """Check one recording, of a pair or a rig, and say what was found; returns the exit code."""
     options = options_of(args)
     if args.report is not None:
-        from calib_ros_check.report import check_report
-
         check_report(args.report)
     check_json(args.json)
+    found, text, write = (_pair if args.rig is None else _rig)(args.source[0], options)
+    print_or_save(found, text, args.json)
+    if args.report is not None:
+        write(args.report)
+    return EXIT[found.verdict]
+
+
+def _pair(source: str, options: CheckOptions) -> Found:
     with progress_bar("reading ") as reading, progress_bar("checking") as step:
         checked = check_source(source, options, reading, lambda stage, share: step(share), note)
-    result = checked.result
-    print_or_save(result, summary(checked), args.json)
-    if args.report is not None:
-        from calib_ros_check.report import write_report
+    return checked.result, summary(checked), partial(write_report, checked=checked)
 
-        write_report(args.report, result, checked.frames, checked.source, checked.config)
-    return EXIT[result.verdict]
+
+def _rig(source: str, options: CheckOptions) -> Found:
+    with progress_bar("checking") as step:
+        found = check_recording(source, options, lambda text, share: step(share))
+    return found, rig_summary(found), partial(write_rig_page, found=found, config=options.config)
 
 
 def summary(checked: Checked) -> str:
@@ -60,3 +83,15 @@ def summary(checked: Checked) -> str:
     lines += [f"  {line}" for line in result.notes]
     lines.append(f"  {result.frames_used} of {len(result.frame_names)} frames, {result.cpu_s:.1f} s of CPU")
     return "\n".join(lines)
+
+
+def rig_summary(found: RigCheck) -> str:
+    """What it prints of a rig: the verdict, sensors, pairs, loops, notes."""
+    rows = [(name, own.verdict.value, own.reason) for name, own in found.sensors.items()]
+    rows += [(f"{pair.target} with {pair.source}", pair.verdict.value, pair.reason) for pair in found.pairs]
+    for loop in found.solution.loops:
+        size = f"{loop.size[0]:.2f} deg, {100 * loop.size[1]:.1f} cm"
+        rows.append((f"loop {', '.join(loop.sensors)}", "closes" if loop.closes else "open", size))
+    width = max(len(row[0]) for row in rows)
+    lines = [f"  {name:<{width}}  {verdict:<12}  {reason}" for name, verdict, reason in rows]
+    return "\n".join([f"{found.verdict.value}: {found.reason}", *lines, *(f"  {note}" for note in found.notes)])

@@ -65,19 +65,13 @@ class Check:
 
     def run(self, args: argparse.Namespace) -> int:
         """Check and tell; the exit code."""
-        from calib_ros_check.cli import check_one, options_of
-        from calib_ros_check.fleet.recordings import is_fleet
+        from calib_ros_check.cli import check_one, is_one, options_of
 
-        if args.rig is not None:
-            from calib_ros_check.rig.cli import check_one_rig, is_one_rig
+        if is_one(args.source, args.rig):
+            return check_one(args)
+        from calib_ros_check.fleet.cli import check_many
 
-            if is_one_rig(args.source, args.rig):
-                return check_one_rig(args)
-        if is_fleet(args.source):
-            from calib_ros_check.fleet.cli import check_many
-
-            return check_many(args, options_of(args))
-        return check_one(args.source[0], args)
+        return check_many(args, options_of(args))
 
 
 class Certify:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -18,6 +17,7 @@ from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.overlay import render
 from calib_ros_check.outcome import CheckResult, Deviation, Tolerance
 from calib_ros_check.page import page_template, write_page
+from calib_ros_check.recording import Checked
 from calib_ros_check.tolerance import Judgement, amount, signed
 
 PICTURES = 3
@@ -95,7 +95,6 @@ SHEET = """\
 TEMPLATE = (
     f"{{% block style %}}\n{STYLE}{{% endblock %}}"
     + """
-{% block contents %}{% endblock %}
 {% block main %}
 <p><span class="verdict {{ result.verdict.value }}">{{ result.verdict.value }}</span></p>
 <p class="said">{{ result.reason }}</p>
@@ -127,13 +126,12 @@ Points are coloured by depth, near ones warm.</p>
 )
 
 
-def write_report(path: str | Path, result: CheckResult, frames: Sequence[Frame], source: str, config: Config) -> None:
-    """Write the page of a check to `path`, atomically. source: name of the recording.
-
-    MissingDependencyError without Jinja2, BadInputError if the folder cannot be written.
-    """
+def write_report(path: str | Path, checked: Checked) -> None:
+    """Write the page of a check to `path`, atomically. MissingDependencyError without Jinja2, BadInputError if the folder cannot
+    be written."""
+    result, frames, config = checked.result, checked.frames, checked.config
     facts = {
-        "recording": source,
+        "recording": checked.source,
         "extrinsic": f"T_{result.camera_frame}_{result.lidar_frame}",
         "frames": f"{result.frames_used} of {len(result.frame_names)} used",
         "time": f"{result.elapsed_s:.1f} s ({result.cpu_s:.1f} s of CPU)",
@@ -147,7 +145,7 @@ def write_report(path: str | Path, result: CheckResult, frames: Sequence[Frame],
         config,
         result.tolerance,
         command="check",
-        title=f"Check of {source}",
+        title=f"Check of {checked.source}",
         facts=facts,
         result=result,
         rows=deviation_rows(result, result.tolerance),

@@ -6,6 +6,7 @@ import argparse
 import os
 import platform
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,11 +21,12 @@ from calib_ros.datasets.kitti import drives_in
 from calib_ros.datasets.open import is_single
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare
-from calib_ros_evaluation.evaluate import Experiments, RunOptions, Study, evaluate
+from calib_ros_evaluation.evaluate import Experiments, Study, evaluate
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, labels
 from calib_ros_evaluation.methods.registry import NAMES
-from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, PROTOCOLS, TRIALS, check_name
+from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, PROTOCOLS, TRIALS
+from calib_ros_evaluation.protocols.definitions import NAMES as PROTOCOL_NAMES
 from calib_ros_evaluation.protocols.detection import Detection, read_perturbations
 from calib_ros_evaluation.protocols.trials import Calibrations
 from calib_ros_evaluation.results import read_trials
@@ -36,18 +38,20 @@ def run_evaluation(args: argparse.Namespace) -> str:
         return as_text(compare(*(read_trials(Path(path)) for path in args.compare)), *args.compare)
     study = study_of(args)
     workers = (os.cpu_count() or 1) if args.workers is None else int(args.workers)
-    options = RunOptions(setup_of(args), Path(args.out), args.frames, workers, args.scheduler or "", args.fresh)
+    if workers < 1:
+        raise BadInputError(f"--workers {workers}: give at least 1")
     with progress_bar("evaluating") as step:
 
         def progress(stage: str, done: int, total: int) -> None:
             """Reading the sources takes seconds, all else minutes."""
             step(done if stage == "trials" else 0.0, max(total, 1))
 
-        done = evaluate(options, study, _facts(args), progress)
-    for line in done.notes:
+        of_run = {"frames": args.frames, "workers": workers, "scheduler": args.scheduler or "", "fresh": args.fresh}
+        said, files, notes = evaluate(setup_of(args), study, Path(args.out), _facts(args), progress, **of_run)
+    for line in notes:
         note(line)
-    page = done.files[0].resolve()
-    return "\n".join([*done.said, str(page), f"open it in a browser: {page.as_uri()}"])
+    page = files[0].resolve()
+    return "\n".join([*said, str(page), f"open it in a browser: {page.as_uri()}"])
 
 
 def study_of(args: argparse.Namespace) -> Study:
@@ -64,8 +68,11 @@ def study_of(args: argparse.Namespace) -> Study:
     if args.seed is not None and args.seed < 0:
         raise BadInputError(f"--seed {args.seed}: give 0 or more")
     if name is None:
-        return Experiments(plan_of(args), args.methods or NAMES, args.experiments or EXPERIMENTS)
-    check_name(name)
+        methods, experiments = args.methods or NAMES, args.experiments or EXPERIMENTS
+        _check_names("method", methods, NAMES)
+        _check_names("experiment", experiments, EXPERIMENTS)
+        return Experiments(plan_of(args), methods, experiments)
+    _check_names("protocol", [name], PROTOCOL_NAMES)
     if not 1 <= trials <= 100_000:
         raise BadInputError(f"--trials {trials}: give 1 to 100000")
     if name != MISCALIBRATION:
@@ -77,6 +84,12 @@ def study_of(args: argparse.Namespace) -> Study:
     if args.table is None:
         raise BadInputError(f"--protocol {MISCALIBRATION} needs the published perturbations: give their CSV file by --table FILE")
     return Detection(read_perturbations(Path(args.table)), args.frames_per_trial or DETECTION_COUNTS)
+
+
+def _check_names(kind: str, given: Sequence[str], known: Sequence[str]) -> None:
+    for name in given:
+        if name not in known:
+            raise BadInputError(f"there is no {kind} '{name}'; choose among {', '.join(known)}")
 
 
 def _facts(args: argparse.Namespace) -> dict[str, str]:

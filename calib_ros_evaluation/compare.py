@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -81,7 +81,7 @@ def compare(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0, resamples: int = 20
     if not (both.which == "both").any():
         raise BadInputError(f"the tables have no trial in common: {_apart(a, b)}; evaluate both with the same options")
     # By number: 2 before 10.
-    both = both.sort_values(list(IDENTITY), key=lambda c: c.str.replace(r"\d+", _padded, regex=True) if c.name == "frames" else c)
+    both = both.sort_values(list(IDENTITY), key=lambda c: c.map(_positions) if c.name == "frames" else c)
     found = []
     for (experiment, method), own in both.groupby(["experiment", "method"]):
         pairs = own[own.which == "both"]
@@ -96,8 +96,8 @@ def compare(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0, resamples: int = 20
     return found
 
 
-def _padded(number: Any) -> str:
-    return str(number[0].zfill(9))
+def _positions(frames: str) -> tuple[int, ...]:
+    return tuple(map(int, frames.split()))
 
 
 def paired_change(

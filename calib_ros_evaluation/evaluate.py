@@ -6,44 +6,26 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import pandas as pd
 import yaml
 
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.journal import Answer, Journal
+from calib_ros_check.jobs.journal import Journal
 from calib_ros_check.jobs.pool import run
-from calib_ros_evaluation.experiments.answers import Answers, collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, code_fingerprint, inspect_sources
-from calib_ros_evaluation.methods.registry import NAMES, check_names, methods
+from calib_ros_evaluation.experiments.trial import run_jobs
+from calib_ros_evaluation.methods.registry import NAMES, methods
 from calib_ros_evaluation.report.page import check_report, write_report
 from calib_ros_evaluation.report.sections import Section, sections
 from calib_ros_evaluation.report.tables import summary
-from calib_ros_evaluation.results import TRIALS, write_table
+from calib_ros_evaluation.results import TRIALS, Answers, collect_results, write_table
 from calib_ros_semantics.models.segmentation import SegmentationModels
 
 Progress = Callable[[str, int, int], None]  # called with the stage (frames, trials), done and total
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What to work on, and with what. frames: of each source, as for --frames. workers: processes on this machine. scheduler:
-    address of a Dask cluster instead; empty = none. fresh: forget earlier results."""
-
-    setup: Setup
-    out: Path
-    frames: str = "all"
-    workers: int = 1
-    scheduler: str = ""
-    fresh: bool = False
-
-    def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise BadInputError(f"--workers {self.workers}: give at least 1")
 
 
 @dataclass(frozen=True)
@@ -72,10 +54,6 @@ class Study:
         """All there is to do, in the order of the report. BadInputError for sources that do not fit the study."""
         raise NotImplementedError
 
-    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
-        """The answers, in order."""
-        return run_jobs(setup, todo)
-
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
         raise NotImplementedError
@@ -88,9 +66,6 @@ class Experiments(Study):
     plan: Plan = FULL
     methods: tuple[str, ...] = NAMES
     experiments: tuple[str, ...] = EXPERIMENTS
-
-    def __post_init__(self) -> None:
-        check_names(self.methods)
 
     def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
         """See Study."""
@@ -108,31 +83,33 @@ class Experiments(Study):
         return StudyReport("Camera-LiDAR calibration: methods compared", sections(results), said, TRIALS, trials, notes, facts)
 
 
-class Evaluation(NamedTuple):
-    """What came of it. said: lines for the terminal. files: the report first. notes: for people."""
+def evaluate(
+    setup: Setup,
+    study: Study,
+    out: Path,
+    facts: Mapping[str, str],
+    progress: Progress,
+    frames: str = "all",
+    workers: int = 1,
+    scheduler: str = "",
+    fresh: bool = False,
+) -> tuple[Sequence[str], list[Path], list[str]]:
+    """Do what the journal in the folder `out` does not hold yet, then write table and report. Returns lines for the terminal, the
+    files, the report first, and notes for people.
 
-    said: Sequence[str]
-    files: list[Path]
-    notes: list[str]
-
-
-def evaluate(options: RunOptions, study: Study, facts: Mapping[str, str], progress: Progress) -> Evaluation:
-    """Do what the journal in the folder does not hold yet, then write table and report. facts: for the head of the report.
-
-    Interrupted or killed at any moment, the same options go on where it stopped; with more of the same to do, what is there is
-    kept. Raises BadInputError for a folder that holds an evaluation of something else, and what sources raise that cannot be
-    used.
+    Interrupted or killed at any moment, the same call goes on where it stopped; with more of the same to do, what is there is
+    kept. facts: for the head of the report. frames: of each source, as for --frames. workers: processes on this machine.
+    scheduler: address of a Dask cluster instead; empty = none. fresh: forget earlier results. Raises BadInputError for a folder
+    that holds an evaluation of something else, and what sources raise that cannot be used.
     """
-    setup, out = options.setup, options.out
     models = SegmentationModels(setup.config.semantics).load()
-    summaries = inspect_sources(setup, options.frames, partial(progress, "frames"))
+    summaries = inspect_sources(setup, frames, partial(progress, "frames"))
     planned = study.jobs(setup, summaries)
     check_report(out)
     about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint, **study.about}
-    with Journal(out, about, options.fresh) as journal:
+    with Journal(out, about, fresh) as journal:
         same_frames(journal, summaries)
-        work, told = partial(study.work, setup), partial(progress, "trials")
-        run(groups(planned), work, journal, told, options.workers, options.scheduler)
+        run(groups(planned), partial(run_jobs, setup), journal, partial(progress, "trials"), workers, scheduler)
         answers, damage = dict(journal.done), journal.notes
     found = study.report(setup, planned, answers)
     notes = [*models, *damage, *(text for one in summaries for text in one.notes), *found.notes]
@@ -145,7 +122,7 @@ def evaluate(options: RunOptions, study: Study, facts: Mapping[str, str], progre
     else:
         write_table(out / found.name, found.table)
         files.append(out / found.name)
-    return Evaluation(found.said, files, notes)
+    return found.said, files, notes
 
 
 def same_frames(journal: Journal, summaries: Sequence[SourceSummary]) -> None:

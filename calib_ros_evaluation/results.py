@@ -1,13 +1,14 @@
-"""Results of an evaluation: the table of trials, also as a CSV file, and what other experiments measured. Tables and plots need
-nothing else."""
+"""Results of an evaluation, read from the answers of its jobs: the table of trials, also as a CSV file, and what other
+experiments measured. Tables and plots need nothing else."""
 
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -15,9 +16,14 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
+from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
+from calib_ros_evaluation.experiments.job import EvaluationJob
 
+T = TypeVar("T")
 Matrix = NDArray[np.float64]
+Answers = Mapping[str, Answer]  # by the keys of their jobs
+OF_TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
 SUCCESS_DEG, SUCCESS_M = 0.5, 0.1  # a trial that ends nearer than both to the reference has found it
 SET = 3  # frames whose curves are averaged, as in figure 4.16
 THESIS_THRESHOLD = 0.7  # of similarity (section 3.6)
@@ -27,6 +33,7 @@ IDENTITY = ("experiment", "method", "scene", "frames", "start_deg", "start_m", "
 STATUSES = ("done", "refused", "failed")  # refused: by the method itself: it then ends where it started; failed: with an error
 TWIST_AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
 END, START = ([f"{name}_{axis}" for axis in TWIST_AXES] for name in ("end", "start"))  # twists log(T T_ref^-1)
+COSTS = ("features_ms_per_frame", "evaluation_ms", "memory_mb")
 SCORES = ("score_start", "score_end", "score_reference")  # by the method's own score; NaN where there is none
 # Of the table of trials: a row for each calibration from a wrong start. Errors are those of eq. 2.19, cpu_s is without features.
 COLUMNS = (
@@ -164,17 +171,6 @@ def algorithm_6(matrix: Matrix, threshold: float) -> list[int]:
     return chosen
 
 
-class Cost(NamedTuple):
-    """What a method costs on so many frames, CPU time of one core. memory_mb: most that arrays took while features were made and
-    the score was evaluated."""
-
-    method: str
-    frames: int
-    features_ms_per_frame: float
-    evaluation_ms: float
-    memory_mb: float
-
-
 class Trust(NamedTuple):
     """F_C of Levinson and Thrun on one frame, the share of neighbours that score worse. right: at the reference. wrong: (deg, m,
     F_C) of extrinsics that are off by so much."""
@@ -190,8 +186,81 @@ class Results:
     titles: dict[str, str]
     trials: pd.DataFrame = field(default_factory=lambda: trials_table([]))
     curves: Sequence[CurveResult] = ()
-    costs: Sequence[Cost] = ()
+    # Method, frames, COSTS: on so many frames, CPU time of one core, and the most that arrays took meanwhile.
+    costs: Sequence[tuple[str, int, float, float, float]] = ()
     failures: Sequence[tuple[str, str]] = ()  # what other job failed, and why
     trusts: Sequence[Trust] = ()
     averagings: Sequence[Averaging] = ()
     similarities: Sequence[Similarity] = ()
+
+
+def collect_results(jobs: Sequence[EvaluationJob], answers: Answers, titles: Mapping[str, str]) -> Results:
+    """Results of all jobs that have an answer, in their order. titles: method name -> for people.
+
+    BadInputError for an answer that cannot be one of its job.
+    """
+    found: dict[str, list[Any]] = {name: [] for name, _ in READ.values()}
+    failures: list[tuple[str, str]] = []
+    for job in jobs:
+        answer = answers.get(job.key)
+        if answer is None:
+            continue
+        if "error" in answer:
+            what = f"{job.experiment} of {job.method}" if job.method else job.experiment
+            failures.append((f"{what}, {job.scene}, frames {' '.join(map(str, job.frames[:10]))}", answer["error"]))
+        else:
+            name, reader = READ[job.experiment]
+            found[name] += read_answers(reader, [job], answers)
+    return Results(dict(titles), failures=failures, **found | {"trials": trials_table(found["trials"])})
+
+
+def read_answers(reader: Callable[[EvaluationJob, Answer], T], jobs: Sequence[EvaluationJob], answers: Answers) -> list[T]:
+    """What a reader makes of the answers of all jobs that have one. BadInputError for one that cannot be one of its job."""
+    found = []
+    for job in jobs:
+        try:
+            found += [reader(job, answers[job.key])] if job.key in answers else []
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadInputError(
+                f"the answer of {job.key} is damaged ({type(error).__name__}: {error}); remove its line from results.jsonl, or "
+                "give --fresh"
+            ) from None
+    return found
+
+
+def trial_of(job: EvaluationJob, answer: Answer) -> dict[str, Any]:
+    """The row of the table of trials that an answer of `trial` tells of."""
+    twists = {f"{name}_{axis}": answer[name][k] for name in ("start", "end") for k, axis in enumerate(TWIST_AXES)}
+    scores = {name: math.nan if answer[name] is None else float(answer[name]) for name in SCORES}
+    known = {"experiment": job.experiment, "method": job.method, "scene": job.scene, "frames": " ".join(map(str, job.frames))}
+    return known | dict(job.options) | {name: answer[name] for name in TOLD} | twists | scores
+
+
+def _averaging(job: EvaluationJob, answer: Answer) -> Averaging:
+    names, weights, shares, values = zip(*answer["frames"], strict=True)
+    single = tuple(_curves(answer["offsets"], own) for own in values)
+    return Averaging(job.method, job.scene, names, np.array(weights), np.array(shares), single, answer["classes_of"])
+
+
+def _similarity(job: EvaluationJob, answer: Answer) -> Similarity:
+    histograms = {int(position): np.array(shares, float) for position, shares in answer["histograms"].items()}
+    return Similarity(job.scene, job.frames, np.array(answer["matrix"], float), answer["threshold"], histograms)
+
+
+def _curves(offsets: Any, values: Any) -> Curves:
+    return Curves(np.array(offsets, float), np.array(values, float))
+
+
+TOLD = (
+    *("status", "reason", "rotation_deg", "translation_m", "start_rotation_deg", "start_translation_m"),
+    *("evaluations", "cpu_s", "features_cpu_s"),
+)
+# Experiment -> the field of Results that its results belong to, and what reads an answer.
+READ: dict[str, tuple[str, Callable[[EvaluationJob, Answer], Any]]] = {
+    **dict.fromkeys(OF_TRIALS, ("trials", trial_of)),
+    "curves": ("curves", lambda j, a: CurveResult(j.method, a["label"], _curves(a["offsets"], a["values"]))),
+    "averaging": ("averagings", _averaging),
+    "similarity": ("similarities", _similarity),
+    "cost": ("costs", lambda j, a: (j.method, len(j.frames), *(a[name] for name in COSTS))),
+    "trust": ("trusts", lambda j, a: Trust(a["right"], [(deg, m, share) for deg, m, share in a["wrong"]])),
+}

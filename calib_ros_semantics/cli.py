@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from calib_ros.cli.output import progress_bar
 from calib_ros.config import Config, SemanticsConfig
 from calib_ros.datasets.source import Source
-from calib_ros.errors import BadInputError, BudgetError
+from calib_ros.errors import BadInputError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.io import make_folder
 from calib_ros.overlay import write_png
 from calib_ros.registration.classes import IMAGE, MASKS
 from calib_ros_semantics.models.onnx_model import Deadline
-from calib_ros_semantics.models.segmentation import ADVICE, ModelSlot, SegmentationModels, error_line, judge, load_model
+from calib_ros_semantics.models.segmentation import ModelSlot, SegmentationModels, error_line, judge, load_model
 
 RUNS = 3  # the first is slower: libraries and memory are made ready
 WIDTH = 110  # letters of a line; some exports have a dozen tensors
@@ -53,8 +53,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> tuple
                 lines += ["", *found]
                 doubtful += [f"semantics.{model.kind}, {model.path}: {doubt}"] * bool(doubt)
             except Exception as error:  # whatever somebody's model makes of the frame, the others are tried
-                advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
-                failed.append(f"semantics.{model.kind}: {error_line(error)}{advice}")
+                failed.append(f"semantics.{model.kind}: {error_line(error, model.kind)}")
             step(k + 1, len(configured))
     return lines, failed, doubtful
 

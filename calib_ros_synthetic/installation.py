@@ -61,10 +61,7 @@ class Installation:
     @property
     def image_delay(self) -> float:
         """Seconds from the cloud's stamp to the picture: a triggered camera waits until the scan sweeps its axis."""
-        if not self.rig.triggered:
-            return 0.0
-        axis = (self.T_base_lidar[:3, :3].T @ self.T_base_camera[:3, 2])[:2]
-        return float(-np.arctan2(axis[1], axis[0]) / (2 * np.pi * self.rig.rate))
+        return sweep_s(self.T_base_lidar, self.T_base_camera, self.rig.rate) if self.rig.triggered else 0.0
 
     def view(self, camera: Camera) -> CameraView:
         """The pixels of a camera: the rig's, or one given instead of it."""
@@ -116,6 +113,12 @@ class Installation:
         if self.rig.intensity is Intensity.WIDE:
             return np.asarray(np.where(unit > 0.97, BRIGHTEST * rng.random(len(unit)) ** 3, unit), np.float32)
         return unit
+
+
+def sweep_s(T_base_lidar: Floats, T_base_camera: Floats, rate: float) -> float:
+    """From a scan's stamp to when it sweeps a camera's axis. Poses (4, 4); rate: turns per second."""
+    axis = (T_base_lidar[:3, :3].T @ T_base_camera[:3, 2])[:2]
+    return float(-np.arctan2(axis[1], axis[0]) / (2 * np.pi * rate))
 
 
 def _compensated(xyz: Floats, twist: Floats, time: Floats) -> Floats:

@@ -20,9 +20,8 @@ from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.stamps import nearest_index, nearest_pairs, pair_tolerance
 from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.drive import LIMITS, START, SyntheticDrive, checked, parsed
-from calib_ros_synthetic.installation import Installation
+from calib_ros_synthetic.installation import Installation, sweep_s
 from calib_ros_synthetic.multi_rigs import MULTI_RIGS, displacement
-from calib_ros_synthetic.rays import CameraView
 from calib_ros_synthetic.ride import RIDES, STEADY, WEAVING, Ride
 from calib_ros_synthetic.rigs import RIGS, Fields
 from calib_ros_synthetic.scanners import PERIOD, RosetteScanner
@@ -115,7 +114,7 @@ class SyntheticRig:
         self._knock = self._knock_of(p["knock_deg"], p["knock_m"]) if self.knocked else np.eye(4)
         self._made = Recent(CACHED)
         self._installed = lru_cache(maxsize=None)(self._install)
-        self._view = lru_cache(maxsize=None)(self._view_of)
+        self._view = lru_cache(maxsize=None)(lambda camera: self._installed(camera, False).view(self.camera(camera)))
         self._own = lru_cache(maxsize=None)(self._own_layer)
 
     @classmethod
@@ -186,8 +185,7 @@ class SyntheticRig:
         """From a scan's stamp to when it sweeps the camera's axis; 0 for scanners that do not turn."""
         if isinstance(self._installed(lidar, False).scanner, RosetteScanner):
             return 0.0
-        axis = (self._pose(lidar, False)[:3, :3].T @ self._pose(camera, False)[:3, 2])[:2]
-        return float(-np.arctan2(axis[1], axis[0]) / (2 * np.pi * self._sensors[lidar].rate))
+        return sweep_s(self._pose(lidar, False), self._pose(camera, False), self._sensors[lidar].rate)
 
     def describe_lidar(self, name: str) -> str:
         """For people."""
@@ -231,9 +229,6 @@ class SyntheticRig:
         """T_base_sensor (4, 4)."""
         own = self._installed(name, after)
         return own.T_base_camera if self._sensors[name].is_camera else own.T_base_lidar
-
-    def _view_of(self, camera: str) -> CameraView:
-        return self._installed(camera, False).view(self.camera(camera))
 
     def _own_layer(self, camera: str, after: bool) -> Any:
         own = self._installed(camera, after)

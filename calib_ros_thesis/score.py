@@ -17,7 +17,6 @@ from calib_ros.registration.score.point_score import (
     MARGIN,
     MIN_POINTS,
     PointScore,
-    ScoredPoints,
     near_image,
     nearest_per_pixel,
     project,
@@ -121,13 +120,8 @@ class ThesisScore:
                 "no LiDAR edge falls into the image; check the initial extrinsic and the thresholds of the stage thesis"
             )
         weights = np.concatenate(weight)
-        points_of_all = ScoredPoints(
-            np.ascontiguousarray(np.concatenate(xyz).T),
-            (weights / weights.sum()).astype(np.float32),
-            np.concatenate(frame),
-            np.zeros(len(weights), np.intp),
-        )
-        return PointScore(points_of_all, self._atlas)
+        normalised, channels = (weights / weights.sum()).astype(np.float32), np.zeros(len(weights), np.intp)
+        return PointScore(np.concatenate(xyz).T, normalised, np.concatenate(frame), channels, self._atlas)
 
 
 @dataclass(frozen=True, eq=False)

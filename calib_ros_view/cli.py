@@ -66,16 +66,23 @@ def _view_node(args: argparse.Namespace, address: Address) -> None:
     from calib_ros_view.node.rig_watch import RigWatch
     from calib_ros_view.node.watch import Watch
     from calib_ros_view.web.live_page import LivePage
-    from calib_ros_view.web.rig_live import LivePairs
+    from calib_ros_view.web.pair_pages import RIG, Opened, PairPages
     from calib_ros_view.web.rig_page import RigPage
 
     pictures = Pictures()
-    with Watch(args.node) as watch, LivePairs(RigWatch(watch), pictures) as pairs:
-        feed = pairs.feed
-        live = LivePage(watch, pictures, other=lambda: feed.rig is not None)
+    with Watch(args.node) as watch:
+        feed = RigWatch(watch)
+
+        def opening(camera: str, lidar: str) -> Opened:
+            if (camera, lidar) not in feed.pairs:
+                raise BadInputError(f"{feed.name} has no pair of {camera} and {lidar}; open one that its page lists")
+            own = Watch(f"{feed.name}/{camera}/{lidar}")
+            return LivePage(own, pictures, RIG).page, own.close
+
+        live, pairs = LivePage(watch, pictures, other=lambda: feed.rig is not None), PairPages(opening)
         serve(
             lambda: live.page() if feed.rig is None else RigPage(feed, pictures).build(),
-            *(f"{watch.name} · {TITLE}", address, pictures.routes, partial(_ready, opened=args.open)),
+            *(f"{watch.name} · {TITLE}", address, pictures.routes, partial(_ready, opened=args.open), pairs.close),
             others={PAIR: pairs.page},
         )
 
@@ -85,8 +92,10 @@ def _view_rig(args: argparse.Namespace, address: Address) -> None:
     given = [name.replace("_", "-") for name in OF_ONE_PAIR if getattr(args, name)]
     if given:
         raise BadInputError(f"--rig says what {', '.join(given)} would: leave them out, and set them in {args.rig}")
+    from calib_ros_view.session.jobs import SessionJobs
+    from calib_ros_view.web.pair_pages import RIG, Opened, PairPages
     from calib_ros_view.web.rig_page import RigPage
-    from calib_ros_view.web.rig_sessions import SessionPairs
+    from calib_ros_view.web.source_page import SourcePage
 
     config, description = configuration(args.config, preset_name=args.preset), read_rig(args.rig)
     out = Path(args.out or OUT)
@@ -95,10 +104,15 @@ def _view_rig(args: argparse.Namespace, address: Address) -> None:
     source = open_rig(args.source, description, **bag_options(args))
     rig = rig or of_priors(description, solve([], priors_of(description, source), description.reference))
     pictures, session = Pictures(), RigSession(source, description, rig, config, args.frames, out)
-    pairs, title = SessionPairs(session, pictures), f"{source.name} · {TITLE}"
-    ready = partial(_ready, opened=args.open)
-    page = partial(RigPage, session, pictures)
-    serve(lambda: page().build(), title, address, pictures.routes, ready, pairs.close, {PAIR: pairs.page})
+
+    def opening(camera: str, lidar: str) -> Opened:
+        own = session.session(camera, lidar)
+        jobs = SessionJobs(own)
+        return lambda: SourcePage(own, jobs, pictures, RIG).build(), jobs.close
+
+    pairs, ready = PairPages(opening), partial(_ready, opened=args.open)
+    build, title = lambda: RigPage(session, pictures).build(), f"{source.name} · {TITLE}"
+    serve(build, title, address, pictures.routes, ready, pairs.close, {PAIR: pairs.page})
 
 
 def _session(args: argparse.Namespace) -> Session:

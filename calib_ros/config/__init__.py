@@ -73,10 +73,8 @@ class Config:
             raise ConfigError(
                 "semantics.segment_anything_decoder is set without semantics.segment_anything, its encoder; set both, or neither"
             )
-        for stage in (self.image, self.lidar):
-            stage.check()
-        for other in self.others:
-            other.check_with(self)
+        for stage in (self.image, self.lidar, *self.others):
+            stage.check_with(self)
 
     def stage(self, kind: type[AnyStage]) -> AnyStage:
         """The stage of a package beside the core; its defaults where the package has not joined it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
@@ -38,7 +39,7 @@ class ImageConfig(Stage):
         high=1.0,
     )
 
-    def check(self) -> None:
+    def check_with(self, config: Any) -> None:
         """ConfigError for boxes that are not four numbers each, or have no area."""
         if len(self.ignored_boxes) % 4:
             raise ConfigError(
@@ -121,7 +122,7 @@ class LidarConfig(Stage):
         length=6,
     )
 
-    def check(self) -> None:
+    def check_with(self, config: Any) -> None:
         """ConfigError for a box of the vehicle without volume."""
         box = self.ego_box
         if any(box) and not all(low < high for low, high in zip(box[::2], box[1::2], strict=True)):

@@ -16,7 +16,7 @@ from calib_ros.datasets.bag_file import BagFile, peek_header
 from calib_ros.datasets.bag_index import RECORDING, TopicIndex
 from calib_ros.datasets.bag_topics import choose_camera_info, choose_image, choose_points, is_rectified
 from calib_ros.datasets.recent import Recent, Timed
-from calib_ros.datasets.rig_source import CAMERA, KEPT_CLOUDS, ByDescription, DescribedRig
+from calib_ros.datasets.rig_source import CAMERA, KEPT_CLOUDS, ByDescription, RigDescription
 from calib_ros.datasets.static_transforms import StaticTransforms
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
@@ -26,7 +26,7 @@ from calib_ros.messages import decode_camera_info
 class BagRig(ByDescription):
     """The sensors of a description in a bag, by their topics. options: of `BagSource`."""
 
-    def __init__(self, path: Path, description: DescribedRig, **options: Any) -> None:
+    def __init__(self, path: Path, description: RigDescription, **options: Any) -> None:
         super().__init__(path.resolve().stem if path.is_file() else path.resolve().name, description)
         self.path, self._options, self._recent = path, options, Recent(KEPT_CLOUDS)
         self._bag = BagFile(path, bool(options.get("incomplete")))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages.image_encodings import picture_to_bgr
-from calib_ros.messages.pictures import decode_picture
+from calib_ros.messages.pictures import read_picture
 from calib_ros.messages.wire import shown
 
 IMAGES, CLOUDS, CALIBRATION, TIMES = "images", "clouds", "calibration.yaml", "times.csv"
@@ -120,21 +119,11 @@ class FolderSource:
 
     def _first_size(self) -> tuple[int, int]:
         """Width and height, px, of the first image; 0 without one."""
-        picture = self._picture(min(self._images, key=_natural)) if self._images else np.zeros((0, 0))
+        picture = read_picture(self._images[min(self._images, key=_natural)], "image") if self._images else np.zeros((0, 0))
         return picture.shape[1], picture.shape[0]
 
-    def _picture(self, name: str) -> NDArray[Any]:
-        path = self._images[name]
-        try:
-            picture = decode_picture(np.fromfile(path, np.uint8))
-        except OSError as error:
-            raise BadInputError(f"image {path} cannot be read ({error.strerror}); check the file") from error
-        if picture is None:
-            raise BadInputError(f"image {path} is no complete PNG, JPEG, BMP, TIFF or WebP; copy it again")
-        return picture
-
     def _read_image(self, name: str) -> NDArray[np.uint8]:
-        path, picture = self._images[name], self._picture(name)
+        path, picture = self._images[name], read_picture(self._images[name], "image")
         height, width = picture.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             raise BadInputError(

@@ -20,7 +20,7 @@ from calib_ros.datasets.kitti_files import (
     Timestamps,
     image_moment,
     numbered_files,
-    read_picture,
+    read_image,
     read_scan,
 )  # fmt: skip
 from calib_ros.datasets.recent import Recent, Timed
@@ -76,7 +76,7 @@ class KittiSource:
             )
         first = self.numbers[0]
         P, self.reference = self._layout.calibrate(first)
-        height, width = read_picture(self._images[first]).shape[:2]
+        height, width = read_image(self._images[first]).shape[:2]
         self.camera = Camera(P[:, :3], width, height)
 
     @property
@@ -94,7 +94,7 @@ class KittiSource:
 
     def __getitem__(self, index: int) -> Frame:
         number = self.numbers[index]
-        image = read_picture(self._images[number])
+        image = read_image(self._images[number])
         P, T_camera_lidar = self._layout.calibrate(number)
         stamp, cloud_stamp = self._layout.stamps(number)
         height, width = image.shape[:2]

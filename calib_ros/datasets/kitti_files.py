@@ -14,7 +14,7 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud
-from calib_ros.messages.pictures import decode_picture
+from calib_ros.messages.pictures import read_picture
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # KITTI has PNG; copies are often recompressed
 # Numbers of a point: x, y, z, reflectance, and in other data sets its ring, time, or a radar's values.
@@ -80,14 +80,9 @@ def _gap(values: NDArray[np.float32], columns: int) -> float:
     return float(np.median(known)) if len(known) else np.inf
 
 
-def read_picture(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path) -> NDArray[np.uint8]:
     """An image as stored: (H, W) grey or (H, W, 3) BGR, uint8. BadInputError if missing or damaged."""
-    try:
-        image = decode_picture(np.fromfile(path, np.uint8))
-    except OSError:
-        image = None
-    if image is None:
-        raise BadInputError(f"picture {path} is missing or unreadable; copy it again")
+    image = read_picture(path)
     if image.dtype != np.uint8 or (image.ndim == 3 and image.shape[2] != 3):
         raise BadInputError(f"picture {path} is not an 8-bit grey or colour picture; copy it again")
     return np.asarray(image, np.uint8)

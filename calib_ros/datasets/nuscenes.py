@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
-from calib_ros.datasets.kitti_files import read_picture, read_points
+from calib_ros.datasets.kitti_files import read_image, read_points
 from calib_ros.datasets.recent import Recent, Timed
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
@@ -146,7 +146,7 @@ class NuScenesSource:
         picture, scan = self._pairs[index]
         camera, reference = self._calibration(picture, scan)
         return Frame(
-            image=read_picture(self.path.parent / picture.filename),
+            image=read_image(self.path.parent / picture.filename),
             cloud=self._cloud(scan),
             camera=camera,
             stamp=picture.stamp,

@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
-from calib_ros.datasets.kitti_files import numbered_files, read_picture, read_scan
+from calib_ros.datasets.kitti_files import numbered_files, read_image, read_scan
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
@@ -57,7 +57,7 @@ class OnceSource:
                 f"{self.path}: no time has both a picture ({len(self._images)} in {self.camera_frame}) and a scan "
                 f"({len(self._scans)} in {SCANS}); download both of this scene"
             )
-        height, width = read_picture(self._images[self.numbers[0]]).shape[:2]
+        height, width = read_image(self._images[self.numbers[0]]).shape[:2]
         try:
             self.camera, self.reference = _calibration(cameras[self.camera_frame], width, height)
         except BadInputError as error:
@@ -71,7 +71,7 @@ class OnceSource:
     def __getitem__(self, index: int) -> Frame:
         number = self.numbers[index]
         stamp = number * MILLISECOND_NS
-        cloud, image = read_scan(self._scans[number]), read_picture(self._images[number])
+        cloud, image = read_scan(self._scans[number]), read_image(self._images[number])
         return Frame(
             image=image, cloud=cloud, camera=self.camera, stamp=stamp, reference=self.reference, name=self._scans[number].stem
         )

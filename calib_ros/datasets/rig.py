@@ -21,10 +21,10 @@ from calib_ros.datasets.rig_source import (
     CAMERA,
     KEPT_CLOUDS,
     ByDescription,
-    DescribedRig,
-    DescribedSensor,
     RecordedRig,
+    RigDescription,
     RigSource,
+    Sensor,
 )
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
@@ -33,7 +33,7 @@ from calib_ros.extensions import RIGS, source_of
 __all__ = ["RecordedRig", "RigSource", "named_rig", "open_rig"]
 
 
-def open_rig(path_or_text: str | Path, description: DescribedRig, **options: Any) -> RigSource:
+def open_rig(path_or_text: str | Path, description: RigDescription, **options: Any) -> RigSource:
     """Open the recording of the rig that is described: a bag by the topics of its sensors; or a synthetic rig, nuScenes, KITTI or
     plain folders, where `topic` is the recording's own name of a sensor (nuScenes: channel; KITTI: number of the camera; plain
     folders: see `FolderRig`), by default its name.
@@ -64,7 +64,7 @@ def named_rig(text: str) -> RecordedRig | None:
 class ChosenSensors(ByDescription):
     """Some sensors of a rig, under the names of a description."""
 
-    def __init__(self, rig: RigSource, description: DescribedRig) -> None:
+    def __init__(self, rig: RigSource, description: RigDescription) -> None:
         super().__init__(rig.name, description)
         self.rig = rig
         self._own = {sensor.name: _own_name(sensor, rig) for sensor in description.sensors}
@@ -91,7 +91,7 @@ class ChosenSensors(ByDescription):
         return self.rig.scans(self._own[lidar])
 
 
-def _own_name(sensor: DescribedSensor, rig: RigSource) -> str:
+def _own_name(sensor: Sensor, rig: RigSource) -> str:
     names = rig.cameras if sensor.kind == CAMERA else rig.lidars
     found = [name for name in (sensor.topic, sensor.name) if name in names]
     if not found:
@@ -104,7 +104,7 @@ def _own_name(sensor: DescribedSensor, rig: RigSource) -> str:
 class OneLidarRig(ByDescription):
     """KITTI or nuScenes: several cameras around one LiDAR."""
 
-    def __init__(self, text: str, description: DescribedRig) -> None:
+    def __init__(self, text: str, description: RigDescription) -> None:
         super().__init__(text, description)
         if len(self.lidars) != 1 or not self.cameras:
             raise BadInputError(
@@ -158,7 +158,7 @@ class FolderRig(ByDescription):
     calibration is to the LiDAR of its own clouds, else to the only one. BadInputError for what is missing.
     """
 
-    def __init__(self, path: Path, description: DescribedRig) -> None:
+    def __init__(self, path: Path, description: RigDescription) -> None:
         super().__init__(path.resolve().name, description)
         self.path, self._recent = path, Recent(KEPT_CLOUDS)
         self._pairs: dict[tuple[str, str], FolderSource] = {}
@@ -241,11 +241,11 @@ class FolderRig(ByDescription):
         return np.eye(4) if name in self.lidars or lidar is None else self.pair(name, lidar).reference
 
 
-def folder_of(path: Path, sensor: DescribedSensor) -> Path:
+def folder_of(path: Path, sensor: Sensor) -> Path:
     """Where the files of a sensor are."""
     return path / (sensor.topic or sensor.name).lstrip("/")
 
 
-def is_folder_rig(path: Path, description: DescribedRig) -> bool:
+def is_folder_rig(path: Path, description: RigDescription) -> bool:
     """Whether a folder has the images of a camera that is described."""
     return any((folder_of(path, sensor) / IMAGES).is_dir() for sensor in description.sensors if sensor.kind == CAMERA)

@@ -1,16 +1,22 @@
-"""The protocol of recordings of several cameras and LiDARs, and of the descriptions that they are opened by."""
+"""The protocol of recordings of several cameras and LiDARs, and the descriptions that they are opened by."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
 from typing import Protocol
 
-from calib_ros.arrays import Transform
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.recent import Timed
 from calib_ros.datasets.source import Source
 
-CAMERA = "camera"  # kind of a sensor; others are LiDARs
+CAMERA, LIDAR = KINDS = "camera", "lidar"  # of sensors
+# As the default search box of the registration: what mounting by a drawing leaves open.
+SIGMA_DEG, SIGMA_M = 3.0, 0.2
 KEPT_CLOUDS = 32  # about 100 MB
 
 
@@ -60,37 +66,75 @@ class RecordedRig(RigSource, Protocol):
         """T_reference_sensor (4, 4) as somebody who mounts the sensors believes it."""
 
 
-class DescribedSensor(Protocol):
-    """What is asked of a sensor of a description. prior: T_reference_sensor (4, 4), None = as recorded."""
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A sensor of a rig.
+
+    kind: camera or lidar. topic: of a bag, else the recording's own name of it, "" = `name`. camera_info: its topic. frame: of
+    TF, "" = as recorded. prior: T_reference_sensor (4, 4); None = as the recording states it. sigma_deg, sigma_m: standard
+    deviations of the prior along every axis. mask: image file of what a camera's pictures leave out, "" = none.
+    """
+
+    name: str
+    kind: str
+    topic: str = ""
+    camera_info: str = ""
+    frame: str = ""
+    prior: Transform | None = None
+    sigma_deg: float = SIGMA_DEG
+    sigma_m: float = SIGMA_M
+    mask: str = ""
+
+    def believed(self, T: Transform) -> tuple[Transform, Covariance]:
+        """T_reference_sensor (4, 4) as its prior, with the covariance (6, 6) of a left twist, rad and m."""
+        return T, prior_covariance(T, self.sigma_deg, self.sigma_m)
+
+
+@dataclass(frozen=True, eq=False)
+class RigDescription:
+    """The sensors of a rig. reference: the one whose frame the others are stated in. pairs: those to be registered; None = all
+    that share a view by their priors."""
+
+    sensors: tuple[Sensor, ...]
+    reference: str
+    pairs: tuple[tuple[str, str], ...] | None = None
+
+    def __getitem__(self, name: str) -> Sensor:
+        """The sensor of a name. KeyError if there is none."""
+        return {sensor.name: sensor for sensor in self.sensors}[name]
 
     @property
-    def name(self) -> str: ...
-    @property
-    def kind(self) -> str: ...
-    @property
-    def topic(self) -> str: ...
-    @property
-    def camera_info(self) -> str: ...
-    @property
-    def frame(self) -> str: ...
-    @property
-    def prior(self) -> Transform | None: ...
-
-
-class DescribedRig(Protocol):
-    """What is asked of a description of a rig."""
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(sensor.name for sensor in self.sensors if sensor.kind == CAMERA)
 
     @property
-    def sensors(self) -> Sequence[DescribedSensor]: ...
+    def lidars(self) -> tuple[str, ...]:
+        """Names of the LiDARs."""
+        return tuple(sensor.name for sensor in self.sensors if sensor.kind == LIDAR)
+
     @property
-    def reference(self) -> str: ...
+    def lidar_pairs(self) -> list[tuple[str, str]]:
+        """The pairs of two LiDARs."""
+        return [pair for pair in self.pairs or combinations(self.lidars, 2) if self[pair[0]].kind == LIDAR]
+
+    @property
+    def camera_pairs(self) -> list[tuple[str, str]]:
+        """The pairs of a camera and a LiDAR, whether they share a view or not where no pairs are given."""
+        return [pair for pair in self.pairs or product(self.cameras, self.lidars) if self[pair[0]].kind == CAMERA]
+
+
+def prior_covariance(T: Transform, sigma_deg: float, sigma_m: float) -> Covariance:
+    """Covariance (6, 6) of a left twist of T (4, 4), rad and m: the sensor turns about itself, whatever its lever arm is."""
+    to_twist = np.linalg.inv(se3.parts_jacobian(T))
+    variances = np.repeat([np.deg2rad(sigma_deg) ** 2, sigma_m**2], 3)
+    return np.asarray(to_twist * variances @ to_twist.T)
 
 
 class ByDescription:
     """What rigs that are opened by a description have in common."""
 
-    def __init__(self, name: str, description: DescribedRig) -> None:
+    def __init__(self, name: str, description: RigDescription) -> None:
         self.name, self.reference_sensor = name, description.reference
         self.sensors = {sensor.name: sensor for sensor in description.sensors}
-        self.cameras = tuple(sensor.name for sensor in description.sensors if sensor.kind == CAMERA)
-        self.lidars = tuple(sensor.name for sensor in description.sensors if sensor.kind != CAMERA)
+        self.cameras, self.lidars = description.cameras, description.lidars

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib_ros.config import ImageConfig
 from calib_ros.errors import BadInputError
-from calib_ros.messages.pictures import decode_picture
+from calib_ros.messages.pictures import read_picture
 
 Mask = NDArray[np.bool_]
 Map = NDArray[np.float32]
@@ -27,7 +26,7 @@ def used_pixels(config: ImageConfig, width: int, height: int) -> Mask | None:
     used = np.ones((height, width), bool)
     if config.mask:
         path = Path(config.mask)
-        picture = _picture(path)
+        picture = read_picture(path, "image.mask")
         if picture.shape[:2] != (height, width):
             raise BadInputError(
                 f"image.mask {path} is {picture.shape[1]}x{picture.shape[0]}, the camera's image is {width}x{height}; "
@@ -54,17 +53,7 @@ def check_mask(config: ImageConfig, size: tuple[int, int] | None) -> None:
     if size is not None:
         used_pixels(config, *size)
     elif config.mask:
-        _picture(Path(config.mask))
-
-
-def _picture(path: Path) -> NDArray[Any]:
-    try:
-        picture = decode_picture(np.frombuffer(path.read_bytes(), np.uint8))
-    except OSError as error:
-        raise BadInputError(f"cannot read image.mask {path}: {error.strerror}") from None
-    if picture is None:
-        raise BadInputError(f"image.mask {path} is no complete PNG, JPEG or BMP picture")
-    return picture
+        read_picture(Path(config.mask), "image.mask")
 
 
 def without_border(used: Mask, reach: int) -> Mask:

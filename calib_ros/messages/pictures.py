@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import struct
 import zlib
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from calib_ros.errors import BadInputError
 
 # More than any camera has; OpenCV allocates memory for all pixels before it reads the first one.
 MAX_PIXELS = 2**27
@@ -45,6 +48,17 @@ def decode_picture(data: NDArray[np.uint8]) -> NDArray[Any] | None:
     except cv2.error:
         return None
     return None if picture is None or picture.dtype not in (np.uint8, np.uint16) else np.asarray(picture)
+
+
+def read_picture(path: Path, what: str = "picture") -> NDArray[Any]:
+    """The same of a file. BadInputError, which calls it `what`, if it cannot be read or is incomplete."""
+    try:
+        picture = decode_picture(np.fromfile(path, np.uint8))
+    except OSError as error:
+        raise BadInputError(f"cannot read {what} {path}: {error.strerror}; check the file") from error
+    if picture is None:
+        raise BadInputError(f"{what} {path} is no complete PNG, JPEG, BMP, TIFF or WebP; copy it again")
+    return picture
 
 
 def _png_header(data: memoryview) -> tuple[int, int, int] | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,7 +70,7 @@ def decode_cloud(msg: Any) -> PointCloud:
         raise BadInputError(f"PointCloud2: size {width}x{height} is negative; check the LiDAR driver")
     if width * height == 0:
         return PointCloud(np.zeros((0, 3), np.float32))
-    return _cloud(_columns(msg, width, height), stamp_ns(msg.header.stamp))
+    return cloud_of_columns(_columns(msg, width, height), stamp_ns(msg.header.stamp))
 
 
 def livox_scan(data: bytes) -> LivoxScan:
@@ -101,12 +102,14 @@ def decode_livox(data: bytes) -> PointCloud:
 
 def cloud_of_columns(columns: Mapping[str, NDArray[Any]], stamp: int = 0) -> PointCloud:
     """Columns (n,) of numbers by the field names of any driver, as files hold them -> PointCloud, as `decode_cloud`. stamp: of
-    the cloud, ns, from which absolute times count. Raises BadInputError without x, y, z, or for columns of different lengths."""
+    the cloud, ns, from which absolute times count. The arrays do not share memory with the columns. Raises BadInputError without
+    x, y, z, or for columns of different lengths."""
     known = {name.strip().lower(): column for name, column in columns.items() if column.dtype.kind in "iufb"}
     missing = [name for name in REQUIRED if name not in known]
     if missing:
         raise BadInputError(
-            f"no field {', '.join(missing)} among ({', '.join(map(shown, columns)) or 'none'}); a point needs x, y and z"
+            f"the cloud has no field {', '.join(missing)} among ({', '.join(map(shown, columns)) or 'none'}); a point needs x, y "
+            "and z, as those of a 3-D LiDAR have them"
         )
     chosen: dict[str, NDArray[Any]] = {}
     for quantity, names in POINT_FIELDS.items():
@@ -116,17 +119,12 @@ def cloud_of_columns(columns: Mapping[str, NDArray[Any]], stamp: int = 0) -> Poi
         if known[name].shape != (len(known["x"]),):
             raise BadInputError(f"field {name} has shape {known[name].shape}, but there are {len(known['x'])} points")
         chosen[quantity] = known[name]
-    return _cloud(chosen, stamp)
-
-
-def _cloud(columns: Mapping[str, NDArray[Any]], stamp: int) -> PointCloud:
-    """Columns (n,) by quantity, at least x, y and z, and the stamp in ns -> PointCloud with memory of its own."""
     # Garbage in a field must not print warnings for every scan: values out of float32's range become inf.
     with np.errstate(over="ignore", invalid="ignore"):
-        xyz = np.empty((len(columns["x"]), 3), np.float32)
+        xyz = np.empty((len(chosen["x"]), 3), np.float32)
         for axis, name in enumerate("xyz"):
-            xyz[:, axis] = columns[name]
-        intensity, ring, time = (columns.get(name) for name in ("intensity", "ring", "time"))
+            xyz[:, axis] = chosen[name]
+        intensity, ring, time = (chosen.get(name) for name in ("intensity", "ring", "time"))
         seconds, problem = (None, "") if time is None else seconds_from_stamp(time, stamp)
         return PointCloud(
             xyz,
@@ -183,17 +181,11 @@ def _time_unit(span: float, units: tuple[int, ...]) -> int | None:
 
 
 def _columns(msg: Any, width: int, height: int) -> dict[str, NDArray[Any]]:
-    """The quantities of all points (n,), each by the first of its fields that the message has, whose layout is checked against
-    the number of bytes. Of an array field the first element."""
+    """The fields of all points (n,) whose name and type are known; their layout is checked against the number of bytes. Of an
+    array field the first element."""
     fields: dict[str, Any] = {}
     for field in msg.fields:
         fields.setdefault(str(field.name).strip().lower(), field)
-    missing = [name for name in REQUIRED if name not in fields]
-    if missing:
-        raise BadInputError(
-            f"PointCloud2: no field {', '.join(missing)} among ({', '.join(map(shown, fields)) or 'none'}); "
-            "choose the topic of a 3-D LiDAR with x, y, z"
-        )
     point_step = int(msg.point_step)
     for name, field in fields.items():
         _check_field(name, field, point_step)
@@ -210,12 +202,12 @@ def _columns(msg: Any, width: int, height: int) -> dict[str, NDArray[Any]]:
             f"PointCloud2: {len(data)} bytes of data, but {width}x{height} points of {point_step} bytes "
             f"need {height * row_step}; the message is truncated, check the LiDAR driver or the recording"
         )
-    columns = {}
-    for quantity, names in POINT_FIELDS.items():
-        found = next((fields[name] for name in names if name in fields and int(fields[name].datatype) in DATATYPES), None)
-        if found is not None:
-            dtype = np.dtype(order + DATATYPES[int(found.datatype)])
-            columns[quantity] = np.ndarray((height, width), dtype, data, int(found.offset), (row_step, point_step)).ravel()
+    shape, strides, columns = (height, width), (row_step, point_step), {}
+    known = set(chain(*POINT_FIELDS.values()))
+    for name, field in fields.items():
+        if name in known and int(field.datatype) in DATATYPES:
+            kind = order + DATATYPES[int(field.datatype)]
+            columns[name] = np.ndarray(shape, kind, data, int(field.offset), strides).reshape(-1)
     return columns
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from difflib import get_close_matches
-from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -14,84 +12,20 @@ import numpy as np
 import yaml
 
 from calib_ros import io, result, se3
-from calib_ros.arrays import Covariance, Transform
+from calib_ros.arrays import Transform
+from calib_ros.datasets.rig_source import CAMERA as CAMERA
+from calib_ros.datasets.rig_source import KINDS, SIGMA_DEG, SIGMA_M
+from calib_ros.datasets.rig_source import LIDAR as LIDAR
+from calib_ros.datasets.rig_source import RigDescription as RigDescription
+from calib_ros.datasets.rig_source import Sensor as Sensor
+from calib_ros.datasets.rig_source import prior_covariance as prior_covariance
 from calib_ros.errors import BadInputError
 
-CAMERA, LIDAR = "camera", "lidar"
-KINDS = (CAMERA, LIDAR)
 FROM_TF = "tf"
-# As the default search box of the registration: what mounting by a drawing leaves open.
-SIGMA_DEG, SIGMA_M = 3.0, 0.2
 MAX_SIGMA_DEG, MAX_SIGMA_M = 45.0, 5.0
 KEYS = {"reference", "sensors", "pairs"}
 SENSOR_KEYS = {"kind", "topic", "camera_info", "frame", "prior", "sigma_deg", "sigma_m", "mask"}
 PRIOR_KEYS = {"translation_m", "quaternion_xyzw"}
-
-
-@dataclass(frozen=True, eq=False)
-class Sensor:
-    """A sensor of a rig.
-
-    kind: camera or lidar. topic: of a bag, else the recording's own name of it, "" = `name`. camera_info: its topic. frame: of
-    TF, "" = as recorded. prior: T_reference_sensor (4, 4); None = as the recording states it. sigma_deg, sigma_m: standard
-    deviations of the prior along every axis. mask: image file of what a camera's pictures leave out, "" = none.
-    """
-
-    name: str
-    kind: str
-    topic: str = ""
-    camera_info: str = ""
-    frame: str = ""
-    prior: Transform | None = None
-    sigma_deg: float = SIGMA_DEG
-    sigma_m: float = SIGMA_M
-    mask: str = ""
-
-    def believed(self, T: Transform) -> tuple[Transform, Covariance]:
-        """T_reference_sensor (4, 4) as its prior, with the covariance (6, 6) of a left twist, rad and m."""
-        return T, prior_covariance(T, self.sigma_deg, self.sigma_m)
-
-
-@dataclass(frozen=True, eq=False)
-class RigDescription:
-    """The sensors of a rig. reference: the one whose frame the others are stated in. pairs: those to be registered; None = all
-    that share a view by their priors. base_dir: of relative paths."""
-
-    sensors: tuple[Sensor, ...]
-    reference: str
-    pairs: tuple[tuple[str, str], ...] | None = None
-    base_dir: Path = Path()
-
-    def __getitem__(self, name: str) -> Sensor:
-        """The sensor of a name. KeyError if there is none."""
-        return {sensor.name: sensor for sensor in self.sensors}[name]
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
-        return tuple(sensor.name for sensor in self.sensors if sensor.kind == CAMERA)
-
-    @property
-    def lidars(self) -> tuple[str, ...]:
-        """Names of the LiDARs."""
-        return tuple(sensor.name for sensor in self.sensors if sensor.kind == LIDAR)
-
-    @property
-    def lidar_pairs(self) -> list[tuple[str, str]]:
-        """The pairs of two LiDARs."""
-        return [pair for pair in self.pairs or combinations(self.lidars, 2) if self[pair[0]].kind == LIDAR]
-
-    @property
-    def camera_pairs(self) -> list[tuple[str, str]]:
-        """The pairs of a camera and a LiDAR, whether they share a view or not where no pairs are given."""
-        return [pair for pair in self.pairs or product(self.cameras, self.lidars) if self[pair[0]].kind == CAMERA]
-
-
-def prior_covariance(T: Transform, sigma_deg: float, sigma_m: float) -> Covariance:
-    """Covariance (6, 6) of a left twist of T (4, 4), rad and m: the sensor turns about itself, whatever its lever arm is."""
-    to_twist = np.linalg.inv(se3.parts_jacobian(T))
-    variances = np.repeat([np.deg2rad(sigma_deg) ** 2, sigma_m**2], 3)
-    return np.asarray(to_twist * variances @ to_twist.T)
 
 
 def read_rig(path: str | Path) -> RigDescription:
@@ -158,7 +92,7 @@ class _Reader:
         at = entries[reference]
         self._kind = at.get("kind") if isinstance(at, dict) else None
         sensors = tuple(self.sensor(name, value) for name, value in entries.items())
-        rig = RigDescription(sensors, reference, None, self.path.parent)
+        rig = RigDescription(sensors, reference)
         if len(sensors) < 2 or not rig.lidars:
             raise self.wrong("sensors", "must hold two or more, one of them of kind: lidar; add what is missing")
         own = rig[rig.reference].prior
@@ -168,7 +102,7 @@ class _Reader:
             self._unique(sensors, key)
         if top.get("pairs") is None:
             return rig
-        return RigDescription(sensors, rig.reference, self.pairs(top["pairs"], rig), self.path.parent)
+        return RigDescription(sensors, rig.reference, self.pairs(top["pairs"], rig))
 
     def _unique(self, sensors: tuple[Sensor, ...], key: str) -> None:
         seen: dict[tuple[str, str], str] = {}

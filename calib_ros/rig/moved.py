@@ -34,15 +34,14 @@ class RigHypothesis:
 
     kind: nothing, moved or clock. sensors: that moved together, or whose clock jumped. displacement: (6,) left twist of theirs in
     the frame of the reference, rad and m, or (1,) of the clock, s, positive = later than before; with its covariance.
-    log_likelihood: of the new edges, the displacement integrated out. posterior: probability among all hypotheses. p_value: of
-    edges that fit as badly, were it so. others: sensors of which the opposite is the same to the graph.
+    posterior: probability among all hypotheses. p_value: of edges that fit as badly, were it so. others: sensors of which the
+    opposite is the same to the graph.
     """
 
     kind: str
     sensors: tuple[str, ...]
     displacement: Matrix
     covariance: Matrix
-    log_likelihood: float
     posterior: float
     p_value: float
     size: tuple[float, float]
@@ -83,10 +82,10 @@ def hypotheses(before: RigSolution, edges: Sequence[Edge]) -> list[RigHypothesis
     logs = np.array([e[0] + prior for e, (*_, prior) in zip(evidences, found, strict=True)])
     posterior = np.exp(logs - logsumexp(logs))
     out = []
-    for (kind, group, _, _, _), (log_likelihood, x, C, p), probability in zip(found, evidences, posterior, strict=True):
+    for (kind, group, _, _, _), (_, x, C, p), probability in zip(found, evidences, posterior, strict=True):
         others = tuple(n for n in names if n not in group) if kind == MOVED else ()
         size = model.size(group, x) if kind == MOVED else (0.0, 0.0)
-        out.append(RigHypothesis(kind, group, x, C, log_likelihood, float(probability), p, size, others))
+        out.append(RigHypothesis(kind, group, x, C, float(probability), p, size, others))
     return sorted(out, key=lambda h: (-round(h.posterior, 9), len(h.sensors), h.sensors))
 
 

@@ -97,7 +97,7 @@ class Listener:
 
     @property
     def tells(self) -> bool:
-        """See `AdaptiveSubscription`: of those who share it, the first one."""
+        """Whether it is to report problems: of those who share the subscription, the first one."""
         return self._topic.listeners[:1] == [self]
 
     def check(self) -> str:

@@ -39,11 +39,10 @@ POINTS_ADVICE = {
 
 
 class Form(NamedTuple):
-    """A message type of a topic. restore: bytes of it -> the message, for a callback that gets it Serialized; None for one that
-    gets the message itself."""
+    """A message type of a topic. restore: bytes of it -> the message."""
 
     kind: type[Any]
-    restore: Callable[[bytes], Any] | None = None
+    restore: Callable[[bytes], Any]
 
 
 def serialized(kind: type[Any]) -> Form:
@@ -63,11 +62,9 @@ class AdaptiveSubscription:
     it may be replaced at any time and holds from the next check() on. latched: receive what was published before as well, where
     all publishers keep it. guard: context that callbacks run in. forms: types that are received, one at a time, the first that
     somebody publishes. largest: bytes of data in the largest message so far. reliability_offered: by all publishers, when check()
-    was called last. silence: why nothing comes on the topic, where nothing does. tells: its user is to report problems, and not
-    another one who shares it. To be used on the executor's thread. No message is lost or received twice when reliability changes.
+    was called last. silence: why nothing comes on the topic, where nothing does. To be used on the executor's thread. No message
+    is lost or received twice when reliability changes.
     """
-
-    tells = True
 
     def __init__(
         self,
@@ -177,9 +174,8 @@ class AdaptiveSubscription:
     def _subscribe(self) -> Any:
         qos = QoSProfile(depth=DEPTH, reliability=self._qos[0], durability=self._qos[1])
         self._made += 1
-        kind, restore = self._form
-        receive = partial(self._receive, self._made, restore)
-        subscribe = partial(self._node.create_subscription, kind, self._topic, receive, qos, raw=restore is not None)
+        receive = partial(self._receive, self._made, self._form.restore)
+        subscribe = partial(self._node.create_subscription, self._form.kind, self._topic, receive, qos, raw=True)
         try:
             return subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
         except UnsupportedEventTypeError:
@@ -190,9 +186,9 @@ class AdaptiveSubscription:
     def _on_lost(self, event: Any) -> None:
         self._lost += event.total_count_change
 
-    def _receive(self, subscription: int, restore: Callable[[bytes], Any] | None, msg: Any) -> None:
+    def _receive(self, subscription: int, restore: Callable[[bytes], Any], data: bytes) -> None:
         with self._guard():
-            msg = msg if restore is None else Serialized.of(msg, restore)
+            msg = Serialized.of(data, restore)
             stamp = stamp_ns(msg.header.stamp)
             # Received through the other subscription already. Through the same one it is another message: time may stand still,
             # or not be stamped at all.
@@ -201,7 +197,7 @@ class AdaptiveSubscription:
             self._recent.append((stamp, subscription))
             self._received += 1
             self._received_at = time.monotonic()
-            self.largest = max(self.largest, len(getattr(msg, "data", ())))
+            self.largest = max(self.largest, len(data))
             self._callback(stamp, msg)
 
 

@@ -15,11 +15,12 @@ from calib_ros_check.fleet.claims import find_claims
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
 from calib_ros_check.fleet.history import VERDICTS, Row, row_of, vehicles
 from calib_ros_check.fleet.jobs import OTHER, lost, options_key, run_checks
-from calib_ros_check.fleet.page import page_of_fleet, write_fleet_page
+from calib_ros_check.fleet.page import TEMPLATE, write_fleet_page
 from calib_ros_check.fleet.recordings import find_recordings
 from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
 from calib_ros_check.jobs.journal import Journal
 from calib_ros_check.jobs.pool import run
+from calib_ros_check.page import page_template
 from calib_ros_check.recording import REFERENCE, TF, CheckOptions
 
 Progress = Callable[[int, int], None]
@@ -38,7 +39,7 @@ def check_fleet(
     Raises BadInputError for sources without recordings or a folder that cannot be written, MissingDependencyError, and what
     `run` raises without workers.
     """
-    page_of_fleet()  # says what is missing before the work
+    page_template(TEMPLATE)  # says what is missing before the work
     rows, notes = _checked(options, progress)
     histories, variances = vehicles(rows, options.false_alarms)
     certificates = []

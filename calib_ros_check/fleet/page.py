@@ -64,7 +64,6 @@ h3 { font-size: 1.1rem; margin: 2rem 0 .4rem; overflow-wrap: anywhere; }
 .changes li { padding: .5rem .9rem; margin: 0 0 .5rem; overflow-wrap: anywhere; }
 .changes span { display: block; color: var(--soft); font-size: .92rem; }
 {% endblock %}
-{% block contents %}{% endblock %}
 {% macro table(rows) %}
 <div class="table"><div class="scroll"><table>
 <thead><tr>{% for name in rows[0] %}<th scope="col"><button type="button">{{ name }}</button></th>
@@ -171,11 +170,6 @@ head.addEventListener("click", () => {
 )
 
 
-def page_of_fleet() -> Any:
-    """The template. MissingDependencyError without Jinja2."""
-    return page_template(TEMPLATE)
-
-
 def write_fleet_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[str, str]) -> None:
     """Write the page, atomically. facts: further ones for its end. Frames that cannot be read here make no pictures."""
     checks, rows, certificates = options.options, fleet.rows, fleet.certificates
@@ -198,7 +192,7 @@ def write_fleet_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Map
         sections = [(own, None, plots(own, fleet.variances), [], [], [], []) for own in shown[:MOST_VEHICLES]]
     write_page(
         path,
-        page_of_fleet(),
+        page_template(TEMPLATE),
         checks.config,
         checks.tolerance,
         command="certify" if certificates else "check",

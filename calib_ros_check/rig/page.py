@@ -13,7 +13,6 @@ from calib_ros_check.rig.check import PairCheck, RigCheck, SensorCheck
 TEMPLATE = (
     f"{{% block style %}}\n{STYLE}{{% endblock %}}"
     + """
-{% block contents %}{% endblock %}
 {% block main %}
 <p><span class="verdict {{ found.verdict.value }}">{{ found.verdict.value }}</span></p>
 <p class="said">{{ found.reason }}</p>

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib_ros.errors import BadInputError
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
 from calib_ros_evaluation.results import SET
@@ -58,10 +57,7 @@ QUICK = Plan(
 def jobs(
     plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str], experiments: Sequence[str]
 ) -> list[EvaluationJob]:
-    """All jobs, in the order of the report. BadInputError for an experiment that there is not."""
-    for name in experiments:
-        if name not in EXPERIMENTS:
-            raise BadInputError(f"there is no experiment '{name}'; choose among {', '.join(EXPERIMENTS)}")
+    """All jobs, in the order of the report."""
     around: Options = {"deg": plan.curve_reach[0], "m": plan.curve_reach[1], "samples": plan.curve_samples}
     largest = max(summaries, key=lambda s: len(s.groups[0]))
     several = [(one.label, group) for one in summaries for group in one.groups if len(group) >= SET]

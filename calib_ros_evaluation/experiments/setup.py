@@ -27,6 +27,7 @@ from calib_ros.datasets.positions import frame_positions
 from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame
+from calib_ros_check.checker import Checker
 from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.registry import methods
 
@@ -38,7 +39,7 @@ PACKAGES = (calib_ros, calib_ros_check, calib_ros_evaluation, calib_ros_semantic
 
 @dataclass(frozen=True)
 class SourceSpec:
-    """A source. label: its name among all. path: as open_source takes it. options: of open_source. reference: rows of a
+    """A source. label: its name among all. path, options: as open_dataset takes them. reference: rows of a
     T_camera_lidar (4, 4) that counts instead of the source's own; empty = the source's."""
 
     label: str
@@ -46,10 +47,6 @@ class SourceSpec:
     camera: int | str | None = None
     options: tuple[tuple[str, str], ...] = ()
     reference: tuple[tuple[float, ...], ...] = ()
-
-    def open(self) -> Source:
-        """The source. BadInputError if it cannot be opened."""
-        return open_dataset(self.path, camera=self.camera, **dict(self.options))
 
 
 @dataclass(frozen=True)
@@ -113,10 +110,13 @@ class WorkerCache:
         self.source = lru_cache(maxsize=None)(self._opened)
         self.frame = lru_cache(FRAMES)(self._read)
         self.features = lru_cache(FEATURES)(self._made)
+        self.checker = lru_cache(maxsize=1)(lambda label: Checker(self.source(label).camera, self.config))
 
     def _opened(self, label: str) -> Source:
-        """The source of a scene."""
-        return WithMotion(self.setup.scene(label).open(), self.config.motion, self._note, self.config.lidar.accumulate_s)
+        """The source of a scene. BadInputError if it cannot be opened."""
+        scene = self.setup.scene(label)
+        source = open_dataset(scene.path, camera=scene.camera, **dict(scene.options))
+        return WithMotion(source, self.config.motion, self._note, self.config.lidar.accumulate_s)
 
     def _read(self, label: str, position: int) -> Frame:
         """A frame of a scene. SourceGoneError if it cannot be read."""

@@ -7,6 +7,7 @@ import contextlib
 import time
 import tracemalloc
 import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,11 +25,13 @@ from calib_ros.registration.classes import CLOUD, IMAGE
 from calib_ros.registration.score.point_score import Score
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.experiments.job import EvaluationJob
-from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache, spread
+from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, spread, worker_cache
 from calib_ros_evaluation.methods.edges import LevinsonScore, worse_share
-from calib_ros_evaluation.protocols.definitions import PROTOCOLS, Size
+from calib_ros_evaluation.protocols.definitions import MISCALIBRATION, PROTOCOLS, TOLERANCE, Size, displacement
+from calib_ros_evaluation.results import OF_TRIALS
 from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_thesis.features import importance
 
@@ -105,6 +108,20 @@ def off(T: Matrix, reference: Matrix) -> list[float]:
     """Twist (6,) of T against the reference in the camera frame, deg and m."""
     xi = se3.log(T @ se3.inverse(reference))
     return [*np.rad2deg(xi[:3]).tolist(), *xi[3:].tolist()]
+
+
+def checked(cache: WorkerCache, job: EvaluationJob) -> Answer:
+    """The verdict of the check on a row of the published perturbations; where it cannot use its frames, it does not tell."""
+    reference = cache.reference(job.scene, job.frames[0])
+    T = reference @ displacement(dict(job.options))
+    answer: Answer = {"error_deg": se3.rotation_error_deg(reference, T), "error_m": se3.translation_error_m(reference, T)}
+    try:
+        result = cache.checker(job.scene).check([cache.frame(job.scene, k) for k in job.frames], T, TOLERANCE)
+    except NOT_THE_METHODS:
+        raise
+    except CalibrationError as error:
+        return answer | {"verdict": CheckVerdict.INCONCLUSIVE.value, "reason": str(error), "cpu_s": 0.0}
+    return answer | {"verdict": result.verdict.value, "reason": result.reason, "cpu_s": result.cpu_s}
 
 
 def cost(cache: WorkerCache, job: EvaluationJob) -> Answer:
@@ -216,3 +233,27 @@ def similarities(cache: WorkerCache, job: EvaluationJob) -> Answer:
         "threshold": cache.config.online.similarity_threshold,
         "histograms": {job.frames[k]: found[k].reshape(len(found[k]), BINS, -1).sum(axis=2).tolist() for k in shown},
     }
+
+
+KINDS: dict[str, Callable[[WorkerCache, EvaluationJob], Answer]] = {
+    **dict.fromkeys((*OF_TRIALS, *PROTOCOLS), trial),
+    MISCALIBRATION: checked,
+    "curves": loss_curves,
+    "averaging": averaging,
+    "similarity": similarities,
+    "cost": cost,
+    "trust": trust,
+}
+
+
+def run_jobs(setup: Setup, jobs: Sequence[EvaluationJob]) -> list[Answer]:
+    """The answers, in order. A method that cannot use its frames gives {"error": reason}; all other errors are raised."""
+    cache, answers = worker_cache(setup), []
+    for job in jobs:
+        try:
+            answers.append(KINDS[job.experiment](cache, job))
+        except NOT_THE_METHODS:
+            raise
+        except CalibrationError as error:
+            answers.append({"error": str(error)})
+    return answers

@@ -4,7 +4,7 @@ edges of a completed depth map (Castorena et al. 2016; eq. 4.4 and 4.5)."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -14,7 +14,6 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from calib_ros import se3
-from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.registration.score.point_score import Score, project
 from calib_ros.registration.score.sampler import MIN_DEPTH
@@ -39,32 +38,24 @@ WIDEST = 0.25  # of the box; half width of the first differences. From an eighth
 SHORT = 0.25  # of that half width; a shorter step means that the slope belongs to something narrower
 
 
-def grid_search(score: LevinsonScore, watched: Watched, T: Matrix, half_width: Matrix, finest: Matrix) -> Matrix:
-    """The best extrinsic (4, 4) by grid search around T: of the 729 neighbours the best is moved to; while that is the centre
-    itself, the step is halved, as long as it is above `finest` on any axis.
+def grid_search(score: LevinsonScore, T: Matrix, half_width: Matrix, finest: Matrix) -> tuple[Matrix, int]:
+    """The best extrinsic (4, 4) by grid search around T, and how often the score was evaluated: of the 729 neighbours the best is
+    moved to; while that is the centre itself, the step is halved, as long as it is above `finest` on any axis.
 
     The grid is laid out in the twist from T. half_width, finest: (6,) rad and m. The first step is half of half_width, and
-    beyond half_width nothing is tried; an axis of half width 0 stays. watched: counts the evaluations of `score`.
+    beyond half_width nothing is tried; an axis of half width 0 stays.
     """
-    centre, step = np.zeros(6), half_width / 2
-    watched.value(T)
+    centre, step, evaluations = np.zeros(6), half_width / 2, 1
     while (step > finest).any():
-        twists = centre + step * NEIGHBOURS[_differ(step)]
+        twists = centre + step * NEIGHBOURS[~NEIGHBOURS[:, step == 0].any(axis=1)]
         twists = twists[(np.abs(twists) <= half_width + 1e-12).all(axis=1)]
-        transforms = se3.exp_many(twists) @ T
-        best = int(np.argmax(score.values(transforms)))
-        watched.evaluations += len(transforms) - 1
+        best = int(np.argmax(score.values(se3.exp_many(twists) @ T)))
+        evaluations += len(twists)
         if best == 0:
             step = step / 2
         else:
             centre = twists[best]
-        watched.value(transforms[best])
-    return np.asarray(se3.exp(centre) @ T)
-
-
-def _differ(step: Matrix) -> NDArray[np.intp]:
-    """Rows of NEIGHBOURS that differ, given that axes of step 0 do not move."""
-    return np.flatnonzero(~NEIGHBOURS[:, step == 0].any(axis=1))
+    return np.asarray(se3.exp(centre) @ T), evaluations
 
 
 def worse_share(score: LevinsonScore, T: Matrix) -> float:
@@ -122,9 +113,8 @@ class Levinson(Viewing):
     finest_m: float = 0.003
     margin: float = 0.3
     min_points: int = 50  # per frame; fewer discontinuities are a wall or a covered sensor
-    config: Config = field(default_factory=Config)
-    name: str = "levinson"
-    title: str = "Levinson and Thrun (2013): depth discontinuities on image edges"
+    name = "levinson"
+    title = "Levinson and Thrun (2013): depth discontinuities on image edges"
 
     def features(self, frame: Frame) -> PointFeatures:
         """Points in front of a depth discontinuity of more than least_m, and D. TooFewFeaturesError for fewer than min_points."""
@@ -141,11 +131,8 @@ class Levinson(Viewing):
 
     def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Grid search within reach, by steps from half of it."""
-        score = self.score(features, T)
-        watched = Watched(score)
         finest = np.repeat([np.deg2rad(self.finest_deg), self.finest_m], 3)
-        found = grid_search(score, watched, T, reach.half_width(), finest)
-        return Outcome(found, watched.evaluations)
+        return Outcome(*grid_search(self.score(features, T), T, reach.half_width(), finest))
 
 
 class LevinsonScore:
@@ -316,9 +303,8 @@ class Castorena(Viewing):
     evaluations: int = 500  # per scale; most searches end after 100 to 300
     margin: float = 0.3
     min_points: int = 500  # per frame; of fewer no map can be completed
-    config: Config = field(default_factory=Config)
-    name: str = "castorena"
-    title: str = "Castorena et al. (2016): edges of the completed depth map on image edges"
+    name = "castorena"
+    title = "Castorena et al. (2016): edges of the completed depth map on image edges"
 
     def features(self, frame: Frame) -> PointFeatures:
         """The grey picture, and all points, far ones first. TooFewFeaturesError if hardly anything returned."""

@@ -13,7 +13,7 @@ there. Several frames: the mean of their distances.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,7 +23,6 @@ from scipy.special import entr
 from scipy.stats import rankdata
 
 from calib_ros import se3
-from calib_ros.config import Config
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image, project
@@ -147,12 +146,11 @@ class Pandey(Viewing):
     central differences. evaluations: of the score, at most. Nothing beyond the reach is tried.
     """
 
-    config: Config = field(default_factory=Config)
     step_share: float = 0.25
     epsilon_deg: float = 0.1
     evaluations: int = 400
-    name: str = "pandey"
-    title: str = "Pandey et al. 2015: mutual information of reflectivity and grey value"
+    name = "pandey"
+    title = "Pandey et al. 2015: mutual information of reflectivity and grey value"
 
     def features(self, frame: Frame) -> PointFeatures:
         """All points and their reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty."""
@@ -209,14 +207,13 @@ class Nid(Viewing):
     Nothing beyond the reach is tried, as in the published variant with slopes; the free simplex runs away on one scene.
     """
 
-    config: Config = field(default_factory=Config)
     tolerance_m: float = 0.1
     starts: int = 10
     evaluations: int = 600  # 256 steps of one to three each; the tolerances end it long before
     settled: tuple[float, float] = (0.5, 0.1)
     step_share: float = 0.35
-    name: str = "nid"
-    title: str = "Koide et al. 2023: normalised information distance of reflectivity and grey value"
+    name = "nid"
+    title = "Koide et al. 2023: normalised information distance of reflectivity and grey value"
 
     def features(self, frame: Frame) -> PointFeatures:
         """All points and their equalised reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty.

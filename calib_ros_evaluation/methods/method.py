@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,36 +37,47 @@ class Outcome:
     refused: str = ""
 
 
-class Method(Protocol):
+@dataclass(frozen=True)
+class Method:
     """A method as it was published: a score of the extrinsic and how it is maximised.
 
     All get the same frames, rectified and with the points moved to the image's moment, and know how far off the start may be.
+    name: in tables and on the command line, a lower-case word. title: for people: authors and what is matched with what.
     """
 
-    @property
-    def name(self) -> str:
-        """In tables and on the command line: a lower-case word."""
-        ...
+    config: Config = field(default_factory=Config)
+    name: ClassVar[str]
+    title: ClassVar[str]
 
-    @property
-    def title(self) -> str:
-        """For people: authors and what is matched with what."""
-        ...
+    @cached_property
+    def own_config(self) -> Config:
+        """The configuration with what the method itself chooses."""
+        return self.config
+
+    @cached_property
+    def _last(self) -> list[FeatureExtractor]:
+        return []
+
+    def extractor(self, camera: Camera) -> FeatureExtractor:
+        """Of the features of a camera's images; that of the last camera, whose look-up tables are kept, is used again."""
+        if not self._last or self._last[0].source_camera != camera:
+            self._last[:] = [FeatureExtractor(camera, self.own_config)]
+        return self._last[0]
 
     def features(self, frame: Frame) -> Any:
         """What the method keeps of a frame; does not depend on the extrinsic. CalibrationError if there is nothing to keep."""
-        ...
+        raise NotImplementedError
 
     def score(self, features: Sequence[Any], T_prior: Matrix) -> Score:
         """What is maximised over these frames of one camera. T_prior: (4, 4), near; points far outside its image may be left out.
 
         CalibrationError if too little falls into the image.
         """
-        ...
+        raise NotImplementedError
 
     def optimise(self, features: Sequence[Any], T: Matrix, reach: SearchBox) -> Outcome:
         """Calibrate from T_camera_lidar (4, 4). reach: how far off that may be, per axis."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass(eq=False)
@@ -98,42 +109,29 @@ def search_limits(T: Matrix, reach: SearchBox) -> Limits:
     return unlimited(T) if reach.is_empty else Limits(T, reach.half_width())
 
 
-class Extractors:
-    """The feature extractor of a configuration for the last camera, whose look-up tables are kept."""
-
-    def __init__(self, config: Config) -> None:
-        self.config = config
-        self._last: FeatureExtractor | None = None
-
-    def of(self, camera: Camera) -> FeatureExtractor:
-        """For images of a camera."""
-        if self._last is None or self._last.source_camera != camera:
-            self._last = FeatureExtractor(camera, self.config)
-        return self._last
-
-
-class Extracting:
+class Extracting(Method):
     """Base of methods that work with features of the calibrator. objective: of ``refine.objective``."""
 
     objective: ClassVar[str]
-    config: Config
 
     @cached_property
-    def _extractors(self) -> Extractors:
+    def own_config(self) -> Config:
+        """See Method."""
         refine = self.config.refine
         # An optimiser that was chosen with another objective, as by a preset, is not this one's.
         optimizer = refine.optimizer if refine.objective in ("fast", self.objective) else "auto"
-        return Extractors(replace(self.config, refine=replace(refine, objective=self.objective, optimizer=optimizer)))
+        return replace(self.config, refine=replace(refine, objective=self.objective, optimizer=optimizer))
 
     @cached_property
-    def _segmentation(self) -> SegmentationModels:
+    def segmentation(self) -> SegmentationModels:
+        """The models of the configuration."""
         return SegmentationModels(self.config.semantics)
 
     def features(self, frame: Frame) -> FrameFeatures:
         """Features of a frame, with semantics where the configuration asks for any. TooFewFeaturesError or BadTimesError if it
         cannot be used."""
-        seen = self._segmentation(frame) if self._segmentation.active else None
-        return self._extractors.of(frame.camera)(frame, seen)
+        seen = self.segmentation(frame) if self.segmentation.active else None
+        return self.extractor(frame.camera)(frame, seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,14 +149,13 @@ class PointFeatures:
         return replace(self, xyz=self.xyz[keep], value=None if self.value is None else self.value[keep])
 
 
-class Viewing:
+class Viewing(Method):
     """Base of the baselines, which project by eq. 2.3."""
 
-    config: Config
-
     @cached_property
-    def _extractors(self) -> Extractors:
-        return Extractors(replace(self.config, image=replace(self.config.image, projection="pinhole")))
+    def own_config(self) -> Config:
+        """See Method."""
+        return replace(self.config, image=replace(self.config.image, projection="pinhole"))
 
     def _preprocess(self, frame: Frame) -> tuple[PointFeatures, PointCloud]:
         """The grey image (h, w) uint8 with all points and their reflectivity, float32 in 0..1, None if the source has none; and
@@ -166,7 +163,7 @@ class Viewing:
 
         TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
         require_returns(frame.cloud)
-        extract, measured = self._extractors.of(frame.camera), frame.cloud.finite()
+        extract, measured = self.extractor(frame.camera), frame.cloud.finite()
         at_image = deskewed_points(frame, self.config.motion)
         xyz = measured.xyz if at_image is None else at_image[frame.cloud.finite_mask()]
         gray = to_gray(extract.working_image(frame.image))

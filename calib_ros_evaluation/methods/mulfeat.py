@@ -4,7 +4,7 @@ arXiv 2207.07228), as the thesis describes it: eq. 4.6, tables 4.2 and 4.3."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,29 +45,20 @@ Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
 class Grid:
-    """Cells of a cylinder of radius 1: row 0 is the highest, columns run counter-clockwise from azimuth -180 deg.
+    """Cells of a cylinder of radius 1: row 0 is the highest, columns run counter-clockwise from azimuth -180 deg, and close the
+    circle. top: height of the upper rim. row_step: height of a cell."""
 
-    top: height of the upper rim. row_step: height of a cell. column_step: width of one, rad; they close the circle.
-    """
-
-    top: float
-    row_step: float
-    rows: int
-    columns: int
-
-    @staticmethod
-    def of(scan: RangeImage, xyz: Floats, rows_per_ring: float, columns_per_step: float) -> Grid:
+    def __init__(self, scan: RangeImage, xyz: Floats, rows_per_ring: float, columns_per_step: float) -> None:
         """So many cells from one ring of the scan to the next, and from one azimuth to the next, for points (n, 3)."""
         height = _height(xyz)
         spacing = scan.azimuth_step
         if scan.layout == "rings" and len(scan.elevation) > 1:
             spacing = float(np.median(np.abs(np.diff(scan.elevation))))
         top, bottom = float(height.max()), float(height.min())
-        step = max(spacing / rows_per_ring, (top - bottom) / (MAX_ROWS - 1), 1e-4)
-        columns = min(max(round(2 * np.pi * columns_per_step / scan.azimuth_step), 3), MAX_COLUMNS)
-        return Grid(top + step / 2, step, int((top - bottom) / step + 0.5) + 1, columns)
+        self.row_step = max(spacing / rows_per_ring, (top - bottom) / (MAX_ROWS - 1), 1e-4)
+        self.top, self.rows = top + self.row_step / 2, int((top - bottom) / self.row_step + 0.5) + 1
+        self.columns = min(max(round(2 * np.pi * columns_per_step / scan.azimuth_step), 3), MAX_COLUMNS)
 
     def cells(self, xyz: Floats) -> tuple[Indices, Indices]:
         """Rows and columns (n,) of points (n, 3)."""
@@ -98,7 +89,7 @@ def edge_probability(
     xyz, r = xyz[passed], r[passed]
     depth = point_depth(xyz)
     points = PointAttributes(xyz, depth, r, np.zeros_like(depth), ground, object_labels(xyz, depth, ground, thesis))
-    grid = Grid.of(range_image(cloud, config.lidar), xyz, rows_per_ring, columns_per_step)
+    grid = Grid(range_image(cloud, config.lidar), xyz, rows_per_ring, columns_per_step)
     row, column = grid.cells(xyz)
     cell = row * grid.columns + column
     order = np.lexsort((depth, cell))
@@ -149,9 +140,8 @@ class Mulfeat(Viewing):
     evaluations: int = 240
     margin: float = 0.3
     min_points: int = 200
-    config: Config = field(default_factory=Config)
-    name: str = "mulfeat"
-    title: str = "MulFEAT (Zhang et al. 2022): edges of depth, reflectivity and objects on a cylinder on image edges"
+    name = "mulfeat"
+    title = "MulFEAT (Zhang et al. 2022): edges of depth, reflectivity and objects on a cylinder on image edges"
 
     def features(self, frame: Frame) -> PointFeatures:
         """P(E^L) and E^C. TooFewFeaturesError for fewer than min_points points with P above 0."""

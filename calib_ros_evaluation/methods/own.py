@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
@@ -32,10 +31,9 @@ LINEARISATION = 4  # evaluations: a slope looks the maps up four times, a value 
 class Own(Extracting):
     """The calibrator with the search box of the reach. It refuses what it does not trust."""
 
-    objective: ClassVar[str] = "fast"
-    config: Config = field(default_factory=Config)
-    name: str = "ours"
-    title: str = "This project: oriented edge points of the scan with edges of the image"
+    objective = "fast"
+    name = "ours"
+    title = "This project: oriented edge points of the scan with edges of the image"
 
     def score(self, features: Sequence[FrameFeatures], T_prior: Matrix) -> LevelScore:
         """The fast score on its finest level."""
@@ -48,7 +46,7 @@ class Own(Extracting):
             self.score(features, T)
         except TooFewFeaturesError as error:
             return Outcome(T, 0, str(error))
-        calibrator = Calibrator(features[0].camera, self._extractors.config, self._segmentation)
+        calibrator = Calibrator(features[0].camera, self.own_config, self.segmentation)
         with counted() as count:
             if calibrator.classes_in_doubt_only:
                 plain = [f.plain or f for f in features]
@@ -89,11 +87,10 @@ class Thesis(Extracting):
     each next smoothing. ``thesis.evaluations`` limits the evaluations of a smoothing. Nothing beyond the reach is tried.
     """
 
-    objective: ClassVar[str] = "thesis"
-    config: Config = field(default_factory=Config)
+    objective = "thesis"
     first_step: float = 0.4
-    name: str = "thesis"
-    title: str = "Thesis: edges of depth, reflectivity and objects with edges and classes of the image"
+    name = "thesis"
+    title = "Thesis: edges of depth, reflectivity and objects with edges and classes of the image"
 
     def score(self, features: Sequence[FrameFeatures], T_prior: Matrix) -> ThesisLevelScore:
         """J at the last, finest smoothing; over frames the mean by their weights w_j, eq. 3.16, alike without classes."""
@@ -101,7 +98,7 @@ class Thesis(Extracting):
 
     def _scores(self, features: Sequence[FrameFeatures], T_prior: Matrix) -> ThesisScore:
         own = [f.own for f in features]
-        return ThesisScore(own, T_prior, self._extractors.config, frame_weights([f.importance for f in own]).tolist())
+        return ThesisScore(own, T_prior, self.own_config, frame_weights([f.importance for f in own]).tolist())
 
     def optimise(self, features: Sequence[FrameFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Smoothing after smoothing."""

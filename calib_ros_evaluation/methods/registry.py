@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from calib_ros.config import Config
-from calib_ros.errors import BadInputError
 from calib_ros_evaluation.methods.edges import Castorena, Levinson
 from calib_ros_evaluation.methods.information import Nid, Pandey
 from calib_ros_evaluation.methods.method import Method
@@ -18,10 +17,3 @@ NAMES = tuple(method.name for method in METHODS)
 def methods(config: Config) -> dict[str, Method]:
     """Name -> method, in the order of NAMES; all work with this configuration."""
     return {method.name: method(config=config) for method in METHODS}
-
-
-def check_names(names: tuple[str, ...]) -> None:
-    """BadInputError for a name that no method has."""
-    for name in names:
-        if name not in NAMES:
-            raise BadInputError(f"there is no method '{name}'; choose among {', '.join(NAMES)}")

@@ -4,36 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
-from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros_check.checker import Checker
+from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_check.outcome import CheckVerdict, Tolerance
+from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.evaluate import Study, StudyReport
-from calib_ros_evaluation.experiments.answers import Answers, read_answers
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
-from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, WorkerCache, worker_cache
-from calib_ros_evaluation.protocols.definitions import MISCALIBRATION
-from calib_ros_evaluation.protocols.published import ACCURACIES, protocol_report
-from calib_ros_evaluation.report.statistics import median
+from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache
+from calib_ros_evaluation.protocols.definitions import ACCURACIES, MISCALIBRATION, ROTATION, SHIFT
+from calib_ros_evaluation.protocols.trials import protocol_report
 from calib_ros_evaluation.report.table import NONE, Rows, Table, interval, percent, plural
-from calib_ros_evaluation.results import numbers, read_table
+from calib_ros_evaluation.report.tables import median
+from calib_ros_evaluation.results import Answers, numbers, read_answers, read_table
 
-Matrix = NDArray[np.float64]
 RIGHT_SET = "pos"  # holds right extrinsics, all others wrong ones
-DOUBLED = 2.0  # the published code turns by twice the degrees of its table, and so do the published figures
-TOLERANCE = Tolerance(1.0, 0.05)  # what the set of right ones lies within: up to 1.0 deg and 3.5 cm
 ADVICE = "give the table of published perturbations by --table"
-SHIFT, ROTATION = ("x_m", "y_m", "z_m"), ("rx_deg", "ry_deg", "rz_deg")
 COLUMNS = ("set", "frame", *SHIFT, *ROTATION)
 LARGEST = dict.fromkeys(SHIFT, se3.MAX_TRANSLATION_M) | dict.fromkeys(ROTATION, 360.0)
 RIGHT, WRONG, INCONCLUSIVE = "right", "wrong", "inconclusive"
@@ -47,10 +37,7 @@ class Detection(Study):
     rows: pd.DataFrame
     counts: tuple[int, ...]
 
-    @property
-    def about(self) -> dict[str, str]:
-        """See Study."""
-        return {"protocol": MISCALIBRATION}
+    about: ClassVar[dict[str, str]] = {"protocol": MISCALIBRATION}
 
     def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
         """See Study. BadInputError for several sources, or for one without a frame of the table."""
@@ -59,10 +46,6 @@ class Detection(Study):
         (source,), cache = summaries, WorkerCache(setup)
         names = {cache.frame(source.label, position).name: position for position in source.frames}
         return detection_jobs(self.rows, names, source, self.counts)
-
-    def work(self, setup: Setup, todo: Sequence[EvaluationJob]) -> list[Answer]:
-        """See Study: a check that cannot use its frames does not tell."""
-        return [_checked(setup, one) for one in todo]
 
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """See Study. Decisions by set and in all, beside the published accuracies."""
@@ -119,33 +102,6 @@ def detection_jobs(
         for count in counts
         for first, values in known
     ]
-
-
-def displacement(values: Mapping[str, Any]) -> Matrix:
-    """(4, 4) that the right extrinsic is multiplied with from the right, T_camera_lidar D: a rotation vector of DOUBLED the
-    printed degrees, and the shift."""
-    shift, turn = ([float(values[name]) for name in names] for names in (SHIFT, ROTATION))
-    return se3.from_parts(Rotation.from_rotvec(DOUBLED * np.deg2rad(turn)).as_matrix(), shift)
-
-
-def _checked(setup: Setup, one: EvaluationJob) -> Answer:
-    cache = worker_cache(setup)
-    reference = cache.reference(one.scene, one.frames[0])
-    T = reference @ displacement(dict(one.options))
-    answer = {"error_deg": se3.rotation_error_deg(reference, T), "error_m": se3.translation_error_m(reference, T)}
-    try:
-        result = _checker(setup, one.scene).check([cache.frame(one.scene, k) for k in one.frames], T, TOLERANCE)
-    except NOT_THE_METHODS:
-        raise
-    except CalibrationError as error:
-        return {**answer, "verdict": CheckVerdict.INCONCLUSIVE.value, "reason": str(error), "cpu_s": 0.0}
-    return {**answer, "verdict": result.verdict.value, "reason": result.reason, "cpu_s": result.cpu_s}
-
-
-@lru_cache(maxsize=1)
-def _checker(setup: Setup, label: str) -> Checker:
-    """The checker of a process, whose look-up tables and models are kept."""
-    return Checker(worker_cache(setup).source(label).camera, setup.config)
 
 
 def decision_of(one: EvaluationJob, answer: Answer) -> dict[str, Any]:

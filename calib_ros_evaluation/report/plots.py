@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from calib_ros.frame import SemanticClass
 from calib_ros_evaluation.curves import AXES, COLORS, Curves, Style, above, draw_curves, empty_figure, pixels
-from calib_ros_evaluation.report.statistics import OURS, axis_errors, groups, quantile, wilson
+from calib_ros_evaluation.report.table import wilson
+from calib_ros_evaluation.report.tables import OURS, axis_errors, groups, quantile
 from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, Similarity
 
 Matrix = NDArray[np.float64]

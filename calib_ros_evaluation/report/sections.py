@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from calib_ros_evaluation.report import plots, tables
 from calib_ros_evaluation.report.plots import Plot, Styles, method_styles
-from calib_ros_evaluation.report.statistics import all_methods, axis_errors, curves_of_methods, curves_of_scenes, trials_of
 from calib_ros_evaluation.report.table import Table
+from calib_ros_evaluation.report.tables import axis_errors, curves_of_methods, curves_of_scenes, trials_of
 from calib_ros_evaluation.results import Results
 
 MOST_SCENES = 4  # drawn one by one; the tables and the mean have all
@@ -68,32 +68,27 @@ class Section:
 
 def sections(results: Results) -> list[Section]:
     """Sections with content; the last one says what failed."""
-    styles = method_styles(all_methods(results))
-    titles = [(name, results.titles.get(name, ""), styles[name]["color"]) for name in styles]
+    styles = method_styles(list(results.titles))
+    titles = [(name, title, styles[name]["color"]) for name, title in results.titles.items()]
     summary = tables.summary(results)
-    one, starts, frames = (trials_of(results, name) for name in ("single", "starts", "frames"))
-    of_one = [tables.axes(results), tables.single(results), *tables.scenes(results)] if one else []
-    ended = {name: own for name, own in one.items() if len(axis_errors(own))}
-    averages = [plots.averaging(f"averaging_{k}", own) for k, own in enumerate(results.averagings, start=1)]
-    similar = [plots.similarity(f"similarity_{k}", own) for k, own in enumerate(results.similarities, start=1)]
     made = [
         Section("summary", "Summary", SUMMARY, methods=titles, tables=[summary] if summary.rows else []),
         _loss_curves(results, styles),
-        Section("single", "Errors of single frames", SINGLE, tables=of_one, plots=[plots.boxes(ended, styles)] if ended else []),
-        Section(
-            "starts",
-            "Size of the start error",
-            STARTS,
-            tables=[tables.starts(results)] if starts else [],
-            plots=[plots.starts(starts, styles)] if starts else [],
-        ),
-        Section(
-            "frames",
-            "Number of frames",
-            FRAMES,
-            tables=tables.frames(results) if frames else [],
-            plots=[plots.frames(frames, styles)] if frames else [],
-        ),
+    ]
+    if one := trials_of(results, "single"):
+        found = [tables.axes(results), tables.single(results), *tables.scenes(results)]
+        ended = {name: own for name, own in one.items() if len(axis_errors(own))}
+        drawn = [plots.boxes(ended, styles)] if ended else []
+        made.append(Section("single", "Errors of single frames", SINGLE, tables=found, plots=drawn))
+    if starts := trials_of(results, "starts"):
+        found, drawn = [tables.starts(results)], [plots.starts(starts, styles)]
+        made.append(Section("starts", "Size of the start error", STARTS, tables=found, plots=drawn))
+    if frames := trials_of(results, "frames"):
+        found, drawn = tables.frames(results), [plots.frames(frames, styles)]
+        made.append(Section("frames", "Number of frames", FRAMES, tables=found, plots=drawn))
+    averages = [plots.averaging(f"averaging_{k}", own) for k, own in enumerate(results.averagings, start=1)]
+    similar = [plots.similarity(f"similarity_{k}", own) for k, own in enumerate(results.similarities, start=1)]
+    made += [
         Section("averaging", "Weighted averaging", AVERAGING, tables=tables.averaging(results), plots=averages),
         Section("similarity", "Similarity and keyframes", SIMILARITY, tables=tables.keyframes(results), plots=similar),
         Section("trust", "Is a calibration right?", TRUST, tables=[tables.detection(results.trusts)] if results.trusts else []),

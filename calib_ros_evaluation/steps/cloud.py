@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -12,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.lidar.range_image import range_image
-from calib_ros.lidar.segmentation import Plane
 from calib_ros.overlay import BAR, put, text_width
 from calib_ros.registration.score.point_score import project
 from calib_ros_evaluation.steps.pictures import (
@@ -44,7 +42,6 @@ from calib_ros_thesis.cloud import (
 )
 from calib_ros_thesis.config import thesis_of
 
-Matrix = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 SECTION = "3.3"
@@ -65,7 +62,6 @@ def depth_scale(depth: Floats) -> Scale:
     return Scale("depth (eq. 3.8), m", low, max(float(f"{high:.2g}"), 2 * low), VIRIDIS, log=True, falling=True)
 
 
-@dataclass(frozen=True, eq=False)
 class Cloud:
     """All returns of a scan (n,) in the order of its panorama, and what the thesis finds of them.
 
@@ -73,36 +69,25 @@ class Cloud:
     right border of the camera's picture, rad. colors: (n, 3) by depth, on `scale`.
     """
 
-    xyz: Floats
-    index: NDArray[np.int32]
-    borders: Matrix
-    depth: Floats
-    reflectivity: Floats | None
-    passed: Mask
-    plane: Plane | None
-    ground: Mask
-    label: NDArray[np.uint8]
-    scale: Scale
-    colors: Image
-
-    @staticmethod
-    def of(scene: RegisteredFrame) -> Cloud:
-        """The same steps as attributes(), which keeps only the points that are left in the end."""
+    def __init__(self, scene: RegisteredFrame) -> None:
+        # The same steps as attributes(), which keeps only the points that are left in the end.
         config, camera = thesis_of(scene.config), scene.frame.camera
         scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0))  # nothing is cut off
-        xyz, d = scan.cloud.xyz, depth(scan.cloud.xyz)
-        reach, passed = within_reach(xyz, config), within_thresholds(xyz, scan.reflectivity, config)
-        plane = ground_plane(xyz[reach], config)
-        ground, label = np.zeros(len(xyz), bool), np.full(len(xyz), NO_OBJECT, np.uint8)
-        ground[reach] = ground_points(xyz[reach], plane, config)
-        ground &= passed
-        label[passed] = object_labels(xyz[passed], d[passed], ground[passed], config)
+        self.xyz = xyz = scan.cloud.xyz
+        self.index, self.reflectivity = np.ascontiguousarray(scan.index[:, ::-1]), scan.reflectivity
+        self.depth = depth(xyz)
+        reach, self.passed = within_reach(xyz, config), within_thresholds(xyz, scan.reflectivity, config)
+        self.plane = ground_plane(xyz[reach], config)
+        self.ground, self.label = np.zeros(len(xyz), bool), np.full(len(xyz), NO_OBJECT, np.uint8)
+        self.ground[reach] = ground_points(xyz[reach], self.plane, config)
+        self.ground &= self.passed
+        some = self.passed
+        self.label[some] = object_labels(xyz[some], self.depth[some], self.ground[some], config)
         rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T
         ahead = rays @ scene.T[:3, :3]
-        borders, index = np.arctan2(ahead[:, 1], ahead[:, 0]), np.ascontiguousarray(scan.index[:, ::-1])
-        scale = depth_scale(d)
-        colors = scale.palette[scale.levels(d)]
-        return Cloud(xyz, index, borders, d, scan.reflectivity, passed, plane, ground, label, scale, colors)
+        self.borders = np.arctan2(ahead[:, 1], ahead[:, 0])
+        self.scale = depth_scale(self.depth)
+        self.colors = self.scale.palette[self.scale.levels(self.depth)]
 
     def draw(self, colors: Image, scale: Scale | None = None) -> Image:
         """Colours (n, 3) of the points -> panorama with azimuths above, the camera's borders, and the scale below."""
@@ -122,7 +107,7 @@ class Cloud:
 
 
 def cloud_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
-    """Raw scan and threshold filters."""
+    """Raw scan, threshold filters, the ground found and removed, then clusters of what is left."""
     yield wide_step(
         "Scan by depth",
         f"Figure 3.7a: all {len(cloud.xyz)} returns of the scan as a panorama; a row is a ring of the LiDAR, a column a "
@@ -144,6 +129,8 @@ def cloud_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
             cloud.draw(PLASMA[REFLECTIVITY.levels(cloud.reflectivity)], REFLECTIVITY),
         )
     yield from _filters(scene, cloud)
+    yield from _ground(scene, cloud)
+    yield from _clusters(scene, cloud)
 
 
 def _filters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
@@ -210,12 +197,6 @@ def _choices(scene: RegisteredFrame, cloud: Cloud) -> Iterator[tuple[str, str, s
         "5 to 30 m",
         by_range(xyz, 5, 30),
     )
-
-
-def object_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
-    """The ground found and removed, then clusters of what is left."""
-    yield from _ground(scene, cloud)
-    yield from _clusters(scene, cloud)
 
 
 def _ground(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:

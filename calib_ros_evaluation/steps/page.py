@@ -7,8 +7,8 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import yaml
@@ -21,11 +21,10 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.io import write_atomically
 from calib_ros_check.page import page_template
-from calib_ros_evaluation.steps.cloud import Cloud, cloud_steps, object_steps
+from calib_ros_evaluation.steps.cloud import Cloud, cloud_steps
 from calib_ros_evaluation.steps.image import edge_steps, preparation_steps
-from calib_ros_evaluation.steps.maps import map_steps
+from calib_ros_evaluation.steps.maps import map_steps, score_steps
 from calib_ros_evaluation.steps.pictures import Matrix, RegisteredFrame, Step
-from calib_ros_evaluation.steps.score import score_steps
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
 from calib_ros_semantics.models.segmentation import SegmentationModels
 
@@ -86,16 +85,6 @@ TEMPLATE = """\
 """
 
 
-@dataclass(frozen=True)
-class Figure:
-    """A step on the page. file: of the picture beside it; empty if there is none. size: its width and height, px."""
-
-    number: int
-    step: Step
-    file: str
-    size: tuple[int, int]
-
-
 def make_steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) -> Iterator[Step]:
     """The steps of a frame at T_camera_lidar (4, 4), made one by one. samples: of each loss curve.
 
@@ -103,12 +92,10 @@ def make_steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) 
     Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without matplotlib.
     """
     models = SegmentationModels(config.semantics)
-    scene = RegisteredFrame.of(frame, T, config, models(frame) if models.active else None)
+    scene = RegisteredFrame(frame, T, config, models(frame) if models.active else None)
     yield from preparation_steps(scene)
     yield from edge_steps(scene)
-    cloud = Cloud.of(scene)
-    yield from cloud_steps(scene, cloud)
-    yield from object_steps(scene, cloud)
+    yield from cloud_steps(scene, Cloud(scene))
     yield from map_steps(scene)
     yield from score_steps(scene, samples)
     yield from semantic_steps(scene)
@@ -132,28 +119,27 @@ def write_page(
     title: str,
     facts: Mapping[str, str],
     configuration: str,
-    sections: Mapping[str, tuple[str, str]],
     steps: Iterable[Step],
     progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
     """Write pictures and page once all steps are made; returns the page.
 
-    facts: the page's head. configuration: as YAML. sections: number -> heading and introduction, in the order of the page.
-    progress: called with the number of steps made. Pictures of an earlier page in the folder go. Raises what making the steps
-    raises, then nothing is written; BadInputError if the folder cannot be used; MissingDependencyError without Jinja2.
+    facts: the page's head. configuration: as YAML. progress: called with the number of steps made. Pictures of an earlier page in
+    the folder go. Raises what making the steps raises, then nothing is written; BadInputError if the folder cannot be used;
+    MissingDependencyError without Jinja2.
     """
     template = page_template(TEMPLATE)
     check_folder(folder)
-    figures, pictures = [], {}
+    figures, pictures = list[dict[str, Any]](), {}
     for number, step in enumerate(steps, start=1):
         file, size = "", (0, 0)
         if step.picture is not None:
             file = f"{number:02d}_{re.sub('[^a-z0-9]+', '_', step.name.lower()).strip('_')}.png"
             size = (step.picture.shape[1], step.picture.shape[0])
             pictures[file] = cv2.imencode(".png", step.picture)[1].tobytes()
-        figures.append(Figure(number, step, file, size))
+        figures.append({"number": number, "step": step, "file": file, "size": size})
         progress(number)
-    chapters = [(number, *heading, [f for f in figures if f.step.section == number]) for number, heading in sections.items()]
+    chapters = [(key, *heading, [own for own in figures if own["step"].section == key]) for key, heading in SECTIONS.items()]
     page = template.render(title=title, facts=facts, configuration=configuration, chapters=chapters, command="steps")
     target = folder / PAGE
     before = PICTURE.findall(target.read_text(encoding="utf-8", errors="replace")) if target.exists() else []
@@ -200,7 +186,7 @@ def run_steps(args: argparse.Namespace) -> str:
     title = f"The method step by step: {source.name}, frame {position}"
     with progress_bar("drawing") as step:
         made = make_steps(frame, T, config)
-        page = write_page(folder, title, facts, settings, SECTIONS, made, lambda done: step(min(done, EXPECTED), EXPECTED))
+        page = write_page(folder, title, facts, settings, made, lambda done: step(min(done, EXPECTED), EXPECTED))
     return f"{page}\nopen it in a browser: {page.resolve().as_uri()}"
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import cv2
@@ -19,13 +18,13 @@ from calib_ros.frame import Frame
 from calib_ros.image.enhance import prepare, to_gray
 from calib_ros.overlay import BAR, put, text_width
 from calib_ros.registration.classes import OF_CLASSES, OF_MASKS, FrameSemantics
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures
+from calib_ros.registration.features import FeatureExtractor
 from calib_ros_evaluation.curves import COLORS, Curves, above, draw_curves, empty_figure, pixels
 from calib_ros_semantics.class_pictures import BACKGROUND, sizes
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures, semantic_share
 from calib_ros_thesis.image import blend, gradient_edges
-from calib_ros_thesis.score import RegistrationMaps, registration_maps
+from calib_ros_thesis.score import registration_maps
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -52,75 +51,41 @@ class Step:
     wide: bool = False
 
 
-@dataclass(frozen=True, eq=False)
 class RegisteredFrame:
-    """A frame as the registration sees it. frame: rectified, at working size. source: as recorded.
+    """A frame as the registration sees it. source: as recorded. frame: rectified, at working size. gray, prepared: its image
+    (h, w), and as the edge operators get it.
 
-    T: T_camera_lidar (4, 4) of the pictures. maps: of eq. 3.12 there, at the last smoothing. semantics: of the
-    source, None without models. semantic: its edges (2, h, w) in 0..1 at working size, to 1/255.
+    T: T_camera_lidar (4, 4) of the pictures. wrong: T turned and moved to the side, both the same way in the picture. thesis:
+    what eq. 3.12 keeps of the frame. maps: of eq. 3.12 at T, at the last smoothing. semantics: of the source, None without
+    models. semantic: its edges (2, h, w) in 0..1 at working size, to 1/255; semantic_edges: what they are called; semantic_share:
+    theirs in E^I. unsmoothed: E^I (h, w) before its smoothing, gradient edges with semantic ones where there are any (figure
+    3.10).
+
+    Raises TooFewFeaturesError if the scan is empty.
     """
 
-    source: Frame
-    frame: Frame
-    T: Matrix
-    config: Config
-    features: FrameFeatures
-    maps: RegistrationMaps
-    semantics: FrameSemantics | None = None
-    semantic: NDArray[np.float32] | None = None
-
-    @staticmethod
-    def of(frame: Frame, T: Matrix, config: Config, semantics: FrameSemantics | None = None) -> RegisteredFrame:
-        """Raises TooFewFeaturesError if the scan is empty."""
+    def __init__(self, source: Frame, T: Matrix, config: Config, semantics: FrameSemantics | None = None) -> None:
+        self.source, self.T, self.config, self.semantics = source, T, config, semantics
+        thesis = thesis_of(config)
         # The optimiser goes back to auto: pictures need none, and not every one goes with the thesis's objective.
         refine = dataclasses.replace(config.refine, objective="thesis", optimizer="auto")
-        extract = FeatureExtractor(frame.camera, dataclasses.replace(config, refine=refine))
-        features = extract(frame, semantics)
-        working = dataclasses.replace(frame, image=extract.working_image(frame.image), camera=extract.camera, classes=None)
-        maps = registration_maps(features.own, T, thesis_of(config))
-        semantic = None
+        extract = FeatureExtractor(source.camera, dataclasses.replace(config, refine=refine))
+        self.features = extract(source, semantics)
+        self.thesis: ThesisFeatures = self.features.own
+        image = extract.working_image(source.image)
+        self.frame = dataclasses.replace(source, image=image, camera=extract.camera, classes=None)
+        self.gray, self.prepared = to_gray(image), prepare(image)
+        self.wrong = np.asarray(se3.exp([0, np.deg2rad(WRONG_DEG), 0, 0, 0, 0]) @ se3.exp([0, 0, 0, WRONG_M, 0, 0]) @ T)
+        self.maps = registration_maps(self.thesis, T, thesis)
+        self.semantic, self.semantic_edges, strength = None, "no semantic edges", None
+        edges_of = OF_MASKS if semantics is None else semantics.edges_of
         if semantics is not None and semantics.edges is not None:
             levels = np.asarray(np.rint(255 * semantics.edges), np.uint8)
-            semantic = np.stack([extract.working_image(part) for part in levels]) / np.float32(255)
-        return RegisteredFrame(frame, working, T, config, features, maps, semantics, semantic)
-
-    @property
-    def thesis(self) -> ThesisFeatures:
-        """What eq. 3.12 keeps of the frame."""
-        own: ThesisFeatures = self.features.own
-        return own
-
-    @property
-    def wrong(self) -> Matrix:
-        """T turned and moved to the side, both the same way in the picture."""
-        return np.asarray(se3.exp([0, np.deg2rad(WRONG_DEG), 0, 0, 0, 0]) @ se3.exp([0, 0, 0, WRONG_M, 0, 0]) @ self.T)
-
-    @property
-    def semantic_edges(self) -> str:
-        """What they are called."""
-        return "no semantic edges" if self.semantics is None or self.semantic is None else SEMANTIC_EDGES[self.semantics.edges_of]
-
-    @cached_property
-    def gray(self) -> Image:
-        """The image (h, w) grey."""
-        return to_gray(self.frame.image)
-
-    @cached_property
-    def prepared(self) -> Image:
-        """The image (h, w) as the edge operators get it."""
-        return prepare(self.frame.image)
-
-    @cached_property
-    def unsmoothed(self) -> NDArray[np.float32]:
-        """E^I (h, w) before its smoothing: gradient edges, blended with semantic ones where there are any (figure 3.10)."""
-        gradient = gradient_edges(self.prepared, thesis_of(self.config))
-        semantic = None if self.semantic is None else np.asarray(np.minimum(self.semantic.sum(axis=0), 1), np.float32)
-        return blend(gradient, semantic, self.semantic_share)
-
-    @property
-    def semantic_share(self) -> float:
-        """Share of the semantic edges in E^I."""
-        return semantic_share(thesis_of(self.config), OF_MASKS if self.semantics is None else self.semantics.edges_of)
+            self.semantic = np.stack([extract.working_image(part) for part in levels]) / np.float32(255)
+            self.semantic_edges = SEMANTIC_EDGES[edges_of]
+            strength = np.asarray(np.minimum(self.semantic.sum(axis=0), 1), np.float32)
+        self.semantic_share = semantic_share(thesis, edges_of)
+        self.unsmoothed = blend(gradient_edges(self.prepared, thesis), strength, self.semantic_share)
 
 
 def _ramp(colormap: int, low: int, high: int) -> Image:

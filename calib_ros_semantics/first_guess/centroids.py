@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from calib_ros.registration.search.constraints import Prior
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 from calib_ros_semantics.first_guess.score import distinct
 from calib_ros_semantics.first_guess.view import CELL_DEG, ClassView
+from calib_ros_semantics.models.cluster_shapes import split_by_group
 
 Matrix = NDArray[np.float64]
 
@@ -54,26 +56,14 @@ OBJECT_WEIGHT = 0.3  # of an object beside a point: frames show the same one aga
 HIT_RATES = np.array([0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # tried for every class; what networks find differs much
 
 
-@dataclass(frozen=True, eq=False)
-class Objects:
-    """Objects of frames and their ends. frame: (n,). cls: (n,), class plus kind. position: (n, 3), unit vector to one of an image
-    in the camera frame, or the middle of one of a cloud, m. extent: (n, 2) deg, sideways and upward. width: (n,) deg, of the
-    whole object, as far as it is seen."""
+# Objects of frames and their ends. cls: class plus kind. position: unit vector to one of an image in the camera frame, or the
+# middle of one of a cloud, m. extent: deg, sideways and upward. width: deg, of the whole object, as far as it is seen.
+OBJECT = np.dtype([("frame", np.intp), ("cls", np.intp), ("position", float, 3), ("extent", float, 2), ("width", float)])
+Objects = np.recarray[Any, np.dtype[Any]]
 
-    frame: NDArray[np.intp]
-    cls: NDArray[np.intp]
-    position: Matrix
-    extent: Matrix
-    width: Matrix
 
-    @staticmethod
-    def of(found: Sequence[tuple[int, int, Matrix, Matrix, float]]) -> Objects:
-        """From the frame, class, position, extent and width of each."""
-        frame, cls, position, extent, width = zip(*found, strict=True) if found else ((), (), (), (), ())
-        return Objects(
-            np.array(frame, np.intp), np.array(cls, np.intp), np.reshape(position, (-1, 3)), np.reshape(extent, (-1, 2)),
-            np.array(width),
-        )  # fmt: skip
+def _objects(found: Sequence[tuple[int, int, Matrix, Matrix, float]]) -> Objects:
+    return np.array(found, OBJECT).view(np.recarray)
 
 
 def image_objects(views: Sequence[ClassView]) -> Objects:
@@ -91,8 +81,7 @@ def image_objects(views: Sequence[ClassView]) -> Objects:
             kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size)
             _, region = cv2.connectedComponents(cv2.dilate(mask, kernel), connectivity=8)
             rows, columns = np.nonzero(mask)
-            order, edges = _groups(region[rows, columns])
-            for own in np.split(order, edges):
+            for own in split_by_group(np.arange(len(rows)), region[rows, columns] - 1):
                 u, v = columns[own], rows[own]
                 low, high = int(u.min()), int(u.max())
                 cut = low == 0, high == width - 1
@@ -106,7 +95,7 @@ def image_objects(views: Sequence[ClassView]) -> Objects:
                 ray = np.append((pixel - K[:2, 2]) / (K[0, 0], K[1, 1]), 1.0)
                 extent = per_pixel * np.array([np.ptp(u) + 1.0, np.ptp(v) + 1.0])
                 found.append((number, kind + int(c), ray / np.linalg.norm(ray), extent, wide))
-    return Objects.of(found)
+    return _objects(found)
 
 
 def cloud_objects(views: Sequence[ClassView]) -> Objects:
@@ -121,9 +110,7 @@ def cloud_objects(views: Sequence[ClassView]) -> Objects:
             own = np.flatnonzero(view.label == c)
             around = np.exp(1j * np.deg2rad(azimuth[own])) * np.rad2deg(1) / link[0]
             member = cluster(np.c_[around.real, around.imag, elevation[own] / link[1]].astype(np.float32), 1.0, 2)
-            own, member = own[member >= 0], member[member >= 0]
-            order, edges = _groups(member)
-            for part in np.split(own[order], edges) if len(own) else []:
+            for part in split_by_group(own[member >= 0], member[member >= 0]):
                 if len(part) < MIN_POINTS:
                     continue
                 turned = np.sort(azimuth[part])
@@ -137,13 +124,7 @@ def cloud_objects(views: Sequence[ClassView]) -> Objects:
                     middle = direction / np.linalg.norm(direction) / (1 / distance[few]).mean()
                     extent = np.array([np.ptp(left[end]), np.ptp(elevation[few])])
                     found.append((number, kind + int(c), middle, extent, wide))
-    return Objects.of(found)
-
-
-def _groups(number: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """What sorts (n,) by number, and where the next number begins."""
-    order = np.argsort(number, kind="stable")
-    return order, np.flatnonzero(np.diff(number[order])) + 1
+    return _objects(found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.initial_guess import MAX_DISTANCE_M, allowed, near_lidar, rotation_distance_deg
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import PointScore, ScoredPoints, SmoothScore
+from calib_ros.registration.score.point_score import PointScore, SmoothScore
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, Prior
 from calib_ros.registration.search.optimizers import levenberg_marquardt
@@ -90,14 +91,9 @@ def class_score(views: Sequence[ClassView], classes: Sequence[int]) -> PointScor
     class by the root of its points.
     """
     points = [_points(view, classes, j) for j, view in enumerate(views)]
-    weight = np.concatenate([p.weight for p in points])
-    joined = ScoredPoints(
-        np.ascontiguousarray(np.concatenate([p.xyz for p in points], axis=1)),
-        np.asarray(weight / weight.sum(), np.float32),
-        np.concatenate([p.frame for p in points]),
-        np.concatenate([p.channel for p in points]),
-    )
-    return PointScore(joined, Atlas([_levels(view, classes) for view in views], views[0].camera))
+    xyz, weight, frame, channel = (np.concatenate(parts, axis=-1) for parts in zip(*points, strict=True))
+    atlas = Atlas([_levels(view, classes) for view in views], views[0].camera)
+    return PointScore(xyz, np.asarray(weight / weight.sum(), np.float32), frame, channel, atlas)
 
 
 def refine_positions(score: PointScore, transforms: Matrix, seed: int) -> tuple[Matrix, Matrix, NDArray[np.intp]]:
@@ -227,15 +223,15 @@ def confusion_matrix() -> NDArray[np.float64]:
     return shares
 
 
-def _points(view: ClassView, classes: Sequence[int], frame: int) -> ScoredPoints:
-    """The points of a view; their weights sum up to 1, if there are any."""
+def _points(view: ClassView, classes: Sequence[int], frame: int) -> tuple[NDArray[Any], ...]:
+    """The points of a view as PointScore takes them; their weights sum up to 1, if there are any."""
     number = np.full(256, -1)
     number[list(classes)] = np.arange(len(classes))
     used = np.flatnonzero(number[view.label] >= 0)
     channel = number[view.label[used]]
     weight = 1 / np.sqrt(np.bincount(channel, minlength=len(classes))[channel])
     weight = np.asarray(weight / max(weight.sum(), 1e-9), np.float32)
-    return ScoredPoints(view.xyz[used].T, weight, np.full(len(used), frame, np.int32), channel)
+    return view.xyz[used].T, weight, np.full(len(used), frame, np.int32), channel
 
 
 def _levels(view: ClassView, classes: Sequence[int]) -> list[EdgeLevel]:

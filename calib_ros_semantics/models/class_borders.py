@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros_semantics.models.labels import Classes
-from calib_ros_semantics.models.tiles import is_softmax, softmax
+from calib_ros_semantics.models.tiles import enlarged, is_softmax, softmax
 
 Map = NDArray[np.float32]
 C = SemanticClass
@@ -79,8 +79,7 @@ def class_borders(planes: Mapping[int, Map], size: tuple[int, int]) -> Map:
             np.fmax(border, square, out=border)  # ignores NaN
     np.minimum(borders, 1, out=borders)
     if shape != size:
-        resized = [cv2.resize(border, size[::-1], interpolation=cv2.INTER_LINEAR) for border in borders]
-        borders = np.asarray(resized, np.float32)
+        borders = np.stack([enlarged(border, size) for border in borders])
     clear_border(borders)
     return borders
 

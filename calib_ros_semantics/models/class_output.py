@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +13,7 @@ from calib_ros.errors import ModelError
 from calib_ros.frame import SemanticClass
 from calib_ros_semantics.models.labels import Classes, Names, resized, table_of
 from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel
+from calib_ros_semantics.models.tiles import enlarged
 
 Size = tuple[int, int]
 MAX_STRIDE = 64  # pixels of the input per cell of the output; 32 is the deepest stride in use
@@ -38,9 +38,6 @@ class ClassOutput:
         by_number: Mapping[str, Names],
         conventions: str,
     ) -> None:
-        requested = model.sidecar.output
-        if requested and requested not in [t.name for t in model.outputs]:
-            raise model.error(f"there is no output '{requested}', which {model.yaml} asks for")
         self._model, self._feeds, self._size = model, *example
         self._by_count, self._by_number, self._conventions = by_count, by_number, conventions
         self.count: int | None = None
@@ -146,12 +143,9 @@ def layout_of(shape: Sequence[int], size: Size) -> ClassMapLayout | None:
 
 def best_classes(scores: NDArray[Any], size: Size) -> NDArray[np.int16]:
     """Class (H, W) of the highest of scores (C, h, w), which are interpolated to the size first; -1 where all are NaN."""
-    # Cells cover equal parts of the image, as in networks that do not align corners.
     highest, winner = np.full(size, -np.inf, np.float32), np.full(size, -1, np.int16)
     for number, score in enumerate(scores):
-        plane = np.ascontiguousarray(score, np.float32)
-        if plane.shape != size:
-            plane = cv2.resize(plane, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
+        plane = enlarged(score, size)  # cells cover equal parts of it, as in networks that do not align corners
         better = plane > highest
         np.copyto(highest, plane, where=better)
         np.copyto(winner, np.int16(number), where=better)

@@ -65,8 +65,8 @@ class CloudNetwork(SegmentationModel):
         self.model, self.fallback, own = model, model.fallback, model.sidecar
         masks = [t for t in model.inputs if len(model.inputs) == 2 and _is_mask(t)]
         counts = (len(CHANNELS) - 1, len(CHANNELS)) if isinstance(own.channels, str) else (len(own.channels),)
-        image = InputImage.of([t for t in model.inputs if t not in masks], counts)
-        if image is None or len(model.inputs) != 1 + len(masks):
+        image = InputImage.of(model, [t for t in model.inputs if t not in masks], counts)
+        if image is None:
             raise model.error(
                 f"a network for classes of points takes one range image as 1xCxHxW or 1xHxWxC of {' or '.join(map(str, counts))} "
                 f"channels ({', '.join(CHANNELS)}; name others as 'channels:' in {model.yaml}), and perhaps its mask; groups of "
@@ -74,7 +74,7 @@ class CloudNetwork(SegmentationModel):
                 "another network"
             )
         self._input, self._mask = image, masks[0] if masks else None
-        rows, self._columns = model.size_of(image.tensor, image.axis)
+        rows, self._columns = image.size
         self._rows, self._fov = rows or ROWS, own.fov_deg or DEFAULT_FOV_DEG
         numbers = labels.NUMBERS_OF_CLOUDS
         if _family(model, None, bool(masks)) in ("squeezeseg", "squeezesegv2"):  # its four numbers also fit SemanticKITTI
@@ -191,10 +191,8 @@ def _nearest_width(columns: float) -> int:
 
 def _family(model: OnnxModel, classes: int | None, has_mask: bool) -> str:
     """Family by the YAML, else by the names of file and tensors, else by the number of classes."""
-    declared = model.sidecar.family.lower()
+    declared = model.family(FAMILIES)
     if declared:
-        if declared not in FAMILIES:
-            raise model.error(f"family '{declared}' is unknown; known are {', '.join(FAMILIES)}")
         return declared
     names = " ".join([model.path.stem, *(t.name for t in (*model.inputs, *model.outputs))]).lower()
     if "cenet" in names:

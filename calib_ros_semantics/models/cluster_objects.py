@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +63,7 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     kinds = np.full(len(parts), UNLABELLED, np.uint8)
     for k, part in enumerate(parts):
         if len(part) >= MIN_OBJECT_POINTS:
-            kinds[k] = cluster_shape(xyz[part], Surfaces(*(values[part] for values in shape)), cut[part]).kind
+            kinds[k] = ClusterShape(xyz[part], Surfaces(*(values[part] for values in shape)), cut[part]).kind
     for v in np.nonzero(kinds == SemanticClass.VEHICLE)[0]:
         inside = _within_car(xyz[low], xyz[parts[v]])
         share = np.bincount(number[inside], minlength=len(parts)) / np.bincount(number)
@@ -74,19 +72,19 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     return labels
 
 
-class ClusterShape(NamedTuple):
-    """Measures of a cluster and the class they give. length, width, bottom, top, distance: m. head: length of its uppermost
-    HEAD_HEIGHT, m. scatter, level: median, as of Surfaces. cut: whether its top is outside the field of view."""
+class ClusterShape:
+    """Measures of a cluster and the class they give, from points (n, 3), z = height above the ground (m), and (n,) whether they
+    are at the edge of the field of view. length, width, bottom, top, distance: m. head: length of its uppermost HEAD_HEIGHT, m.
+    scatter, level: median, as of Surfaces. cut: whether its top is outside the field of view."""
 
-    length: float
-    width: float
-    bottom: float
-    top: float
-    distance: float
-    head: float
-    scatter: float
-    level: float
-    cut: bool
+    def __init__(self, xyz: Floats, shape: Surfaces, at_edge: NDArray[np.bool_]) -> None:
+        self.length, self.width = bounding_rectangle(xyz[:, :2])
+        self.bottom, self.top = float(xyz[:, 2].min()), float(xyz[:, 2].max())
+        self.distance = float(np.hypot(*xyz[:, :2].mean(axis=0)))
+        self.head = bounding_rectangle(xyz[xyz[:, 2] > self.top - HEAD_HEIGHT, :2])[0]
+        known = shape.scatter[np.isfinite(shape.scatter)]
+        self.scatter, self.level = float(np.median(known)) if len(known) else np.inf, float(np.median(shape.level))
+        self.cut = np.count_nonzero(at_edge) > MAX_CUT_SHARE * len(at_edge)
 
     @property
     def kind(self) -> int:
@@ -124,18 +122,6 @@ class ClusterShape(NamedTuple):
 
     def _measures(self, limits: tuple[tuple[float, float], ...]) -> bool:
         return all(low <= m <= high for m, (low, high) in zip((self.length, self.width, self.top), limits, strict=True))
-
-
-def cluster_shape(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_]) -> ClusterShape:
-    """ClusterShape of points (n, 3), z = height above the ground (m). cut: (n,) points at the edge of the field of view."""
-    length, width = bounding_rectangle(xyz[:, :2])
-    bottom, top = float(xyz[:, 2].min()), float(xyz[:, 2].max())
-    known = shape.scatter[np.isfinite(shape.scatter)]
-    scatter = float(np.median(known)) if len(known) else np.inf
-    head = bounding_rectangle(xyz[xyz[:, 2] > top - HEAD_HEIGHT, :2])[0]
-    distance = float(np.hypot(*xyz[:, :2].mean(axis=0)))
-    cut_off = np.count_nonzero(cut) > MAX_CUT_SHARE * len(cut)
-    return ClusterShape(length, width, bottom, top, distance, head, scatter, float(np.median(shape.level)), bool(cut_off))
 
 
 def _within_car(xyz: Floats, visible: Floats) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib_ros.frame import Frame
 from calib_ros_semantics.models.masks import NMS_IOU, Mask, MaskModel, found_mask, sample_logits, without_duplicates
 from calib_ros_semantics.models.onnx_model import Array, Deadline, InputImage, Normalisation, OnnxModel, to_rgb
-from calib_ros_semantics.models.segment_anything import DEFAULT_SIDE, declared_family
+from calib_ros_semantics.models.segment_anything import DEFAULT_SIDE, FAMILIES
 
 Floats = NDArray[np.float32]
 BORDER_GREY = 114.0  # grey level around the letterboxed image
@@ -31,20 +31,20 @@ class FastSam(MaskModel):
 
     def __init__(self, model: OnnxModel) -> None:
         self.model, self.fallback = model, model.fallback
-        found = InputImage.of(model.inputs, (3,))
+        found = InputImage.of(model, model.inputs, (3,))
         detections, maps = ([t.name for t in model.outputs if len(t.shape) == rank] for rank in (3, 4))
-        if found is None or len(model.inputs) != 1 or not detections or not maps:
-            raise model.error("this is no FastSAM, which takes pictures 1x3xHxW and gives detections 1xCxN, prototypes 1xPxhxw")
-        declared = model.sidecar.output
-        if declared and declared not in detections:
-            raise model.error(f"'{declared}', which 'output:' of the YAML beside it names, is no output with detections 1xCxN")
+        asked = model.sidecar.output
+        if found is None or not maps or not detections or (asked and asked not in detections):
+            raise model.error(
+                "this is no FastSAM, which takes pictures 1x3xHxW and gives prototypes 1xPxhxw and detections 1xCxN, which an "
+                "'output:' in its YAML names"
+            )
         told = [model.metadata.get(key, "").lower() == "true" for key in ("nms", "end2end")]
         if any(told) or re.search(r"'nms':\s*True", model.metadata.get("args", "")):
             raise model.error(NMS_INSIDE)
-        self._outputs = [declared or detections[0], *maps]
+        self._outputs = [asked or detections[0], *maps]
         self._normalised = Normalisation.of(model, Normalisation(1 / 255))
-        height, width = model.size_of(found.tensor, found.axis)
-        self._input, self._size = found, (height or DEFAULT_SIDE, width or DEFAULT_SIDE)
+        self._input, self._size = found, (found.size[0] or DEFAULT_SIDE, found.size[1] or DEFAULT_SIDE)
 
     def describe(self) -> str:
         height, width = self._size
@@ -104,7 +104,7 @@ class FastSam(MaskModel):
 
 def is_fast_sam(model: OnnxModel, alone: bool) -> bool:
     """Whether a graph is FastSAM. alone: it is configured without a decoder."""
-    family = declared_family(model)
+    family = model.family((*FAMILIES, "fastsam"))
     return family == "fastsam" if family else alone and {3, 4} <= {len(t.shape) for t in model.outputs}
 
 

@@ -22,10 +22,7 @@ from calib_ros_semantics.models.onnx_model import (
 )
 from calib_ros_semantics.models.tiles import Tiling
 
-# Exports by the name that a YAML may give as 'family:' (lower case) and as shown.
-FAMILIES = {
-    name.lower(): name for name in ("mmsegmentation", "PIDNet", "DDRNet", "torchvision", "SegFormer", "EdgeNets", "ESPNetv2")
-}
+FAMILIES = ("mmsegmentation", "PIDNet", "DDRNet", "torchvision", "SegFormer", "EdgeNets", "ESPNetv2")
 CONVENTIONS = (
     "scores NxCxHxW or NxHxWxC and class numbers Nx1xHxW or NxHxW, as of mmsegmentation, PIDNet, DDRNet, torchvision, SegFormer "
     "and EdgeNets, at the input's size or a part of it"
@@ -44,13 +41,11 @@ class ImageNetwork(SegmentationModel):
 
     def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
         self.model, self.fallback = model, model.fallback
-        family = model.sidecar.family
-        if family and family.lower() not in FAMILIES:
-            raise model.error(f"family '{family}' is unknown; known are {', '.join(FAMILIES)}")
-        found = InputImage.of(model.inputs, (3,))
-        if found is None or len(model.inputs) != 1:
+        self._family = model.family(FAMILIES)
+        found = InputImage.of(model, model.inputs, (3,))
+        if found is None:
             raise model.error("a network for classes of pixels takes one picture as 1x3xHxW or 1xHxWx3")
-        self._input, self._size = found, model.size_of(found.tensor, found.axis)
+        self._input, self._size = found, found.size
         rows, columns = (n or 1 for n in self._size)
         if rows * columns > MAX_PIXELS:
             raise model.error(
@@ -87,8 +82,7 @@ class ImageNetwork(SegmentationModel):
         return tiling.numbers(parts) if self._output.count is None else tiling.scores(parts)
 
     def describe(self) -> str:
-        family = "PIDNet with auxiliary heads" if self._output.is_pidnet else "segmentation network"
-        family = FAMILIES.get(self.model.sidecar.family.lower(), family)
+        family = self._family or ("PIDNet with auxiliary heads" if self._output.is_pidnet else "segmentation network")
         height, width = ("?" if n is None else n for n in self._size)
         order = "RGB" if self._swap else "BGR"
         free = f" (at most {MAX_SIDE} wide)" if None in self._size else " (pictures of another shape in tiles)"

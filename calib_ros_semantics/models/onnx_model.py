@@ -6,7 +6,7 @@ import re
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,11 +58,13 @@ class OnnxModel:
     def __init__(self, path: str | Path, config: SemanticsConfig) -> None:
         self.path, self.sidecar = Path(path), Sidecar.beside(path)
         self.yaml = self.path.with_suffix(".yaml")  # where its description is, or would be
-        self._session, self.fallback = _session(self.path, config)
-        self.provider = provider_name(self._session)
+        self._session, self.provider, self.fallback = _session(self.path, config)
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)  # that the exporter wrote
         self.inputs = [_tensor(self.path, t) for t in self._session.get_inputs()]
         self.outputs = [_tensor(self.path, t) for t in self._session.get_outputs()]
+        asked = self.sidecar.output
+        if asked and asked not in [t.name for t in self.outputs]:
+            raise self.error(f"there is no output '{asked}', which {self.yaml} asks for")
 
     @property
     def tensors(self) -> str:
@@ -90,13 +92,12 @@ class OnnxModel:
             deadline.check()
             raise ModelError(f"{self.path} failed: {error_text(error)}; it has {self.tensors}") from None
 
-    def size_of(self, tensor: Tensor, axis: int) -> tuple[int | None, int | None]:
-        """Height and width of an input by graph and YAML, None = unknown. axis: of the channels. ModelError if the two differ."""
-        own = [n for k, n in enumerate(tensor.shape) if k != axis][-2:] or [None, None]
-        given = self.sidecar.size or (None, None)
-        if any(None not in (n, m) and n != m for n, m in zip(own, given, strict=True)):
-            raise self.error(f"it does not run at the height and width {list(given)} that 'size:' says")
-        return own[0] or given[0], own[1] or given[1]
+    def family(self, known: Iterable[str]) -> str:
+        """The one of the known families that the YAML names, however it writes it; empty without. ModelError for others."""
+        own, named = _plain(self.sidecar.family), {_plain(name): name for name in known}
+        if own and own not in named:
+            raise self.error(f"family '{self.sidecar.family}' is unknown; known are {', '.join(named.values())}")
+        return named.get(own, "")
 
     def error(self, problem: str) -> ModelError:
         """A ModelError with the file, the problem and the tensors found."""
@@ -117,25 +118,32 @@ class Tensor:
 
 
 class InputImage(NamedTuple):
-    """The input of a network that takes an image: its tensor, axis of the channels, and their number."""
+    """The input of a network that takes an image: its tensor, axis of the channels, and their number. size: height and width by
+    graph and YAML, None = unknown."""
 
     tensor: Tensor
     axis: int
     channels: int
+    size: tuple[int | None, int | None]
 
     @staticmethod
-    def of(tensors: Sequence[Tensor], counts: Sequence[int]) -> InputImage | None:
-        """The only one of the tensors that takes one image of so many channels, first or last; None if there is no such one."""
-        found = []
-        for tensor in tensors:
-            shape, first = tensor.shape, len(tensor.shape) - 3
-            if not shape:  # unknown rank: the usual layout
-                found.append(InputImage(tensor, 1, counts[0]))
-            elif len(shape) == 3 or (len(shape) == 4 and shape[0] in (None, 1)):
-                axis = next((axis for axis in (first, len(shape) - 1) if shape[axis] in counts), first)
-                if shape[axis] in (*counts, None):
-                    found.append(InputImage(tensor, axis, shape[axis] or counts[0]))
-        return found[0] if len(found) == 1 else None
+    def of(model: OnnxModel, tensors: Sequence[Tensor], counts: Sequence[int]) -> InputImage | None:
+        """The only one of these inputs, if it takes one image of so many channels, first or last; else None. ModelError if its
+        size is not that of the YAML."""
+        if len(tensors) != 1:
+            return None
+        sizes = tensors[0].shape or (None,) * 4  # of an unknown rank: the usual layout
+        if len(sizes) < 3 or sizes[:-3] not in ((), (None,), (1,)):
+            return None
+        first = len(sizes) - 3
+        axis = next((axis for axis in (first, len(sizes) - 1) if sizes[axis] in counts), first)
+        if sizes[axis] not in (*counts, None):
+            return None
+        own = [n for k, n in enumerate(sizes) if k != axis][-2:]
+        given = model.sidecar.size or (None, None)
+        if any(None not in (n, m) and n != m for n, m in zip(own, given, strict=True)):
+            raise model.error(f"it does not run at the height and width {list(given)} that 'size:' says")
+        return InputImage(tensors[0], axis, sizes[axis] or counts[0], (own[0] or given[0], own[1] or given[1]))
 
     def arranged(self, image: NDArray[Any]) -> Array:
         """An image (h, w, channels) as the network takes it."""
@@ -183,6 +191,10 @@ class Normalisation:
         whole = shifted if set(stds) == {"1"} else f"{shifted} / [{', '.join(stds)}]"
         source = "as its YAML says" if self.declared else "assumed; its YAML may say otherwise"
         return f"{whole} of grey levels v in 0..255 ({source})"
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "").replace("-", "")
 
 
 def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -246,8 +258,8 @@ def error_text(error: BaseException | None) -> str:
     return text if len(text) <= 300 else f"{text[:98]} ... {text[-197:]}"
 
 
-def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
-    """The session, and why it does not run on the configured provider; empty if it does."""
+def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str, str]:
+    """The session, its provider (cpu, cuda or tensorrt), and why that is not the configured one; empty if it is."""
     try:
         import onnxruntime
     except ImportError:
@@ -274,11 +286,11 @@ def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
             failed = error
     else:
         raise ModelError(f"model {path} cannot be loaded: {_load_error(failed, path, onnxruntime.__version__)}") from None
-    instead = provider_name(session)
+    own = str(session.get_providers()[0]).removesuffix("ExecutionProvider").lower()
     if PROVIDERS[asked][0] not in available:
-        return session, f"onnxruntime has no {asked} here: {path.name} runs on {instead}"
+        return session, own, f"onnxruntime has no {asked} here: {path.name} runs on {own}"
     why = "; check the driver and its libraries" if failed is None else f": {error_text(failed)}"
-    return session, f"{path.name} cannot run on {asked}, but on {instead}{why}" * (instead != asked)
+    return session, own, f"{path.name} cannot run on {asked}, but on {own}{why}" * (own != asked)
 
 
 def _load_error(error: BaseException | None, path: Path, version: str) -> str:
@@ -290,11 +302,6 @@ def _load_error(error: BaseException | None, path: Path, version: str) -> str:
     if OPSET.search(whole):
         return f"{text}; export it again, with an opset that onnxruntime {version} knows, or install a newer onnxruntime"
     return f"{text}; download or export it again"
-
-
-def provider_name(session: Any) -> str:
-    """Execution provider of a session: cpu, cuda or tensorrt."""
-    return str(session.get_providers()[0]).removesuffix("ExecutionProvider").lower()
 
 
 def _tensor(path: Path, node: Any) -> Tensor:

@@ -88,8 +88,6 @@ class Decoder:
         outputs = list(model.outputs)
         largest = max(len(t.shape) for t in outputs)
         declared = model.sidecar.output
-        if declared and declared not in [t.name for t in outputs]:
-            raise model.error(f"there is no output '{declared}', which 'output:' of the YAML beside it names")
         names = (declared,) if declared else ("low_res", "mask")
         exactly = [t for t in outputs if t.name == declared]
         masks = exactly[0] if exactly else _take(outputs, names, lambda t: len(t.shape) == largest >= 3)
@@ -99,15 +97,11 @@ class Decoder:
         others = [t for t in outputs if t is not masks]
         self._score = _take(others, ("iou", "score"), lambda t: 1 <= len(t.shape) < len(masks.shape) - 1)
         self._nested = len(points.shape) == 4  # (1, prompts, points, 2)
+        self.is_efficient = self._nested and self._image_size is not None  # EfficientSAM, which scales points itself
         self._fixed = points.shape[1 if self._nested else 0]
         self.batch = self._fixed or PROMPT_BATCH
         # Exports with nested points pad them themselves; the others expect a padding point where there is no box.
         self._slots = points.shape[-2] or (1 if self._nested else 2)
-
-    @property
-    def is_efficient(self) -> bool:
-        """Whether points are in pixels of the original image: EfficientSAM, whose decoder scales them itself."""
-        return self._nested and self._image_size is not None
 
     def __call__(self, embedded: Embedded, points: Points, deadline: Deadline) -> Proposals:
         """Masks for prompts (n, 2), n <= batch, points in pixels of the image. Raises ModelError, BudgetError."""
@@ -171,14 +165,12 @@ class SegmentAnything(MaskModel):
         self.fallback = "; ".join(model.fallback for model in (encoder, decoder) if model.fallback)
         self.decoder = Decoder(decoder, encoder)
         features = sum(len(t.shape) == 4 for t in encoder.outputs)
-        found = InputImage.of(encoder.inputs, (3,))
-        if found is None or len(encoder.inputs) != 1 or not features:
+        found = InputImage.of(encoder, encoder.inputs, (3,))
+        if found is None or not features:
             raise encoder.error("this is no encoder, which takes a picture and gives an embedding")
-        self._input, self._size = found, encoder.size_of(found.tensor, found.axis)
+        self._input = found
         self._channels_last = found.axis == len(found.tensor.shape) - 1
-        self.family = declared_family(encoder)
-        if self.family and self.family not in FAMILIES:
-            raise encoder.error(f"family '{self.family}' in its YAML is unknown; known are {', '.join(FAMILIES)}, fastsam")
+        self.family = encoder.family(FAMILIES)
         if not self.family:
             self.family = "samexporter" if self._channels_last or np.issubdtype(found.tensor.dtype, np.integer) else "sam"
             if self.decoder.is_efficient or found.tensor.name.startswith("batched"):
@@ -219,7 +211,7 @@ class SegmentAnything(MaskModel):
 
     def _input_size(self, height: int, width: int) -> tuple[int, int]:
         """Height and width of the input for an image of this size."""
-        rows, columns = self._size
+        rows, columns = self._input.size
         if rows and columns:
             return rows, columns
         if self._own_pixels:
@@ -323,11 +315,6 @@ def _mismatch(decoder: OnnxModel, encoder: OnnxModel, problem: str) -> ModelErro
         f"{encoder.path} and {decoder.path} are no pair of Segment Anything: {problem}; the encoder has {encoder.tensors}; "
         f"the decoder has {decoder.tensors}; {KNOWN}"
     )
-
-
-def declared_family(model: OnnxModel) -> str:
-    """The family in the YAML beside a model, lower case, without underscores and hyphens; empty if it is not given."""
-    return model.sidecar.family.lower().replace("_", "").replace("-", "")
 
 
 def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:

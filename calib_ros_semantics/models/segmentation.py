@@ -164,7 +164,7 @@ class SegmentationModels:
             first = slot.model is None
             model = self._loaded(slot)
         except Exception as error:  # no file of a user may stop the node, or cause a message with every keyframe
-            slot.off = error_line(error)
+            slot.off = error_line(error, slot.kind)
             problems.append(f"semantics.{slot.kind} is off: {slot.off}")
             return None
         if first and model.fallback:
@@ -179,8 +179,7 @@ class SegmentationModels:
         except Exception as error:  # whatever a user's model does with an image, the calibration continues
             if not cancelled():
                 slot.failures += 1
-                advice = ADVICE[slot.kind] if isinstance(error, BudgetError) else ""
-                line = f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {error_line(error)}{advice}"
+                line = f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {error_line(error, slot.kind)}"
                 if slot.failures == MAX_FAILURES:
                     slot.off = line
                     line += f"; off from now on after {MAX_FAILURES} failures in a row"
@@ -279,6 +278,8 @@ def of_little_use(classes: Classes) -> str:
     return f"{share}; give 'labels:' in a YAML beside the model, or take one for streets"
 
 
-def error_line(error: Exception) -> str:
-    """An error of a model in one line."""
-    return str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {error_text(error)}"
+def error_line(error: Exception, kind: str) -> str:
+    """An error of a model of this kind in one line; with advice where its time was up."""
+    if not isinstance(error, CalibrationError):
+        return f"unexpected {type(error).__name__}: {error_text(error)}"
+    return f"{error}{ADVICE[kind] if isinstance(error, BudgetError) else ''}"

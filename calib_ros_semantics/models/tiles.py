@@ -60,11 +60,11 @@ class Tiling(NamedTuple):
 
         Where tiles overlap, the one counts more in which a pixel lies farther from the border.
         """
-        whole, shape = self._merged_sizes()
+        whole, shape = self._cells(self.size), self._cells(self.tile)
         merged, weight = np.zeros((len(tiles[0]), *whole), np.float32), _towards_middle(shape)
         total = np.full(whole, SMALLEST, np.float32)
         for (place, part), own in zip(self._overlaps(whole, shape), tiles, strict=True):
-            planes = np.stack([_resized(np.asarray(plane, np.float32), shape) for plane in own])
+            planes = np.stack([enlarged(plane, shape) for plane in own])
             if not is_softmax(planes):
                 softmax(planes)
             for sums, plane in zip(merged, planes, strict=True):
@@ -76,7 +76,7 @@ class Tiling(NamedTuple):
     def numbers(self, tiles: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:
         """Class numbers (h, w) of the whole picture from those (rows, columns) of its tiles: of the tile in which a pixel lies
         farthest from the border."""
-        whole, shape = self._merged_sizes()
+        whole, shape = self._cells(self.size), self._cells(self.tile)
         merged, weight = np.zeros(whole, tiles[0].dtype), _towards_middle(shape)
         best = np.zeros(whole, np.float32)
         for (place, part), own in zip(self._overlaps(whole, shape), tiles, strict=True):
@@ -86,10 +86,9 @@ class Tiling(NamedTuple):
             best[place] = np.maximum(best[place], weight[part])
         return merged
 
-    def _merged_sizes(self) -> tuple[Size, Size]:
-        """Cells of the picture, and of a tile."""
-        (h, w), (rows, columns) = ([max(round(n * self._share), 1) for n in size] for size in (self.size, self.tile))
-        return (h, w), (rows, columns)
+    def _cells(self, size: Size) -> Size:
+        """Cells, height and width, that so many pixels are put together at."""
+        return max(round(size[0] * self._share), 1), max(round(size[1] * self._share), 1)
 
     @property
     def _share(self) -> float:
@@ -126,12 +125,12 @@ def _starts(whole: int, part: int) -> list[int]:
     return [int(n) for n in np.linspace(0, whole - part, max(count, 2)).round()]
 
 
-def _resized(plane: Floats, size: Size) -> Floats:
-    return (
-        plane
-        if plane.shape == size
-        else np.asarray(cv2.resize(np.ascontiguousarray(plane), size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-    )
+def enlarged(plane: NDArray[np.generic], size: Size) -> Floats:
+    """A plane (h, w) of numbers at another size (height, width)."""
+    values = np.ascontiguousarray(plane, np.float32)
+    if values.shape == size:
+        return values
+    return np.asarray(cv2.resize(values, size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _towards_middle(size: Size) -> Floats:

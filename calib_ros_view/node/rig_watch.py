@@ -38,12 +38,12 @@ from calib_ros_view.session.rig_shown import (
     RigShown,
     SensorShown,
     compared,
-    usual_corners,
 )
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 KIND = "registration"
 TILE_WIDTH = 480  # px
+VIEW_DEG = (32.0, 20.0)  # half of what a camera sees, across and upwards, where its intrinsics are not known
 PATIENCE_S = 10.0  # in which a picture or a cloud comes, or the next one's turn is
 LOOK_S = 3.0  # after which a page that does not say so again is not looked at any more
 NOT_HEARD = "The node is not heard any more; this is the last known."
@@ -86,8 +86,9 @@ class RigWatch:
         return list(self._pairs)
 
     def corners(self, camera: str) -> Matrix:
-        """See `RigSession`."""
-        return usual_corners()
+        """See `RigSession`; the node does not say what a camera sees."""
+        u, v = np.tan(np.deg2rad(VIEW_DEG))
+        return np.array([[-u, -v, 1.0], [u, -v, 1.0], [u, v, 1.0], [-u, v, 1.0]])
 
     def look(self) -> None:
         """Somebody looks; to be called again within LOOK_S."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros.result import Result
 from calib_ros_check.alternatives import CheckInputs
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, Tolerance
@@ -113,20 +112,13 @@ class SessionJobs:
         features = self._session.features(state)
         result = self._session.scores.calibrator.estimate(features, state.T, box, job.watch)
         job.watch(job.stage, 1.0)
-        job.message = outcome(result)
         if result.converged:
+            job.message = f"accepted; {result.reason}" if result.reason else "accepted"
             job.state = self._session.take(result, "refined" if box is None else "searched")
         else:
-            job.failed = True
+            job.failed, job.message = True, f"{result.status}: {result.reason}"
 
     def _check(self, job: SessionJob, state: SessionState) -> None:
         inputs = CheckInputs(state.T, Tolerance(), progress=job.watch)
         found = Checker(self._session.camera, self._session.config).check_features(self._session.features(state), inputs)
         job.check, job.state, job.message = found, state, f"{found.verdict.value}: {found.reason}"
-
-
-def outcome(result: Result) -> str:
-    """How an estimate ended, in a line."""
-    if result.converged:
-        return f"accepted; {result.reason}" if result.reason else "accepted"
-    return f"{result.status}: {result.reason}"

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
-from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.datasets.positions import frame_positions, spread_positions
 from calib_ros.datasets.rig_source import RigSource
@@ -73,8 +72,11 @@ class RigSession:
         return [pair for pair in self.pairs if pair[0] == tile]
 
     def corners(self, camera: str) -> Matrix:
-        """(4, 3) of a camera's picture, m, in its frame at a depth of 1 m."""
-        return corners_of(self._source.camera(camera))
+        """(4, 3) of a camera's picture, m, in its frame at a depth of 1 m, by the focal lengths alone: of a fisheye what a plain
+        lens would show."""
+        own = self._source.camera(camera)
+        u, v = np.array([0, own.width, own.width, 0]), np.array([0, 0, own.height, own.height])
+        return np.stack([(u - own.K[0, 2]) / own.K[0, 0], (v - own.K[1, 2]) / own.K[1, 1], np.ones(4)], axis=1)
 
     def go(self, by: int) -> None:
         """Show another moment, or draw this one again. What cannot be read is told in `problem`."""
@@ -118,10 +120,3 @@ class RigSession:
             start = se3.inverse(self.rig.poses[camera]) @ self.rig.poses[lidar]
             out = self._out.with_name(f"{self._out.stem}.{camera}.{lidar}{self._out.suffix}")
             return Session([source[k] for k in self._positions(len(source))], source, start, config, out)
-
-
-def corners_of(camera: Camera) -> Matrix:
-    """(4, 3) of the picture at a depth of 1 m, by the focal lengths alone: of a fisheye what a plain lens would show."""
-    u, v = np.array([0, camera.width, camera.width, 0]), np.array([0, 0, camera.height, camera.height])
-    K = camera.K
-    return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(4)], axis=1)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.result import CONVERGED, INITIAL, MOVED, TENTATIVE
 from calib_ros.rig.description import CAMERA, RigDescription
@@ -26,7 +26,6 @@ FATES = {USED: GOOD, DOUBTED: DOUBTFUL, REJECTED: BAD}
 EXCESS = 2.0  # standard deviations, in the mean of the six axes, from which on an edge that is used is doubtful
 Pair = tuple[str, str]  # camera, LiDAR
 NOT_ESTIMATED = "nothing is estimated: these are the priors; give a result of calib-ros rig --json with --initial"
-VIEW_DEG = (32.0, 20.0)  # half of what a camera sees, across and upwards, where its intrinsics are not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +170,3 @@ def summary(sensors: Sequence[SensorShown], edges: Sequence[EdgeShown], loops: S
     parts = [f"{sum(own.usable for own in sensors)} of {len(sensors)} sensors usable"]
     parts += [f"{own.target}-{own.source} contradicts the others" for own in edges if own.fate == REJECTED]
     return "; ".join([*parts, *(f"loop {', '.join(own.sensors)} does not close" for own in loops if not own.closes)])
-
-
-def usual_corners() -> Matrix:
-    """Of a camera whose intrinsics are not known."""
-    u, v = np.tan(np.deg2rad(VIEW_DEG))
-    return np.array([[-u, -v, 1.0], [u, -v, 1.0], [u, v, 1.0], [-u, v, 1.0]])

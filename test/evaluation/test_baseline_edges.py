@@ -12,7 +12,6 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.edges import (
-    Castorena,
     Levinson,
     edge_image,
     edge_weights,
@@ -26,7 +25,7 @@ from calib_ros_evaluation.methods.edges import (
     spread,
     worse_share,
 )
-from calib_ros_evaluation.methods.method import PointFeatures, Watched
+from calib_ros_evaluation.methods.method import PointFeatures
 
 
 class Top(Bowl):
@@ -87,23 +86,26 @@ def test_score_of_three_points():
     assert score.values(np.stack([np.eye(4), right])).tolist() == [35.0, 4.0]
 
 
-# --- Levinson and Thrun: grid search and the test of a calibration ---
+# --- both searches, and the test of a calibration ---
 
 
-def test_grid_search_finds_the_top_of_a_bowl_and_stays_in_its_box():
+@pytest.mark.parametrize(
+    ("search", "near"),
+    [
+        (lambda *args: grid_search(*args, np.repeat([np.deg2rad(0.02), 0.003], 3))[0], 0.03),
+        (lambda *args: fista(*args, 0.01, 600)[0], 0.02),
+    ],
+    ids=["grid search", "fista"],
+)
+def test_the_top_of_a_bowl_is_found_within_the_box(search, near):
     T, width = np.eye(4), SearchBox(1.0, 0.1).half_width()
-    finest = np.repeat([np.deg2rad(0.02), 0.003], 3)
-    top = se3.exp(width * [0.7, -0.3, 0.1, -0.9, 0.5, 0.2])
-    score = Top(top)
-    watched = Watched(score)
-    found = grid_search(score, watched, T, width, finest)
-    assert np.all(np.abs(se3.log(found @ se3.inverse(top))) <= finest)
-    assert watched.evaluations > 729
-    beyond = Top(se3.exp(width * [3, 0, 0, 0, 0, 0]))
-    found = grid_search(beyond, Watched(beyond), T, width, finest)
-    assert np.allclose(se3.log(found) / width, [1, 0, 0, 0, 0, 0], atol=0.03)
-    fixed = width * [1, 1, 1, 0, 0, 0]
-    assert np.allclose(se3.log(grid_search(score, Watched(score), T, fixed, finest))[3:], 0, atol=1e-12)
+    score = Top(se3.exp(width * [0.5, -0.6, 0.3, -0.4, 0.5, 0.2]))
+    found = search(score, T, width)
+    assert np.abs(se3.log(found @ se3.inverse(score.optimum)) / width).max() < near
+    found = search(Top(se3.exp(width * [4, 0, 0, 0, 0, 0])), T, width)
+    assert np.allclose(se3.log(found) / width, [1, 0, 0, 0, 0, 0], atol=near)
+    found = search(score, T, width * [1, 1, 1, 0, 0, 0])
+    assert np.allclose(se3.log(found)[3:], 0, atol=1e-12)
 
 
 def test_share_of_worse_neighbours():
@@ -158,33 +160,3 @@ def test_completed_depth_is_the_weighed_mean_of_the_points_around():
     assert pixels.tolist() == [4 * 12 + 5, 4 * 12 + 7]
     assert np.allclose(x, [abs(at_6 - at_5), abs(at_8 - at_7)], rtol=1e-5)
     assert np.allclose(y, 0, atol=1e-5)  # one row below the points lie as far from it
-
-
-def test_score_is_the_misfit_of_visible_points():
-    """A step of depth on a step of the picture; at a whole pixel to the side it no longer is."""
-    camera, gray = pinhole(20, 12, 10.0), np.zeros((12, 20), np.uint8)
-    gray[:, 10:] = 255
-    u, v = (a.ravel() for a in np.meshgrid(np.arange(18), np.arange(10)))
-    depth = np.where(u < 10, 2.0, 6.0)
-    xyz = np.stack([u / 10 * depth, v / 10 * depth, depth], 1).astype(np.float32)[np.argsort(-depth, kind="stable")]
-    score = Castorena(min_points=10).score([PointFeatures(camera, gray, xyz)], np.eye(4))
-    turned = [score.value(se3.exp([0, angle, 0, 0, 0, 0])) for angle in (-0.2, 0, 0.2)]
-    assert turned[1] > max(turned[0], turned[2])
-    behind = se3.from_parts(np.eye(3), [0, 0, -50])
-    assert score.value(behind) == -2.0  # nothing is seen: unrelated in both directions
-
-
-# --- FISTA ---
-
-
-def test_fista_finds_the_optimum_within_its_box():
-    T, width = np.eye(4), SearchBox(2.0, 0.2).half_width()
-    score = Top(se3.exp(width * [0.5, -0.6, 0.3, -0.4, 0.5, 0.2]))
-    found, value = fista(score, T, width, 0.01, 600)
-    assert np.abs(se3.log(found @ se3.inverse(score.optimum)) / width).max() < 0.02
-    assert value == pytest.approx(score.value(found))
-    beyond = Top(se3.exp(width * [4, 0, 0, 0, 0, 0]))
-    found, _ = fista(beyond, T, width, 0.01, 600)
-    assert np.allclose(se3.log(found) / width, [1, 0, 0, 0, 0, 0], atol=0.02)
-    fixed = width * [1, 1, 1, 0, 0, 0]
-    assert np.allclose(se3.log(fista(score, T, fixed, 0.01, 600)[0])[3:], 0, atol=1e-12)

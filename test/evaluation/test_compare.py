@@ -139,16 +139,6 @@ def test_the_interval_knows_that_trials_on_the_same_frames_belong_together() -> 
     assert found.high - found.low == pytest.approx(2 * 1.96 * shift.std() / np.sqrt(30), rel=0.1)
 
 
-def test_identical_tables_show_no_difference() -> None:
-    a = table(np.random.default_rng(2).uniform(0, 2, 40))
-    found = only(compare(a, a.copy()))
-    assert (found.only_a, found.only_b, found.gained, found.lost) == (0, 0, 0, 0)
-    for name, one in found.estimates.items():
-        none = 1 if name == "cpu" else 0
-        assert (one.change, one.low, one.high, one.verdict) == (none, none, none, "no difference shown")
-    assert not any(word in as_text([found], "a", "b").split("\n\n")[1] for word in ("better", "worse", "*"))
-
-
 def test_the_order_of_rows_does_not_matter() -> None:
     rng = np.random.default_rng(3)
     base = rng.uniform(0, 2, 60)

@@ -20,7 +20,6 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud, SemanticClass
 from calib_ros.result import Result
 from calib_ros_evaluation.commands import sources_in
-from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import (
@@ -36,10 +35,12 @@ from calib_ros_evaluation.experiments.setup import (
     spread,
     worker_cache,
 )
-from calib_ros_evaluation.experiments.trial import classes_of_points
+from calib_ros_evaluation.experiments.trial import classes_of_points, run_jobs
 from calib_ros_evaluation.methods.registry import NAMES
+from calib_ros_evaluation.protocols.definitions import NAMES as PROTOCOL_NAMES
+from calib_ros_evaluation.protocols.detection import COLUMNS as PERTURBED
 from calib_ros_evaluation.report.sections import sections
-from calib_ros_evaluation.results import TWIST_AXES
+from calib_ros_evaluation.results import TWIST_AXES, collect_results
 from calib_ros_thesis.features import importance
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
@@ -119,21 +120,23 @@ def test_one_worker_gives_what_two_give(done: Path, tmp_path: Path) -> None:
 def test_compare_of_a_table_with_itself(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = str(done / "trials.csv")
     assert main.main(["evaluate", "--compare", table, table]) == 0
-    assert "no difference" in capsys.readouterr().out
+    verdicts = capsys.readouterr().out.split("\n\n")[1]
+    assert "no difference" in verdicts
+    assert not any(word in verdicts for word in ("better", "worse"))
 
 
 def test_every_experiment_of_every_method_answers() -> None:
     """The smallest plan with all of them: nothing fails, everything is reported."""
     planned = jobs(TINY, inspect_sources(setup(), "all"), NAMES, EXPERIMENTS)
     answers = {one.key: answer for group in groups(planned) for one, answer in zip(group, run_jobs(setup(), group), strict=True)}
-    results = collect_results(planned, answers, {})
+    results = collect_results(planned, answers, dict.fromkeys(NAMES, ""))
     assert results.failures == []
     assert set(results.trials.method) == set(NAMES)
     assert set(results.trials.status) <= {"done", "refused"}, results.trials.reason
     assert {c.method for c in results.curves} == set(NAMES)
     assert all(abs(c.curves.peaks[1]) < 0.5 for c in results.curves if c.method == "ours")
-    assert {c.method for c in results.costs} == set(NAMES)
-    assert all(c.memory_mb > 0.1 for c in results.costs)
+    assert {method for method, *_ in results.costs} == set(NAMES)
+    assert all(memory_mb > 0.1 for *_, memory_mb in results.costs)
     assert {a.method for a in results.averagings} == {"thesis", "ours"}
     assert all(abs(a.shares.sum(axis=1) - 1).max() < 1e-9 and (a.weights >= 0).all() for a in results.averagings)
     (similar,) = results.similarities
@@ -154,29 +157,48 @@ def test_weights_by_points_in_the_picture() -> None:
     assert importance(classes_of_points(frame, None, np.eye(4), Config())) is None
 
 
-def test_bad_requests_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments, named in (
-        ([], "at least one source"),
-        ([DRIVE, "--methods", "ours,magic"], "magic"),
-        ([DRIVE, "--experiments", "alchemy"], "alchemy"),
-        ([DRIVE, "--start-deg", "0"], "--start-deg"),
-        ([DRIVE, "--start-m", "nan"], "--start-m"),
-        ([DRIVE, "--repeats", "0"], "--repeats"),
-        ([DRIVE, "--workers", "0"], "--workers"),
-        ([DRIVE, "--seed", "-1"], "--seed"),
-        ([DRIVE, "--frames", "7"], "--frames"),
-        ([DRIVE, "--reference", "nowhere.json"], "nowhere.json"),
-        (["{tmp}"], "no KITTI drives, ROS 2 bags or plain folders"),
-        (["{tmp}/none"], "does not exist"),
-        ([DRIVE, "--compare", "a", "b"], "--compare"),
-        (["--compare", "{tmp}/a.csv", "{tmp}/b.csv"], "a.csv"),
-        ([DRIVE, "--scheduler", "tcp://127.0.0.1:9"], "127.0.0.1:9"),
-    ):
-        given = [text.replace("{tmp}", str(tmp_path)) for text in arguments]
-        assert main.main(["evaluate", "--quick", "--out", str(tmp_path / "out"), *given]) == 2
-        error = capsys.readouterr().err
-        assert named in error
-        assert error.count("\n") == 1
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("--quick", ["at least one source"]),
+        ("DRIVE --methods ours,magic", ["magic", *NAMES]),
+        ("DRIVE --experiments alchemy", ["alchemy", *EXPERIMENTS]),
+        ("DRIVE --start-deg 0", ["--start-deg"]),
+        ("DRIVE --start-m nan", ["--start-m"]),
+        ("DRIVE --repeats 0", ["--repeats"]),
+        ("DRIVE --workers 0", ["--workers"]),
+        ("DRIVE --seed -1", ["--seed"]),
+        ("DRIVE --frames 7", ["--frames"]),
+        ("DRIVE --reference nowhere.json", ["nowhere.json"]),
+        ("DRIVE --trials 3", ["--trials belongs to --protocol"]),
+        ("DRIVE --quick --scheduler tcp://127.0.0.1:9", ["127.0.0.1:9"]),
+        ("TMP", ["no KITTI drives, ROS 2 bags or plain folders"]),
+        ("TMP/none", ["does not exist"]),
+        ("DRIVE --compare a b", ["--compare"]),
+        ("--compare TMP/a.csv TMP/b.csv", ["a.csv"]),
+        ("DRIVE --protocol nothing", ["no protocol 'nothing'", *PROTOCOL_NAMES]),
+        ("DRIVE --protocol borer --frames-per-trial 1,5", ["--frames-per-trial 5", "only 3", "give --frames-per-trial 1"]),
+        ("DRIVE --protocol borer --frames-per-trial 0", ["whole numbers of at least 1"]),
+        ("DRIVE --protocol borer --trials 0", ["--trials 0: give 1"]),
+        ("DRIVE --protocol borer --methods nid", ["leave out --methods"]),
+        ("DRIVE --protocol borer --table x.csv", ["--table belongs to --protocol miscalibration"]),
+        ("DRIVE --protocol miscalibration", ["--table FILE"]),
+        ("DRIVE --protocol miscalibration --table TMP/none.csv", ["cannot read", "none.csv", "--table"]),
+        ("DRIVE --protocol miscalibration --table TMP/table.csv", ["no frame 004170", "sequences/00"]),
+        ("DRIVE --protocol miscalibration --table TMP/table.csv --trials 3", ["leave out --trials"]),
+    ],
+)
+def test_bad_requests_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, words: list[str]) -> None:
+    (tmp_path / "table.csv").write_text(f"{','.join(PERTURBED)}\npos,004170,0,0,0,0,0,0\n")
+    given = arguments.replace("TMP", str(tmp_path)).replace("DRIVE", DRIVE).split()
+    try:
+        code = main.main(["evaluate", "--out", str(tmp_path / "out"), *given])
+    except SystemExit as stopped:  # what the parser refuses
+        code = stopped.code
+    error = capsys.readouterr().err
+    assert code == 2
+    assert all(word in error for word in words), error
+    assert error.strip().count("\n") == 0
 
 
 def test_without_pandas_there_are_steps_but_no_tables() -> None:

@@ -156,7 +156,7 @@ def test_semantics_take_part_where_they_are_configured(scene: Scene, kind: type[
 
 
 def test_a_preset_leaves_the_other_method_its_optimiser():
-    found = {name: methods(preset("thesis"))[name]._extractors.config.refine for name in ("ours", "thesis")}
+    found = {name: methods(preset("thesis"))[name].own_config.refine for name in ("ours", "thesis")}
     assert {name: (refine.objective, refine.optimizer) for name, refine in found.items()} == {
         "ours": ("fast", "auto"),
         "thesis": ("thesis", "nelder_mead"),

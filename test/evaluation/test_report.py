@@ -17,12 +17,12 @@ from trial_rows import row, table
 
 from calib_ros.errors import MissingDependencyError
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.report import statistics, tables
+from calib_ros_evaluation.report import tables
 from calib_ros_evaluation.report.page import write_report
 from calib_ros_evaluation.report.sections import sections
-from calib_ros_evaluation.report.statistics import basins, median, peak_distances, quantile
 from calib_ros_evaluation.report.table import Table, escaped, figures
-from calib_ros_evaluation.results import Averaging, Cost, CurveResult, Results, Similarity, Trust, algorithm_6
+from calib_ros_evaluation.report.tables import area, basins, called_right, hits, median, peak_distances, quantile
+from calib_ros_evaluation.results import Averaging, CurveResult, Results, Similarity, Trust, algorithm_6
 
 # Frame 1 is like 0; frame 2 is unlike 0, though like 1; frame 3 is like 2.
 ALIKE = np.array([[1, 0.8, 0.5, 0.1], [0.8, 1, 0.8, 0.2], [0.5, 0.8, 1, 0.9], [0.1, 0.2, 0.9, 1]])
@@ -58,7 +58,7 @@ def fake(methods: tuple[str, ...], n: int) -> Results:
         trials += [draw(*own, "starts", i, s, 1) for s in (0.5, 1.0, 2.0) for i in range(n // 2)]
         trials += [draw(*own, "frames", i, 2.0, count) for count in (1, 2, 4) for i in range(n // 2)]
     curves = [CurveResult(method, f"drive {k}", bell(0.1 * k)) for method in methods for k in range(2)]
-    costs = [Cost(method, 1, 20.0 * (k + 1), 0.05, 5.0) for k, method in enumerate(methods)]
+    costs = [(method, 1, 20.0 * (k + 1), 0.05, 5.0) for k, method in enumerate(methods)]
     titles = {method: f"{method.capitalize()} and others: edges of the one with edges of the other" for method in methods}
     trusts = [Trust(0.99, ((0.5, 0.0, 0.6 + 0.02 * k), (0.0, 0.1, 0.8))) for k in range(4)]
     shape = tuple("abc"), np.array([0.1, 0.3, 0.2]), np.full((3, 10), 0.1), (bell(0.1), bell(), bell(-0.1)), "by points"
@@ -208,8 +208,8 @@ def test_algorithm_6_compares_with_the_last_keyframe() -> None:
 
 
 def test_cost_of_features_and_of_a_whole_estimate() -> None:
-    costs = [Cost("nid", 1, 5.0, 2.0, 9.0), Cost("ours", 3, 20.0, 0.5, 10.0)]
-    found = tables.cost(Results({}, table(*(trial(cpu_s=c) for c in (1.0, 2.0, 9.0))), costs=costs))
+    costs = [("nid", 1, 5.0, 2.0, 9.0), ("ours", 3, 20.0, 0.5, 10.0)]
+    found = tables.cost(Results({"ours": "Ours"}, table(*(trial(cpu_s=c) for c in (1.0, 2.0, 9.0))), costs=costs))
     assert found.rows == [
         ["nid", "1", "5.00", "2.00", "9.00", "–", "–"],
         ["ours", "3", "20.0", "0.500", "10.0", "2.50", "100"],
@@ -321,15 +321,15 @@ def test_reasons_that_differ_in_figures_are_one() -> None:
 
 def test_report_of_the_share_of_worse_neighbours() -> None:
     """Of 4 right and 2 wrong shares: 7 of the 8 pairs are in order and one is tied, (7 + 0.5 * 1) / 8."""
-    assert statistics.area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)
-    assert statistics.area([0.5], [0.5]) == 0.5
+    assert area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)
+    assert area([0.5], [0.5]) == 0.5
     # Of 40 right ones, two may be below the threshold at 5 % false alarms: it is the third lowest.
     right = np.linspace(0.61, 1.0, 40)
-    assert statistics.hits(right, [0.625, 0.635]) == 0.5
+    assert hits(right, [0.625, 0.635]) == 0.5
     trusts = [Trust(0.95 + 0.01 * k, ((0.5, 0.0, 0.5 + 0.05 * k), (0.0, 0.1, 0.6))) for k in range(4)]
-    assert statistics.called_right(trusts, None) == 1.0
-    assert statistics.called_right(trusts, (0.5, 0.0)) == 0.0
+    assert called_right(trusts, None) == 1.0
+    assert called_right(trusts, (0.5, 0.0)) == 0.0
     found = tables.detection(trusts)
     assert found.rows[0][:2] == ["none", "0.965"]
     assert found.rows[1] == ["0.5 deg", "0.575", "1.00", "100 %", "1.00", "100 %", "0 %"]
-    assert math.isnan(statistics.called_right(trusts[:2], None))
+    assert math.isnan(called_right(trusts[:2], None))

@@ -120,7 +120,7 @@ def test_a_source_without_colour_and_intensity(drive: SyntheticDrive, tmp_path: 
     assert "no intensity" in missing.caption
     assert made[0].picture is not None
     assert made[0].picture.ndim == 2
-    page = write_page(tmp_path, "plain", {}, "", SECTIONS, made)
+    page = write_page(tmp_path, "plain", {}, "", made)
     assert len(Page(page.read_text()).captions) == len(made)
 
 
@@ -128,8 +128,8 @@ def test_the_filters_shown_are_those_of_the_method_without_intensity_too(drive: 
     """A threshold on reflectivity says nothing where the source tells none."""
     frame, config = drive[0], with_constants(Config(), min_reflectivity=0.5)
     bare = dataclasses.replace(frame, cloud=PointCloud(frame.cloud.xyz, ring=frame.cloud.ring))
-    scene = RegisteredFrame.of(bare, drive.reference, config)
-    cloud = Cloud.of(scene)
+    scene = RegisteredFrame(bare, drive.reference, config)
+    cloud = Cloud(scene)
     assert np.count_nonzero(cloud.passed) == len(scene.thesis.points) > 1000
     assert np.count_nonzero(cloud.ground) == np.count_nonzero(scene.thesis.points.ground)
     assert np.array_equal(np.bincount(cloud.label[cloud.passed]), np.bincount(scene.thesis.points.label))
@@ -293,13 +293,13 @@ def test_new_page_replaces_the_old_one(tmp_path: Path) -> None:
     section = next(iter(SECTIONS))
     (tmp_path / "notes.png").write_bytes(b"mine")
     first = [Step(section, name, "what it is", picture) for name in ("One <step>", "Two")]
-    page = write_page(tmp_path, "a & b", {"Source": "<here>"}, "x: 1", SECTIONS, first)
+    page = write_page(tmp_path, "a & b", {"Source": "<here>"}, "x: 1", first)
     assert sorted(content(tmp_path)) == ["01_one_step.png", "02_two.png", "index.html", "notes.png"]
     text = page.read_text()
     assert "a &amp; b" in text
     assert "&lt;here&gt;" in text
     assert "One &lt;step&gt;" in text
-    write_page(tmp_path, "c", {}, "", SECTIONS, first[1:])
+    write_page(tmp_path, "c", {}, "", first[1:])
     assert sorted(content(tmp_path)) == ["01_two.png", "index.html", "notes.png"]
 
     def broken() -> object:
@@ -308,7 +308,7 @@ def test_new_page_replaces_the_old_one(tmp_path: Path) -> None:
 
     before = content(tmp_path)
     with pytest.raises(ValueError, match="no more"):
-        write_page(tmp_path, "d", {}, "", SECTIONS, broken())  # type: ignore[arg-type]
+        write_page(tmp_path, "d", {}, "", broken())  # type: ignore[arg-type]
     assert content(tmp_path) == before
     check_folder(tmp_path)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import zlib
 
-import cv2
 import numpy as np
 
 from calib_ros.camera import Camera
@@ -66,15 +65,3 @@ def compared(masks: list[Mask], truth: list[np.ndarray], enough: float = 0.8) ->
     told = [int(row.argmax()) for row in table if row.max() > 0.5]
     recall = float((table.max(axis=0, initial=0) > enough).mean())
     return recall, len(told) - len(set(told)), len(pictures) - len(told)
-
-
-def assert_lies_on_edges(edges: np.ndarray, image: np.ndarray, sigma: float, shift: int, factor: float) -> None:
-    """Edges (2, H, W) meet the gradients of a picture by so much more than shifted, or with their directions swapped."""
-    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), sigma)
-    slopes = np.abs(np.stack([cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)]))
-
-    def met(given: np.ndarray) -> float:
-        return float((slopes * given).sum() / given.sum())
-
-    for moved in (edges[::-1], *(np.roll(edges, by, axis) for by in (shift, -shift) for axis in (1, 2))):
-        assert met(edges) > factor * met(moved)

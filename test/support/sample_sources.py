@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -47,14 +48,15 @@ class Listed:
         return {}
 
 
-def kitti(folder: Path, layout: str) -> None:
-    """A drive of two frames."""
+def kitti(folder: Path, layout: str, listed: Sequence[Frame] = ()) -> None:
+    """A drive of two frames, or of those; in the object layout each has its own extrinsic."""
     import cv2
 
     def text(values: Any) -> str:
         return " ".join(f"{v:e}" for v in np.ravel(values))
 
-    T, P = nominal(0.0)[:3], f"P2: {text(np.c_[K, [1.0, 0, 0]])}\n"
+    listed = listed or frames()
+    T, P = nominal(0.0)[:3], f"P2: {text(np.c_[listed[0].camera.K, [1.0, 0, 0]])}\n"
     files: dict[str, str] = {}
     if layout == "raw":
         rectified = f"R_rect_00: {text(np.eye(3))}\n{P.replace('2', '_rect_02', 1)}"
@@ -67,10 +69,11 @@ def kitti(folder: Path, layout: str) -> None:
     elif layout == "odometry":
         files |= {"calib.txt": f"{P}Tr: {text(T)}\n", "times.txt": "0.0\n1.03e-1\n"}
     else:
-        files |= {f"calib/{k:06d}.txt": f"{P}R0_rect: {text(np.eye(3))}\nTr_velo_to_cam: {text(T)}\n" for k in range(2)}
+        own = [f"{P}R0_rect: {text(np.eye(3))}\nTr_velo_to_cam: {text(frame.reference[:3])}\n" for frame in listed]
+        files |= {f"calib/{k:06d}.txt": content for k, content in enumerate(own)}
     raw = layout == "raw"
     images, clouds = ("image_02/data", "velodyne_points/data") if raw else ("image_2", "velodyne")
-    for k, frame in enumerate(frames()):
+    for k, frame in enumerate(listed):
         name = f"{k:0{10 if raw else 6}d}"
         for place in (images, clouds):
             (folder / place).mkdir(parents=True, exist_ok=True)

@@ -202,15 +202,6 @@ def test_files_that_cannot_be_read(tmp_path):
 # --- atomic files ---------------------------------------------------------------------------------------------------------
 
 
-def test_writing_replaces_whole_files(tmp_path):
-    path = tmp_path / "deep" / "er" / "file"
-    write_atomically(path, b"first, and long")
-    write_atomically(str(path), b"second")
-    assert path.read_bytes() == b"second"
-    assert [p.name for p in path.parent.iterdir()] == ["file"]
-    assert path.stat().st_mode & 0o777 == 0o644
-
-
 FULL = OSError(28, "No space left on device")
 
 

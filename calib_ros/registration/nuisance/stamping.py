@@ -7,7 +7,7 @@ agree. Which part of the scan is stamped is a time offset of half a scan period 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -45,28 +45,15 @@ def restamped(features: FrameFeatures, before: MotionConfig, after: MotionConfig
     return replace(features, points=points, plain=plain, view=None)  # points of a view have no times
 
 
-@dataclass(frozen=True)
-class Convention:
-    """A convention for people: what to set for a driver that stamps so."""
-
-    spin: str
-    stamp_at: str
-    stamp_azimuth_deg: float
-
-    def __str__(self) -> str:
-        return f"motion.spin: {self.spin}, motion.stamp_at: {self.stamp_at}, motion.stamp_azimuth_deg: {self.stamp_azimuth_deg:g}"
-
-
-def convention(stamping: Stamping, seconds: float, scan_period_s: float) -> tuple[Convention, float]:
-    """The usual convention nearest to what was found, and the time offset that is left then, s. seconds: that of `stamping`,
-    whose scans are stamped half a turn after they begin."""
-    if stamping.spin == "none":
-        return Convention("none", "middle", 0.0), seconds
-    halves = {"start": 0.5, "middle": 0.0, "end": -0.5}
-    name = min(halves, key=lambda n: abs(seconds - halves[n] * scan_period_s))
-    seam = (stamping.azimuth_deg + 180.0) % 360.0
-    azimuth = stamping.azimuth_deg if name == "middle" else (seam if seam <= 180.0 else seam - 360.0)
-    return Convention(stamping.spin, name, azimuth), seconds - halves[name] * scan_period_s
+def convention(stamping: Stamping, seconds: float, scan_period_s: float) -> tuple[str, float]:
+    """What to set for a driver that stamps as was found, for people, by the nearest usual convention; and the time offset that is
+    left then, s. seconds: that of `stamping`, whose scans are stamped half a turn after they begin."""
+    halves = {"start": 0.5, "middle": 0.0, "end": -0.5} if stamping.spin != "none" else {"middle": 0.0}
+    name, azimuth = min(halves, key=lambda n: abs(seconds - halves[n] * scan_period_s)), stamping.azimuth_deg
+    if name != "middle":
+        azimuth = azimuth + 180.0 if azimuth <= 0 else azimuth - 180.0
+    found = f"motion.spin: {stamping.spin}, motion.stamp_at: {name}, motion.stamp_azimuth_deg: {azimuth:g}"
+    return found, seconds - halves[name] * scan_period_s
 
 
 def stamped_by_azimuth(features: Sequence[FrameFeatures], config: MotionConfig) -> bool:

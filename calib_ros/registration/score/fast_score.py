@@ -11,7 +11,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, PointScore, ScoredPoints, near_image
+from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, PointScore, near_image
 
 # Weights of the kinds of edges, beside that of reflectivity, which users set: what is often no edge in the image weighs less.
 WEIGHT_SIDE, WEIGHT_TOP, WEIGHT_SKY_SIDE, WEIGHT_SKY_TOP = 1.0, 0.6, 0.5, 0.3
@@ -48,13 +48,13 @@ class FastScore(PointScore):
                 "wait for a scene with objects, or check the initial extrinsic"
             )
         weights = np.concatenate([_weights(p, config) for p in kept])
-        points = ScoredPoints(
-            np.ascontiguousarray(np.concatenate([p.xyz for p in kept]).T),
+        super().__init__(
+            np.concatenate([p.xyz for p in kept]).T,
             (weights / weights.sum()).astype(np.float32),
             frame,
             np.concatenate([_channels(p, T_prior) for p in kept]),
+            atlas or Atlas([f.levels for f in features], camera),
         )
-        super().__init__(points, atlas or Atlas([f.levels for f in features], camera))
 
 
 def _channels(points: EdgePoints, T_prior: Transform) -> NDArray[np.intp]:

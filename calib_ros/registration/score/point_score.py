@@ -72,34 +72,22 @@ def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera,
     return np.asarray(in_front[inside])
 
 
-@dataclass(frozen=True, eq=False)
-class ScoredPoints:
-    """Points of several frames, frame after frame. xyz: (3, n) float32 m, LiDAR frame. weight: (n,) float32, sums up to 1. frame:
-    (n,) number of the frame. channel: (n,) which of its maps is sampled."""
+class PointScore(Sampler):
+    """Weighted mean of the map values under the points, at several resolutions.
 
-    xyz: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    frame: NDArray[np.int32]
-    channel: NDArray[np.intp]
+    xyz: (3, n) float32 m, LiDAR frame, of several frames, frame after frame. weights: (n,) float32, sum up to 1. frame: (n,)
+    number of the frame. channel: (n,) which of its maps is sampled.
+    """
 
-
-class PointScore:
-    """Weighted mean of the map values under the points, at several resolutions."""
-
-    def __init__(self, points: ScoredPoints, atlas: Atlas) -> None:
-        self.atlas, self.camera, self.n_frames = atlas, atlas.camera, atlas.n_frames
-        self.points, self.weights, self.frame = points.xyz, points.weight, points.frame
-        self._tiles = np.asarray(atlas.channels * points.frame + points.channel, np.int32)
-        self._sampler = self._make_sampler()
-
-    def _make_sampler(self) -> Sampler:
-        return Sampler(self.points, self.weights, self._tiles, self.atlas)
+    def __init__(self, xyz: Map, weights: Map, frame: NDArray[np.int32], channel: NDArray[np.intp], atlas: Atlas) -> None:
+        self.camera, self.n_frames, self.frame = atlas.camera, atlas.n_frames, frame
+        super().__init__(xyz, weights, np.asarray(atlas.channels * frame + channel, np.int32), atlas)
 
     def _with(self, **changed: Any) -> PointScore:
         """The same with some attributes changed."""
         part = copy.copy(self)
         vars(part).update(changed)
-        part._sampler = part._make_sampler()
+        Sampler.__init__(part, part.points, part.weights, part._tiles, part.atlas)
         return part
 
     @property
@@ -152,38 +140,18 @@ class PointScore:
         total = self.points.shape[1]
         return self if total <= n else self.select(np.sort(rng.choice(total, n, replace=False)))
 
-    def sample(self, T: Transform, level: int) -> Map:
-        """Map value under every point (n,) at T."""
-        return self._sampler.samples(T, level)
-
-    def values(self, transforms: Matrix, level: int) -> Matrix:
-        """The score (k,) of many extrinsics (k, 4, 4) at once: for the starts of a search, where calls would cost most."""
-        return self._sampler.values(transforms, level)
-
     def frame_values(self, transforms: Matrix, level: int) -> Matrix:
-        """The same frame by frame (k, n_frames); NaN for a frame without points."""
+        """`values` frame by frame (k, n_frames); NaN for a frame without points."""
         present = self.frames
         first = np.searchsorted(self.frame, present)
         out = np.full((len(transforms), self.n_frames), np.nan)
         share = np.bincount(self.frame, self.weights, self.n_frames)[present]
-        out[:, present] = self._sampler.group_values(transforms, level, first) / share
+        out[:, present] = self.group_values(transforms, level, first) / share
         return out
-
-    def jacobian(self, T: Transform, level: int) -> Map:
-        """Derivative of every sample by a left twist at T, (6, n)."""
-        return self._sampler.jacobian(T, level)
-
-    def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
-        """Gradients (k, 6) at each of (k, 4, 4), and the weighted outer products of the point derivatives (k, 6, 6)."""
-        return self._sampler.linearise(transforms, level)
-
-    def gradients(self, transforms: Matrix, level: int) -> Matrix:
-        """The gradients (k, 6) alone."""
-        return self._sampler.gradients(transforms, level)
 
     def frame_scores(self, T: Transform, level: int = -1) -> Matrix:
         """Score of every frame alone (n_frames,); NaN for a frame without points."""
-        e = self.sample(T, level % self.n_levels)
+        e = self.samples(T, level % self.n_levels)
         weight = np.bincount(self.frame, self.weights, self.n_frames)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.bincount(self.frame, self.weights * e, self.n_frames) / weight)

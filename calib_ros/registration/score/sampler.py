@@ -77,43 +77,45 @@ KERNEL = load_kernel()
 
 
 class Sampler:
-    """The maps of an atlas under its points, by kernel.c. T is T_camera_lidar (4, 4). Calls release the interpreter lock."""
+    """The maps of an atlas under its points, by kernel.c. T is T_camera_lidar (4, 4). Calls release the interpreter lock.
+
+    points: (3, n). weights: (n,).
+    """
 
     def __init__(self, points: Map, weights: Map, tiles: Tiles, atlas: Atlas) -> None:
-        """points: (3, n). tiles: (n,) of the atlas, those that the points look at."""
-        self._atlas, self._n = atlas, points.shape[1]
+        """tiles: (n,) of the atlas, those that the points look at."""
+        self.atlas, self._tiles = atlas, tiles
         # The views hold addresses: these arrays must live as long, and lie in memory as C expects.
-        self._points, self._weights = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(weights, np.float32)
-        self._tiles = tiles
+        self.points, self.weights = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(weights, np.float32)
         self._made: dict[int, ctypes._Pointer[_View]] = {}
 
     def _view(self, level: int) -> ctypes._Pointer[_View]:
         """The view of a level, made when it is asked for: few samplers are used on all of them."""
         if (made := self._made.get(level)) is not None:
             return made
-        own, row = self._atlas.levels[level], self._points.strides[0]
-        points, K = self._points.ctypes.data, own.K
+        own, row = self.atlas.levels[level], self.points.strides[0]
+        points, K = self.points.ctypes.data, own.K
         left, top = (np.ascontiguousarray(edge[self._tiles], np.float32) for edge in own.corner.T)
         if own.image.dtype != np.int16 or own.image.strides[1] != own.image.itemsize:
             raise TypeError("the maps of an atlas must be int16 without gaps within a row")
         view = _View(
             image=own.image.ctypes.data, stride=own.image.strides[0] // own.image.itemsize,
-            x=points, y=points + row, z=points + 2 * row, weight=self._weights.ctypes.data,
-            left=left.ctypes.data, top=top.ctypes.data, count=self._n,
+            x=points, y=points + row, z=points + 2 * row, weight=self.weights.ctypes.data,
+            left=left.ctypes.data, top=top.ctypes.data, count=self.points.shape[1],
             fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], width=own.width, height=own.height, step=slope_step(own),
-            unit=UNIT, sphere=self._atlas.camera.is_sphere,
+            unit=UNIT, sphere=self.atlas.camera.is_sphere,
         )  # fmt: skip
         view.corners = left, top  # which live as long as the view
         return self._made.setdefault(level, ctypes.pointer(view))
 
     def samples(self, T: Transform, level: int) -> Map:
         """Map value (n,) under every point; 0 outside the frame."""
-        rows, out = _rows(T[None]), np.empty(self._n, np.float32)
+        rows, out = _rows(T[None]), np.empty(self.points.shape[1], np.float32)
         KERNEL.calib_samples(self._view(level), rows.ctypes.data, 1, out.ctypes.data)
         return out
 
     def values(self, transforms: Matrix, level: int) -> Matrix:
-        """Weighted sum (k,) of the map values at each of (k, 4, 4)."""
+        """Weighted sum (k,) of the map values at each of (k, 4, 4): for the starts of a search, where calls would cost most."""
         return self.group_values(transforms, level, ALL_POINTS)[:, 0]
 
     def group_values(self, transforms: Matrix, level: int, first: NDArray[np.intp]) -> Matrix:
@@ -124,7 +126,7 @@ class Sampler:
 
     def jacobian(self, T: Transform, level: int) -> Map:
         """Derivative of every map value by a left twist at T, (6, n): over half the blur, or fine structure makes it noise."""
-        rows, out = _rows(T[None]), np.empty((6, self._n), np.float32)
+        rows, out = _rows(T[None]), np.empty((6, self.points.shape[1]), np.float32)
         KERNEL.calib_jacobian(self._view(level), rows.ctypes.data, out.ctypes.data)
         return out
 

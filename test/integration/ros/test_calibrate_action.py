@@ -64,16 +64,11 @@ def assert_says(asked: Goal, what: str, extrinsic: str) -> None:
     assert what in result.message
 
 
-def test_a_goal_before_any_message_says_what_is_missing():
-    """First of all: there is no other node yet."""
-    with Peer(initial_from_tf=False) as peer:
-        assert_says(peer.goal(), "no pair of image and cloud", "initial")
-
-
 @pytest.fixture(scope="module")
 def peer(ros_in_this_process, drive, street):
-    """A node with four keyframes that waits for requests."""
+    """A node with four keyframes that waits for requests; before them it says what is missing."""
     with Peer(**start_parameters(off(drive.reference)), **{**QUICK, "online__mode": "manual"}, initial_from_tf=False) as peer:
+        assert_says(peer.goal(), "no pair of image and cloud", "initial")
         peer.drive(street[:4])
         yield peer
 

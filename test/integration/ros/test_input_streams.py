@@ -68,11 +68,10 @@ def test_a_stream_with_lost_messages_is_named(street):
         assert "on /image get lost" in peer.last_error()
 
 
-@pytest.mark.parametrize(("ahead_s", "named"), [(37.0, "TAI and UTC"), (-1.7e9, "another epoch")])
-def test_clouds_of_another_clock_are_paired_as_received_and_it_is_told(street, drive, ahead_s, named):
+def test_clouds_of_another_clock_are_paired_as_received_and_it_is_told(street, drive):
     with Peer(**start_parameters(drive.reference), **QUICK) as peer:
         peer.publish_camera(street[0])
-        frames, ahead = cycle(street), round(ahead_s * NANOSECONDS)
+        frames, ahead = cycle(street), 37 * NANOSECONDS
         stamps = count(1_750_000_000 * NANOSECONDS, PERIOD)
 
         def go_on() -> None:
@@ -82,7 +81,7 @@ def test_clouds_of_another_clock_are_paired_as_received_and_it_is_told(street, d
         until(lambda: peer.pipeline.last_keyframe is not None, "a keyframe", go_on)
         kept = peer.pipeline.last_keyframe
         assert abs(kept.moment_of_cloud - kept.stamp) < 0.2 * NANOSECONDS
-        until(lambda: peer.warns(named, "paired as received", "synchronise the clocks"), "what was done", go_on)
+        until(lambda: peer.warns("TAI and UTC", "paired as received", "synchronise the clocks"), "what was done", go_on)
 
 
 # A driver whose images of 25 MB do not fit the shared memory that Fast DDS has by default.

@@ -56,24 +56,25 @@ def test_environment_variables_are_those_of_the_distribution(monkeypatch, rclpy,
     assert "FASTRTPS_DEFAULT_PROFILES_FILE" in distributions.profile_variables()  # Kilted takes it, too
 
 
-@pytest.mark.parametrize(
-    ("middleware", "advice", "silence"),
-    [
-        ("rmw_cyclonedds_cpp", "SocketReceiveBufferSize in CYCLONEDDS_URI", "ROS_DOMAIN_ID"),
-        ("rmw_zenoh_cpp", "ZENOH_CONFIG_OVERRIDE='transport/shared_memory/enabled=true'", "and that rmw_zenohd runs"),
-        ("rmw_connextdds", "socket buffers (net.core.rmem_max) that hold several messages", "ROS_DOMAIN_ID"),
-    ],
-)
-def test_another_middleware_is_told_of_once_and_has_advice_of_its_own(monkeypatch, capfd, middleware, advice, silence):
-    monkeypatch.setattr(distributions, "get_rmw_implementation_identifier", lambda: middleware)
+def test_another_middleware_is_told_of_once_and_has_advice_of_its_own(monkeypatch, capfd):
+    def runs(middleware):
+        monkeypatch.setattr(distributions, "get_rmw_implementation_identifier", lambda: middleware)
+
+    runs("rmw_cyclonedds_cpp")
     with Peer() as peer:
         points = peer.calibration.sensors.adaptive[1]
         for publisher in (peer.image_pub, peer.cloud_pub):
             peer.peer.destroy_publisher(publisher)
-        peer.until(lambda: points.silence.endswith(silence))
-        assert advice in loss_advice(points)
-        assert "fastdds_profile" not in loss_advice(points)
-    assert capfd.readouterr().err.count(f"{middleware}: to receive large messages, ") == 1
+        for middleware, advice, silence in (
+            ("rmw_cyclonedds_cpp", "SocketReceiveBufferSize in CYCLONEDDS_URI", "ROS_DOMAIN_ID"),
+            ("rmw_zenoh_cpp", "ZENOH_CONFIG_OVERRIDE='transport/shared_memory/enabled=true'", "and that rmw_zenohd runs"),
+            ("rmw_connextdds", "socket buffers (net.core.rmem_max) that hold several messages", "ROS_DOMAIN_ID"),
+        ):
+            runs(middleware)
+            peer.until(lambda silence=silence: points.silence.endswith(silence))
+            assert advice in loss_advice(points)
+            assert "fastdds_profile" not in loss_advice(points)
+    assert capfd.readouterr().err.count("rmw_cyclonedds_cpp: to receive large messages, ") == 1
 
 
 def test_a_middleware_that_reports_no_losses_is_named_once(monkeypatch, capfd, street):

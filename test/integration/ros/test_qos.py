@@ -28,7 +28,7 @@ from calib_ros.messages import decode_cloud
 from calib_ros.messages.point_fields import decode_livox
 from calib_ros.ros import dds
 from calib_ros.ros.distributions import profile_variables
-from calib_ros.ros.subscriptions import AdaptiveSubscription, Form, advice, livox_forms, loss_advice, serialized
+from calib_ros.ros.subscriptions import AdaptiveSubscription, advice, livox_forms, loss_advice, serialized
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -50,9 +50,9 @@ class Topic:
 
     def subscribe(self, preference: str, latched: bool = False, kind: type[Any] = CameraInfo) -> AdaptiveSubscription:
         def receive(stamp: int, msg: Any) -> None:
-            self.got.append(msg.height)
+            self.got.append(msg.message().height)
 
-        return AdaptiveSubscription(self.listener, [Form(kind)], "info", receive, preference, latched)
+        return AdaptiveSubscription(self.listener, [serialized(kind)], "info", receive, preference, latched)
 
     def publisher(self, qos: QoSProfile) -> Any:
         count = self.publishers()

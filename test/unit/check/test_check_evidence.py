@@ -11,7 +11,6 @@ from calib_ros_check.checker import Checker
 from calib_ros_check.evidence import (
     EVEN,
     Match,
-    _nearest_within,
     convinces,
     freedom,
     is_off,
@@ -68,14 +67,3 @@ def test_an_extrinsic_is_off_where_nothing_within_the_tolerance_matches_as_well(
     T = drive.reference
     checked = se3.perturb(T, [0, deg, 0], [0, 0, 0])
     assert is_off(Match(score_of((0, 2), T), T), SHARP, checked, Tolerance()) is off
-
-
-def test_the_nearest_within_a_tolerance_follows_what_the_scenes_do_not_tell():
-    """Beyond the limit of the rotation only along a flat direction that couples it with a shift."""
-    half = np.array([0.01] * 3 + [0.1] * 3)
-    error = np.array([0.03, 0, 0, 0, 0.02, 0])
-    plain = _nearest_within(error, np.diag([1e-6] * 3 + [1e-4] * 3), half)
-    np.testing.assert_allclose(plain, [0.01, 0, 0, 0, 0.02, 0], atol=1e-4)
-    flat = np.array([1.0, 0, 0, 0, -3.0, 0])
-    coupled = _nearest_within(error, np.diag([1e-6] * 3 + [1e-4] * 3) + 1e-2 * np.outer(flat, flat), half)
-    np.testing.assert_allclose(coupled[[0, 4]], [0.01, 0.08], atol=2e-3)

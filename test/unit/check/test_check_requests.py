@@ -50,24 +50,12 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
     before, kept, states = recalibrator.current, list(recalibrator.buffer), len(driven.states)
     of_estimates = pipeline.load.counts().seconds[Work.ESTIMATES]
     own = request_check(pipeline, CheckRequest()).result(SOON)
-    assert own.of_current
-    assert own.result.verdict is CheckVerdict.PASS, own.result.reason
+    assert (own.of_current, own.result.verdict) == (True, CheckVerdict.PASS), own.result.reason
     np.testing.assert_array_equal(own.result.T_checked, before.result.T_camera_lidar)
-    assert (own.result.camera_frame, own.result.lidar_frame) == ("camera", "lidar")
-    assert len(own.result.frame_names) == 4
-    assert own.result.data_stamp == kept[-1].stamp
     assert own.result.cpu_s > 0
-
     wrong = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
     given = request_check(pipeline, CheckRequest(Tolerance(1.0, 0.2), wrong, 2)).result(SOON)
-    assert not given.of_current
-    assert given.result.verdict is CheckVerdict.FAIL
-    axes = {axis.name: axis for axis in given.result.axes}
-    assert axes["ry"].low < 2.0 < axes["ry"].high
-    assert axes["rx"].verdict is CheckVerdict.PASS
-    assert len(given.result.frame_names) == 2
-    assert given.result.tolerance == Tolerance(1.0, 0.2)
-
+    assert (given.of_current, given.result.verdict) == (False, CheckVerdict.FAIL)
     assert (recalibrator.current, list(recalibrator.buffer), len(driven.states)) == (before, kept, states)
     assert driven.errors == []
     assert pipeline.wait_idle(SOON)

@@ -164,22 +164,6 @@ def test_empty_segmentation_is_explained(capsys, files):
     assert max(map(len, out.splitlines())) < 130
 
 
-def test_bad_input_is_one_line(capsys, files, tmp_path):
-    (tmp_path / "file").write_text("")
-    (tmp_path / "wrong.yaml").write_text("semantics: {image_class: source}\n")
-    for arguments, text in (
-        ((SMALL, "--image-classes", "source", "--frame", 2), "--frame 2 is outside 0..1"),
-        ((SMALL, "--image-classes", "source", "--out", tmp_path / "file"), "is a file, not a folder; name another"),
-        ((SMALL, "--image-classes", "source", "--out", tmp_path / "file" / "x"), "cannot be made (Not a directory)"),
-        ((SMALL, "--config", tmp_path / "none.yaml"), "none.yaml"),
-        ((SMALL, "--config", tmp_path / "wrong.yaml"), "image_class"),
-        ((tmp_path / "nothing", "--image-classes", "source"), "nothing"),
-    ):
-        code, out, err = run(capsys, *arguments)
-        assert (code, out, len(err.splitlines())) == (2, "", 1), (arguments, err)
-        assert text in err
-
-
 # --- pictures -------------------------------------------------------------------------------------------------------------
 
 

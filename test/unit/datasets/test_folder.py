@@ -190,7 +190,7 @@ def test_damaged_and_doubled_images_are_one_clear_error(folder):
     with pytest.raises(BadInputError, match=r"10\.png is no complete PNG"):
         source[1]
     (folder / "images/10.png").unlink()
-    with pytest.raises(BadInputError, match=r"10\.png cannot be read"):
+    with pytest.raises(BadInputError, match=r"cannot read image .*10\.png"):
         source[1]
     write_image(folder / "images" / "11.jpg", 0)
     with pytest.raises(BadInputError, match=r"11\.jpg and 11\.png are of the same frame; keep one"):

@@ -225,7 +225,7 @@ def test_cameras_that_are_not_there(raw, odometry):
         (lambda d: (d.parent / "calib_cam_to_cam.txt").write_text("P_rect_02: 1 2 3\n"), "'P_rect_02' must have 12 numbers"),
         (lambda d: (d.parent / "calib_velo_to_cam.txt").write_text(line("R", np.ones(9)) + line("T", np.ones(3))), "not a rigid"),
         (lambda d: (d / "velodyne_points/data/0000000007.bin").write_bytes(bytes(33)), "0000000007.bin is truncated: 33 bytes"),
-        (lambda d: (d / "image_02/data/0000000007.png").write_bytes(b"\x89PNG"), "0000000007.png is missing or unreadable"),
+        (lambda d: (d / "image_02/data/0000000007.png").write_bytes(b"\x89PNG"), "0000000007.png is no complete PNG"),
         (lambda d: (d / "image_02/timestamps.txt").write_text(date_lines(9, blank=(7,))), "no timestamp on line 8"),
         (lambda d: (d / "velodyne_points").rename(d / "points"), "has no folder velodyne_points/data"),
         (lambda d: [p.unlink() for p in (d / "velodyne_points/data").iterdir()], "no number has both"),

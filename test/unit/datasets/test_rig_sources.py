@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from calib_ros.datasets.bag_file import BagFile
 from calib_ros.datasets.bag_rig import BagRig
 from calib_ros.datasets.recent import Recent
 from calib_ros.datasets.rig import open_rig
+from calib_ros.datasets.rig_source import RigDescription, Sensor
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.initial_guess import nominal
@@ -27,11 +27,8 @@ from calib_ros_synthetic.rig import SyntheticRig
 TEXT = "synthetic:seed=3,frames=1,stride=4,width=96,noise=0.0,rig=two_lidars_three_cameras"
 
 
-def described(reference: str, **sensors: dict[str, Any]) -> Any:
-    """A description as of calib_ros/rig."""
-    empty = {"topic": "", "camera_info": "", "frame": "", "prior": None}
-    listed = tuple(SimpleNamespace(**{**empty, "name": name, **values}) for name, values in sensors.items())
-    return SimpleNamespace(reference=reference, sensors=listed)
+def described(reference: str, **sensors: dict[str, Any]) -> RigDescription:
+    return RigDescription(tuple(Sensor(name, **values) for name, values in sensors.items()), reference)
 
 
 def camera(topic: str = "", **more: Any) -> dict[str, Any]:

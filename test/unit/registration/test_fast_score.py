@@ -137,7 +137,7 @@ def test_the_fast_score_is_the_slow_one(config, margin):
         assert np.array_equal(score.frame, number)
         assert np.allclose(score.weights, weight, rtol=1e-4)
         # cv2.remap knows pixels to 1/32.
-        assert np.abs(score.sample(T, level) - sampled).max() < 0.15
+        assert np.abs(score.samples(T, level) - sampled).max() < 0.15
         assert score.at(level).value(T) == pytest.approx(weight @ sampled, abs=1e-3)
         per_frame = [np.average(sampled[number == j], weights=weight[number == j]) for j in range(3)]
         assert score.frame_scores(T, level) == pytest.approx(per_frame, abs=2e-3)
@@ -199,7 +199,7 @@ def test_a_subset_is_the_score_of_its_points():
     chosen = [int(np.nonzero((score.points == p[:, None]).all(axis=0))[0][0]) for p in part.points.T]
     assert len(set(chosen)) == 500
     for level in range(len(SCALES)):
-        expected = np.average(score.sample(T, level)[chosen], weights=score.weights[chosen])
+        expected = np.average(score.samples(T, level)[chosen], weights=score.weights[chosen])
         assert part.at(level).value(T) == pytest.approx(expected, abs=1e-4)
     assert part.at(-1).value(T) == score.subset(500, np.random.default_rng(4)).at(-1).value(T)
     assert score.subset(10**6, np.random.default_rng(0)) is score

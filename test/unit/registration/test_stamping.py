@@ -34,9 +34,8 @@ def test_spin_and_stamp_are_found(end_of_the_scan):
     result = scene.quick.estimate(without_times(scene, scene.quick.extract), scene.truth, BOX)
     scene.assert_found(result)
     found, left = convention(result.stamping, result.time_offset_s, 0.1)
-    assert (found.spin, found.stamp_at) == ("counterclockwise", "end")
     assert abs(left) < 0.003
-    assert str(found) == "motion.spin: counterclockwise, motion.stamp_at: end, motion.stamp_azimuth_deg: 180"
+    assert found == "motion.spin: counterclockwise, motion.stamp_at: end, motion.stamp_azimuth_deg: 180"
     assert parse(result.dumps(), "a file").stamping == result.stamping
 
 
@@ -87,6 +86,6 @@ def test_the_recalibrator_moves_its_keyframes_to_the_convention(end_of_the_scan)
 )
 def test_an_offset_of_half_a_scan_is_a_convention(seconds, expected, left):
     found, rest = convention(Stamping("clockwise", 0.0), seconds, 0.1)
-    assert found.stamp_at == expected
+    assert f"motion.stamp_at: {expected}," in found
     assert rest == pytest.approx(left, abs=1e-9)
     assert convention(Stamping("none", 0.0), seconds, 0.1)[1] == seconds

@@ -8,13 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from masks_of_pictures import assert_lies_on_edges, frame_of, later
+from masks_of_pictures import frame_of, later
 from onnx_graphs import segmentation
 from scenes import RenderedDrive
 from thesis_constants import with_constants
 
 from calib_ros.config import Config, SemanticsConfig, update
-from calib_ros.errors import BudgetError
 from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import blurred_levels, oriented_edges
@@ -23,7 +22,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import EDGE_SHARE, IMAGE, OF_CLASSES, OF_MASKS
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros_semantics.models.class_borders import IMAGE_BORDER, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
-from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, SegmentationModel
+from calib_ros_semantics.models.onnx_model import OnnxModel, SegmentationModel
 from calib_ros_semantics.models.segmentation import SegmentationModels, load_model
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import CLASS_EDGE_SHARE, semantic_share
@@ -186,10 +185,10 @@ def test_where_a_score_is_no_number_there_is_no_border() -> None:
 CENTRES = np.array([-4.5, 5.5])
 
 
-def network(folder: Path, config: SemanticsConfig | None = None, outputs: str = "scores 1 2 64 128", **more) -> SegmentationModel:
-    path = segmentation(folder / "net.onnx", 2, outputs, inputs="1 3 64 128", at=CENTRES, **more)
+def network(folder: Path, outputs: str = "scores 1 2 64 128") -> SegmentationModel:
+    path = segmentation(folder / "net.onnx", 2, outputs, inputs="1 3 64 128", at=CENTRES)
     path.with_suffix(".yaml").write_text("labels: [building, sky]\n")
-    return load_model(IMAGE, str(path), config or SemanticsConfig())
+    return load_model(IMAGE, str(path), SemanticsConfig())
 
 
 def grey(left: int, right: int) -> Frame:
@@ -213,24 +212,12 @@ def test_a_network_gives_classes_and_borders_of_one_run(tmp_path: Path, monkeypa
         assert borders[0, 30, 63:65] == pytest.approx(abs(sky[0] - sky[1]), abs=2e-3)
         assert borders[1].max() < 1e-3
     assert model(frame, later(), borders=False).borders is None
-    with pytest.raises(BudgetError):
-        model(frame, Deadline(0))
 
 
-@pytest.mark.parametrize(
-    ("graph", "off"),
-    [
-        ({"outputs": "scores 1 64 128 2", "form": "NCHW to NHWC"}, 1e-3),
-        ({"outputs": "argmax 1 64 128"}, 1e-3),
-        ({"outputs": "scores 1 2 32 64", "stride": 2}, 0.25),  # coarser cells are enlarged first
-    ],
-)
-def test_networks_of_all_layouts_give_the_same_borders(tmp_path: Path, graph: dict, off: float) -> None:
-    halves = split(C.BUILDING, C.SKY, 64, (64, 128))
-    classes, borders = network(tmp_path, **graph)(grey(0, 255), later())
-    assert np.array_equal(classes, halves)
-    np.testing.assert_allclose(borders, borders_of_classes(halves), atol=off)
-    assert borders[0, 30, 63:65].min() > 0.99
+def test_a_network_of_class_numbers_has_borders_of_full_strength(tmp_path: Path) -> None:
+    classes, borders = network(tmp_path, outputs="argmax 1 64 128")(grey(0, 255), later())
+    assert np.array_equal(classes, split(C.BUILDING, C.SKY, 64, (64, 128)))
+    assert np.array_equal(borders, borders_of_classes(classes))
 
 
 @pytest.fixture(scope="module")
@@ -303,14 +290,3 @@ def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, 
     for sigma, own in zip(thesis_of(config).smoothing, features.image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(expected, sigma * focal / 720.0), atol=1e-3)
         assert abs(own - smoothed(gradient, sigma * focal / 720.0)).max() > 0.05
-
-
-@pytest.mark.kitti
-def test_borders_of_a_real_street_lie_on_edges_of_the_picture(kitti_root: Path) -> None:
-    image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
-    if image is None:
-        pytest.skip("no such KITTI frame")
-    edges = load_model(IMAGE, "builtin", SemanticsConfig())(frame_of(image, "000000"), later()).borders
-    assert edges.shape == (2, *image.shape[:2])
-    assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.2
-    assert_lies_on_edges(edges, image, sigma=2, shift=12, factor=1.15)

@@ -10,7 +10,6 @@ from helpers import GROUND, HEIGHT, Box, Plane, Spinner
 from masks_of_pictures import frame_of, later
 
 from calib_ros.datasets.kitti import KittiSource
-from calib_ros.datasets.kitti_files import read_scan
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.classes import CLOUD
 from calib_ros_semantics.models.geometric_classes import ClusterClasses, cluster_classes, heights
@@ -193,14 +192,3 @@ def test_a_labelled_scan(kitti_root: Path) -> None:
     floors = {C.VEHICLE: (0.95, 0.7), C.POLE: (0.8, 0.5), C.BUILDING: (0.75, 0.6), C.VEGETATION: (0.75, 0.65)}
     assert_floors(found, truth, {**floors, C.GROUND: (0.9, 0.98)})
     assert np.count_nonzero(found == C.PERSON) < 100, "there is nobody in this scan"
-
-
-@pytest.mark.kitti
-def test_a_real_pedestrian(kitti_root: Path) -> None:
-    scan = kitti_root / "object" / "training" / "velodyne" / "000000.bin"
-    if not scan.is_file():
-        pytest.skip("no object set")
-    cloud = read_scan(scan)
-    x, y, z = cloud.xyz.T
-    body = (np.abs(x - 8.74) < 0.6) & (np.abs(y + 1.87) < 0.6) & (z > -1.3) & (z < 0.3)
-    assert np.mean(cluster_classes(cloud)[body] == C.PERSON) > 0.7

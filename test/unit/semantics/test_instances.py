@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 
@@ -29,8 +27,7 @@ def scanned(*parts: tuple[SemanticClass, np.ndarray]) -> ClassView:
 
 def whole(found: Objects) -> Objects:
     """Without the ends of objects."""
-    own = found.cls < LEFT
-    return Objects(*(getattr(found, field.name)[own] for field in fields(found)))
+    return found[found.cls < LEFT]
 
 
 def patch(azimuth_deg: float, elevation_deg: float, distance: float, half_deg: float = 1.0) -> np.ndarray:

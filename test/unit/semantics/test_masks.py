@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from masks_of_pictures import assert_lies_on_edges, box, frame_of, later, picture_of, png
+from masks_of_pictures import box, frame_of, later, picture_of
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
@@ -126,27 +126,3 @@ def test_folders_of_masks_that_cannot_be_used(tmp_path: Path) -> None:
         model.masks(FRAME, later())
     with pytest.raises(BudgetError):
         model.masks(FRAME, Deadline(0))
-
-
-def test_a_large_mask_of_one_bit(tmp_path: Path) -> None:
-    """More than a thousand pixels in a byte of the file."""
-    inside = box(600, 400, 1800, 1000, (1400, 2400))
-    data = png(inside, 1)
-    assert inside.size > 1100 * len(data)
-    (tmp_path / "000007").mkdir()
-    (tmp_path / "000007" / "a.png").write_bytes(data)
-    (mask,) = MaskFolder(tmp_path).masks(frame_of(np.zeros(inside.shape, np.uint8), "000007"), later())
-    assert tuple(mask.box) == (600, 400, 1800, 1000)
-    assert mask.inside.all()
-
-
-@pytest.mark.kitti
-def test_boundaries_of_real_masks_lie_on_edges_of_the_picture(kitti_root: Path) -> None:
-    image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
-    if image is None or not (kitti_root / "sam_masks/000000").is_dir():
-        pytest.skip("no masks of Segment Anything among the KITTI frames")
-    masks = MaskFolder(kitti_root / "sam_masks").masks(frame_of(image, "000000"), later())
-    assert len(masks) == 94
-    edges = mask_edges(masks, image.shape[:2])
-    assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.1
-    assert_lies_on_edges(edges, image, sigma=1, shift=6, factor=1.3)

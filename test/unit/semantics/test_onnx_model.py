@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from pathlib import Path
 
 import cv2
@@ -11,11 +10,11 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from onnx_graphs import endless, failing, segmentation, value
 from onnx_graphs import save as save_graph
+from onnx_graphs import segmentation, value
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.errors import BudgetError, ModelError
+from calib_ros.errors import ModelError
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
 from calib_ros_semantics.models.sidecar import Sidecar
 
@@ -78,40 +77,6 @@ def test_a_tensor_type_that_no_network_has(tmp_path: Path) -> None:
     text, same = (value(name, [1], onnx.TensorProto.STRING) for name in ("text", "same"))
     path = save_graph(tmp_path / "text.onnx", [onnx.helper.make_node("Identity", ["text"], ["same"])], [text], [same])
     assert "tensor text is of type tensor(string)" in message(path)
-
-
-@pytest.mark.parametrize("size", [64, 10])
-def test_a_network_that_fails_while_it_runs(tmp_path: Path, size: int) -> None:
-    """By itself, or since an array does not fit."""
-    model = OnnxModel(failing(tmp_path / "fails.onnx"), CONFIG)
-    with pytest.raises(ModelError, match=r"fails\.onnx failed: .*it has inputs: input float32 1x3x64x64") as caught:
-        model.run({"input": np.full((1, 3, size, size), 7.0)}, Deadline(60))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_run_is_broken_off_and_the_next_one_works(tmp_path: Path) -> None:
-    """In time, or when it is cancelled while it runs: before it, the deadline is asked twice."""
-    model, count = OnnxModel(endless(tmp_path / "endless.onnx"), CONFIG), itertools.count()
-    slow, quick = ({"input": np.full((1, 3, 64, 64), level)} for level in (0.5, -0.5))
-    with pytest.raises(BudgetError, match=r"budget of 0\.2 s \(semantics\.budget_s\)"):
-        model.run(slow, Deadline(0.2))
-    with pytest.raises(BudgetError, match="no longer wanted"):
-        model.run(slow, Deadline(600, lambda: next(count) > 4))
-    assert next(count) > 4
-    with pytest.raises(BudgetError):
-        model.run(quick, Deadline(0.0))
-    level = 0.485 - 0.5 * 0.229
-    assert (model.run(quick, Deadline(60))[0].argmax(axis=1) == int(level * 19)).all()
-
-
-@pytest.mark.parametrize("provider", ["cuda", "tensorrt"])
-def test_without_an_accelerator_it_runs_on_the_cpu_and_says_so(good: Path, provider: str) -> None:
-    if any(p.startswith(("CUDA", "Tensorrt")) for p in onnxruntime.get_available_providers()):
-        pytest.skip("onnxruntime has an accelerator here")
-    model = OnnxModel(good, SemanticsConfig(provider=provider))
-    assert model.provider == "cpu"
-    assert model.fallback == f"onnxruntime has no {provider} here: good.onnx runs on cpu"
-    assert model.run({"input": np.zeros((1, 3, 256, 512))}, Deadline(60))[0].shape == (1, 19, 256, 512)
 
 
 EVERY_ENTRY = """{family: cenet, mean: [1, 2.5, -3], std: [0.5, 1, 2], scale: 0.00392, channels: [range, x, y], size: [64, 2048],

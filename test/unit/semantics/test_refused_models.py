@@ -89,7 +89,7 @@ REFUSED: dict[str, tuple[Made, str, str, str]] = {
     "two means": (net(), IMAGE, "mean: [1, 2]", "'mean:' of the YAML beside it must have 1 or 3 numbers"),
     "another size": (net(), IMAGE, "size: [512, 512]", "does not run at the height and width [512, 512]"),
     "channels of scans": (net(), IMAGE, "channels: [range, x]", "must be rgb or bgr"),
-    "no such family": (net(), IMAGE, "family: zzz", "family 'zzz' is unknown; known are mmsegmentation, pidnet"),
+    "no such family": (net(), IMAGE, "family: zzz", "family 'zzz' is unknown; known are mmsegmentation, PIDNet"),
     "a huge size": (net("s ?", inputs="b 3 h w"), IMAGE, "size: [16384, 16384]", "[height, width], each 8 to 8192 px"),
     "no class of use": (
         *(net("s 1 3 256 512", classes=3), IMAGE, "labels: [object, void, unknown]"),
@@ -139,11 +139,11 @@ REFUSED: dict[str, tuple[Made, str, str, str]] = {
     ),
     "a family of SAM": (
         lambda folder: (encoder(folder), decoder(folder)),
-        *(MASKS, "family: segnet", "family 'segnet' in its YAML is unknown; known are sam, mobilesam"),
+        *(MASKS, "family: segnet", "family 'segnet' is unknown; known are sam, mobilesam"),
     ),
     "four stds": (lambda folder: (encoder(folder), decoder(folder)), MASKS, "std: [1, 2, 3, 4]", "must have 1 or 3 numbers"),
     "four stds of FastSAM": (fast(), MASKS, "std: [1, 2, 3, 4]", "'std:' of the YAML beside it must have 1 or 3 numbers"),
-    "no such table": (fast(), MASKS, "output: nothing", "'nothing', which 'output:' of the YAML beside it names, is no output"),
+    "no such table": (fast(), MASKS, "output: nothing", "there is no output 'nothing', which"),
     "NMS": (fast(nms="True"), MASKS, "", NMS),
     "an end-to-end head": (fast(end2end="True"), MASKS, "", NMS),
     "NMS among arguments": (fast(args="{'batch': 1, 'half': False, 'nms': True}"), MASKS, "", NMS),

@@ -9,7 +9,6 @@ import pytest
 from calib_ros.cli.arguments import parser
 from calib_ros.cli.inputs import configuration, initial_of
 from calib_ros.config import Config, load_stages, preset, update
-from calib_ros.errors import ConfigError
 from calib_ros.extensions import commands
 from calib_ros_thesis.config import ThesisConfig
 from calib_ros_thesis.presets import LITERAL, THESIS
@@ -74,8 +73,3 @@ def test_the_preset_begins_at_its_first_guess_unless_told_another(options, start
     assert initial_of(args, preset(args.preset)) == start
     args = parser().parse_args(["calibrate", "drive", "--initial", "reference", *options])
     assert initial_of(args, preset(args.preset)) == "reference"
-
-
-def test_a_mistyped_name_names_those_there_are():
-    with pytest.raises(ConfigError, match=r"there is no preset 'thesys'; there are thesis, thesis-literal"):
-        preset("thesys")

@@ -15,7 +15,6 @@ from calib_ros import Calibrator, SearchBox, se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.frame import PointCloud
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.classes import ALL, IMAGE, MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
@@ -23,7 +22,7 @@ from calib_ros.registration.score.point_score import near_image, project
 from calib_ros.result import RefusalCode
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.cloud import PointAttributes
-from calib_ros_thesis.config import ThesisConfig, thesis_of
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ImageEdges, Later, ThesisFeatures
 from calib_ros_thesis.maps import PointLevels
 from calib_ros_thesis.score import KEPT, ThesisScore, registration_maps
@@ -373,16 +372,6 @@ def test_an_image_of_another_scene_is_refused(scene):
     result = calibrator_of(scene.camera, "attached").estimate([other] * 3, start)
     assert result.status == "refused"
     assert np.array_equal(result.T_camera_lidar, start)
-
-
-def test_a_cloud_without_intensity_still_has_depth_and_objects(drive, scene):
-    frame = drive[0]
-    bare = dataclasses.replace(frame, cloud=PointCloud(frame.cloud.xyz, None, frame.cloud.ring, frame.cloud.time))
-    f = FeatureExtractor(drive.camera, THESIS)(bare)
-    assert not f.has_reflectivity
-    maps = registration_maps(f.own, scene.truth, ThesisConfig()).lidar
-    assert [e.any() for e in (maps.reflectivity_edges, maps.depth_edges, maps.object_edges)] == [False, True, True]
-    assert "no intensity" in calibrator_of(drive.camera, "attached").calibrate([bare], scene.truth).reason
 
 
 def test_covariance_includes_the_systematic_error_of_the_objective(scene):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 
 import pytest
 
@@ -78,17 +77,9 @@ def test_which_addresses_are_of_this_machine_only(host, local):
     assert Address(host).is_local is local
 
 
-def test_a_taken_port_and_what_cannot_be_an_address_are_clear_errors():
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        port = other.getsockname()[1]
-        with pytest.raises(BadInputError, match=f"port {port}.*--port"):
-            listening(Address(port=port))
-    for wrong in (Address(port=70_000), Address("203.0.113.7")):
-        with pytest.raises(BadInputError, match="cannot listen"):
-            listening(wrong)
-    listening(Address(port=0)).close()
+def test_what_cannot_be_an_address_is_a_clear_error():
+    with pytest.raises(BadInputError, match="cannot listen"):
+        listening(Address(port=70_000))
     assert Address("::1", 1).url(2, "t") == "http://[::1]:2/?token=t"
     for token in ("", "a b", "a;b", "a&b", "a\nSet-Cookie: x", "schlüssel"):  # no address or cookie can hold it
         with pytest.raises(BadInputError, match="--token"):

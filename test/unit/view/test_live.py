@@ -167,7 +167,6 @@ def test_statuses_are_events_with_their_reason_and_repetitions_are_counted() -> 
     assert history.newest_events()[0].text == "moved: searched anew"
     assert history.state is not None
     assert history.state.level == "bad"
-    assert "do not use it" in history.state.words
     for k in range(3):
         history.note(T0 + 3 + k, f"{k} % get lost")
     assert (history.newest_events()[0].count, history.newest_events()[0].at) == (3, T0 + 5)

@@ -20,11 +20,11 @@ from calib_ros.rig.description import CAMERA, LIDAR, RigDescription, Sensor, pri
 from calib_ros.rig.edges import RigMeasurer
 from calib_ros.rig.graph import Edge, RigSolution, solve
 from calib_ros.rig.report import RigReport
+from calib_ros_check.cli import rig_summary
 from calib_ros_check.fleet.history import row_of
 from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.rig.check import PairCheck, RigCheck, as_given, as_row, check_rig, judged
-from calib_ros_check.rig.cli import summary
 from calib_ros_check.rig.page import write_rig_page
 from calib_ros_check.tolerance import judge, unknown
 
@@ -91,7 +91,7 @@ def test_the_sensor_is_named_that_is_off_and_no_other(name: str, groups: list[li
     found = checked(name, groups)
     off = {n for group in groups for n in group}
     assert found.verdict is FAIL
-    assert {n for n, own in found.sensors.items() if own.verdict is FAIL} == off, summary(found)
+    assert {n for n, own in found.sensors.items() if own.verdict is FAIL} == off, rig_summary(found)
     assert {n for n, own in found.sensors.items() if own.verdict is PASS} == found.sensors.keys() - off
     assert set(found.blame.off) == off
     for group in groups:
@@ -123,13 +123,13 @@ def test_a_clock_that_all_pairs_share_is_the_lidars() -> None:
     known = known_of(poses)
     measured = [pair_of(known, e, 0.05) for e in edges(poses, pairs, np.random.default_rng(0))]
     found = judged(known, described(poses), measured, TOLERANCE)
-    assert {n for n, own in found.sensors.items() if own.verdict is FAIL} == {"l0"}, summary(found)
+    assert {n for n, own in found.sensors.items() if own.verdict is FAIL} == {"l0"}, rig_summary(found)
     assert found.reason.startswith("the clock of l0 is off by +")
     # Only one camera is late; then the same, where nothing is known of the clocks of the others.
     for offset in (0.0, None):
         one = [p if p.target == "c1" else replace(p, check=None, edge=replace(p.edge, time_offset_s=offset)) for p in measured]
         found = judged(known, described(poses), one, TOLERANCE)
-        assert {n for n, own in found.sensors.items() if own.verdict is FAIL} == {"c1"}, summary(found)
+        assert {n for n, own in found.sensors.items() if own.verdict is FAIL} == {"c1"}, rig_summary(found)
         assert ("cannot tell between: the clock of c1" if offset is None else "the clock of c1 is off by -") in found.reason
 
 
@@ -177,7 +177,7 @@ def test_two_cameras_are_checked_around_their_lidar(drive: RenderedDrive) -> Non
     description = RigDescription((Sensor("top", LIDAR), Sensor("left", CAMERA), Sensor("right", CAMERA, prior=off)), "top")
     found = check_rig(RigMeasurer(halves, description, QUICK, 3), TOLERANCE)
     assert [pair.check is not None for pair in found.pairs] == [True, True]
-    assert {n: own.verdict for n, own in found.sensors.items()} == {"top": PASS, "left": PASS, "right": FAIL}, summary(found)
+    assert {n: own.verdict for n, own in found.sensors.items()} == {"top": PASS, "left": PASS, "right": FAIL}, rig_summary(found)
     assert found.reason.startswith("right is off by ")
 
 
