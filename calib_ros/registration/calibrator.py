@@ -25,10 +25,16 @@ from calib_ros.intrinsics import change_between
 from calib_ros.registration.acceptance.checks import Acceptance, leaves_doubt
 from calib_ros.registration.acceptance.refusal import MAYBE_RAW, SUSPECT_INTRINSICS, joined
 from calib_ros.registration.acceptance.split_half import inflation
-from calib_ros.registration.camera_rounds import refined_with_camera
 from calib_ros.registration.classes import ALL, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
-from calib_ros.registration.estimate import Estimate, insufficient, observable_pose, refine_start, reject_outlier_frames
+from calib_ros.registration.estimate import (
+    Estimate,
+    insufficient,
+    observable_pose,
+    refine_start,
+    refined_with_camera,
+    reject_outlier_frames,
+)
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, other_objective, views_of
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
@@ -127,10 +133,7 @@ class Calibrator:
             seen = [replace(frame, camera=camera) for frame in frames]
             return self._with_camera(camera)._calibrated(seen, start, box, progress, ())
 
-        # Of other objectives the edges confirm the place, not the covariance; see Acceptance.refusal.
-        asked = not box.is_empty and other_objective(self.config) is None
-        limits = self.config.refine if asked else None
-        result = refined_with_camera(first, self.extract.source_camera, whole, self.config.camera, limits)
+        result = refined_with_camera(first, self.extract.source_camera, whole)
         return replace(result, origin=first.origin, elapsed_s=first.elapsed_s + time.perf_counter() - started)
 
     def _with_camera(self, camera: Camera) -> Calibrator:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.camera import Camera
 from calib_ros.config import Config, MotionConfig
 from calib_ros.errors import CalibrationError
+from calib_ros.intrinsics import RefinedCamera, change_between
 from calib_ros.registration.acceptance.refusal import KEPT, LEFT_OUT, NO_INTENSITY, ONE_FRAME, Refusal, joined
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.joint import Optimised
@@ -26,6 +28,7 @@ from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, Refusal
 UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
 NEGLIGIBLE = 3e-5  # of the score: what steps of a thousandth of a degree leave of an optimum
 OUTLIER_ROUNDS = 3  # an outlier frame may hide another
+CAMERA_ROUNDS = 3  # after two, changes are those by which pictures differ that are rectified a fraction of a pixel apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,3 +196,36 @@ def observable_pose(
     if penalised(objective, kept) < penalised(objective, start):  # the score does observe them farther from the optimum
         return T, C + np.diag(held), ()
     return kept, narrower + np.diag(held), tuple(unobservable)
+
+
+def refined_with_camera(first: Result, given: Camera, whole: Callable[[Camera], Result]) -> Result:
+    """The estimate with intrinsics of its own, in rounds: pictures are rectified by the corrected camera, and what is left to
+    correct is estimated. Where the last one is refused, like any other, there are no intrinsics.
+
+    first: by the given camera. whole: the estimate by another camera, from the same start.
+    """
+    left = found = first.refined_camera
+    result, own, clocks = first, np.zeros((6, 6)), np.zeros((6, 6))
+    if left is None or found is None:  # too little is seen to estimate anything
+        return first
+    for _ in range(CAMERA_ROUNDS):
+        result = whole(left.camera)
+        if result.refined_camera is None or result.covariance is None or not result.converged:
+            return replace(result, refined_camera=None)
+        clocks = np.zeros((6, 6)) if result.shared_covariance is None else result.shared_covariance
+        found, left, own = left, result.refined_camera, result.covariance - clocks
+        if left.settled:
+            break
+    changes = {name: replace(change, value=change_between(given, found.camera, name)) for name, change in left.changes.items()}
+    # About the camera that was used, with the change that is left: a second moment.
+    off = np.array([change.value for change in left.changes.values()])
+    both = np.r_[left.directions @ off, off]
+    joint = RefinedCamera(found.camera, result.T_camera_lidar, changes, left.covariance + np.outer(both, both))
+    extrinsic = joint.covariance[:6, :6]
+    return replace(
+        result,
+        covariance=extrinsic + clocks,
+        shared_covariance=clocks + extrinsic - own,
+        intrinsics=changes,
+        refined_camera=joint,
+    )

@@ -1,8 +1,8 @@
 """Is the optimum of an estimate to be used? What speaks for it, and the checks that may refuse it.
 
 `Acceptance.refusal` is the acceptance test: no better than the start, other intrinsics or clocks, at the end of the trust region,
-no better than chance, not known well enough, another objective elsewhere. Its limits are those of the stage ``refine``. Two more
-tests follow elsewhere: of refined intrinsics (camera_rounds.py), and of the node, over time (the gate of online/tracker.py).
+no better than chance, not known well enough, another objective elsewhere. Its limits are those of the stage ``refine``. One more
+test follows elsewhere: of the node, over time (the gate of online/tracker.py).
 """
 
 from __future__ import annotations

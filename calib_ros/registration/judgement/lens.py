@@ -360,6 +360,8 @@ def estimate_lens(
     see, as_it_is = _seeing(part, unknowns), np.zeros(n)
     T_given, _, lower, _ = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))
     starts = [(T, as_it_is, LEVELS), (T_given, as_it_is, NEAR_LEVELS)]
+    bent = np.array([GROSS if own.name == RADIAL else 0.0 for own in unknowns])
+    starts += [(T, sign * bent, LEVELS) for sign in (1, -1) if bent.any()]  # few frames have several tops
     if turned is not None:
         across = Rotation.from_matrix(T[:3, :3] @ turned[:3, :3].T).as_rotvec()[:2] * score.camera.K[0, 0] / score.camera.width
         looks = {CENTRE[0]: across[1], CENTRE[1]: -across[0]}

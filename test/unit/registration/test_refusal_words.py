@@ -21,7 +21,6 @@ LENSES = [
         (False, False),
         "that camera_info does not state, which moves the corners of the image by -5.0%",
     ),
-    (RADIAL, -0.05, (True, False), "a lens distortion other than camera_info states"),
 ]
 
 
