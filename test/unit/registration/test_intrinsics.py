@@ -142,7 +142,6 @@ def test_they_are_checked_where_it_is_wanted(scene):
 
 @pytest.mark.parametrize(("focal", "corner", "box"), [(-0.03, 0.02, BOX), (0.03, 0.0, None)])
 def test_a_wrong_camera_is_corrected_with_the_extrinsic(scene, focal, corner, box):
-    """Also where the extrinsic is only refined."""
     given = wrong(scene.camera, focal, corner=corner)
     result = calibrated(scene, given, box, REFINE)
     scene.assert_found(result, 0.3, 0.05)
