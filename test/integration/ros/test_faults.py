@@ -83,7 +83,7 @@ BAD: list[tuple[Callable[[Frame], dict[str, Any]], str]] = [
     (lambda f: scan(f, np.zeros((0, 3), np.float32)), "the cloud has 0 usable points"),
     (lambda f: scan(f, np.full((1000, 3), np.nan, np.float32)), "the LiDAR shows nothing (no returns"),  # by now it is known
     (lambda f: scan(f, data=bytes(1000)), "PointCloud2"),
-    (lambda f: scan(f, fields=[]), "PointCloud2"),
+    (lambda f: scan(f, fields=[]), "has no field x, y, z"),
     (lambda f: scan(f, point_step=0), "PointCloud2"),
     (lambda f: scan(f, width=2**31), "PointCloud2"),
     (lambda f: with_times(f, 37.0), "of another clock, +37 s from the header stamp"),
