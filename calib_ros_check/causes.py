@@ -86,7 +86,7 @@ def lens_findings(
     main = lens.unknowns[fault.k].name
     cause = Cause.PRINCIPAL_POINT if main in CENTRE_NAMES else Cause.FOCAL_LENGTH
     if main == RADIAL:
-        cause = Cause.ALREADY_RECTIFIED if fault.removes_distortion(camera) else Cause.NOT_RECTIFIED
+        cause = Cause.ALREADY_RECTIFIED if fault.removes_distortion else Cause.NOT_RECTIFIED
     names = {"focal": "focal", "aspect": "aspect", "u": "u_px", "v": "v_px"}
     values = {names[name]: value for name, value in refusal.figures.items() if name in names}
     values["barrel"] = -refusal.figures.get("radial", 0.0)

@@ -32,6 +32,7 @@ from calib_ros.intrinsics import (
     RefinedCamera,
     changed,
 )
+from calib_ros.lens import PERSPECTIVE
 from calib_ros.registration.acceptance.refusal import Refusal, left_open, wrong_intrinsics
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.covariance import LEAST_CURVATURE, NO_NOISE, REGIONS, STEP, effective_frames
@@ -58,13 +59,14 @@ OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes th
 class LensUnknown:
     """A change of a camera. name: of `calib_ros.intrinsics`. unit: by which values are multiplied for files. usual: standard
     deviation in advance. field: (h, w, 2) shift of the ray at every node of the working image, per unit of the value. bend: (k,
-    3) how far some of the rays turn, rad, but for a common turn."""
+    3) how far some of the rays turn, rad, but for a common turn. stated: value of the camera itself, of a distortion."""
 
     name: str
     unit: float
     usual: float
     field: NDArray[np.float32]
     bend: Matrix
+    stated: float = 0.0
 
 
 def lens_unknowns(config: CameraConfig, source: Camera, working: Camera) -> tuple[LensUnknown, ...]:
@@ -75,16 +77,20 @@ def lens_unknowns(config: CameraConfig, source: Camera, working: Camera) -> tupl
     u, v = np.meshgrid(np.linspace(0, working.width - 1, NODES[0]), np.linspace(0, working.height - 1, NODES[1]))
     K = working.K
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
-    shift, width = _shifts(source, rays), float(source.width)
+    shift, width, stated = _shifts(source, rays), float(source.width), 0.0
     out = [(FOCAL, 1.0, config.focal_sigma, shift(FOCAL, DIFFERENCE)), (ASPECT, 1.0, ASPECT_USUAL, shift(ASPECT, DIFFERENCE))]
     out += [(name, width, config.centre_sigma, shift(name, 1.0) * width) for name in CENTRE]
     if source.model in COEFFICIENTS:  # of the other models the first coefficient is no share of the radius
         radial = shift(RADIAL, DIFFERENCE)
         radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
-        corner = int(radius.argmax())
-        share = float(np.linalg.norm(radial[corner])) / radius[corner]  # by which a k1 of 1 moves the corner
+        farthest = radius.max() if source.model in PERSPECTIVE else np.arctan(radius.max())
+        share = float(farthest) ** 2  # by which a k1 of 1 moves the corner, but for what is stated
         out.append((RADIAL, 1 / share, RADIAL_USUAL, radial / share))
-    return tuple(LensUnknown(name, unit, usual, _grid(moved), _bend(rays, moved)) for name, unit, usual, moved in out)
+        stated = share * float(source.D[0]) if len(source.D) else 0.0
+    return tuple(
+        LensUnknown(name, unit, usual, _grid(moved), _bend(rays, moved), stated if name == RADIAL else 0.0)
+        for name, unit, usual, moved in out
+    )
 
 
 def _shifts(camera: Camera, rays: Matrix) -> Callable[[str, float], Matrix]:
@@ -328,15 +334,13 @@ class LensFault:
         if self.probability < 1:
             value, sigma = own.unit * self.estimate.change[k], own.unit * self.estimate.sigma[k]
             return left_open(own.name, value, sigma, self.probability, deg, m)
-        return wrong_intrinsics(
-            own.name, self.values, camera.width, len(camera.D) > 0, self.removes_distortion(camera), self.deviations
-        )
+        return wrong_intrinsics(own.name, self.values, camera.width, bool(own.stated), self.removes_distortion, self.deviations)
 
-    def removes_distortion(self, camera: Camera) -> bool:
+    @property
+    def removes_distortion(self) -> bool:
         """Whether the scenes show hardly any of the distortion that is stated."""
-        own, value = self.estimate.unknowns[self.k], self.change[self.k]
-        stated = camera.D[0] / own.unit if own.name == RADIAL and len(camera.D) else 0.0
-        return bool(abs(stated + value) < 0.5 * abs(stated))
+        stated = self.estimate.unknowns[self.k].stated
+        return bool(abs(stated + self.change[self.k]) < 0.5 * abs(stated))
 
 
 def estimate_lens(
@@ -360,8 +364,10 @@ def estimate_lens(
     see, as_it_is = _seeing(part, unknowns), np.zeros(n)
     T_given, _, lower, _ = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))
     starts = [(T, as_it_is, LEVELS), (T_given, as_it_is, NEAR_LEVELS)]
-    bent = np.array([GROSS if own.name == RADIAL else 0.0 for own in unknowns])
-    starts += [(T, sign * bent, LEVELS) for sign in (1, -1) if bent.any()]  # few frames have several tops
+    # Few frames have several tops; and pictures that are rectified already are far from what is stated.
+    radial, stated = np.array([own.name == RADIAL for own in unknowns], float), unknowns[-1].stated
+    begun = (GROSS, -GROSS, -stated) if abs(stated) > GROSS else (GROSS, -GROSS)
+    starts += [(T, value * radial, LEVELS) for value in begun if radial.any()]
     if turned is not None:
         across = Rotation.from_matrix(T[:3, :3] @ turned[:3, :3].T).as_rotvec()[:2] * score.camera.K[0, 0] / score.camera.width
         looks = {CENTRE[0]: across[1], CENTRE[1]: -across[0]}
