@@ -32,26 +32,26 @@ def start_of(case: Case, trial: int) -> NDArray[np.float64]:
     return se3.perturb(case.truth, START_DEG * turn, START_M * shift)
 
 
-def with_intrinsics(frame: Frame, focal: float = 0.0, centre_px: Sequence[float] = (0.0, 0.0)) -> Frame:
-    """The same picture with a CameraInfo that is wrong. focal: share of the focal length."""
-    K = frame.camera.K.copy()
+def claimed(frame: Frame, focal: float = 0.0, centre: Sequence[float] = (0.0, 0.0), corner: float = 0.0) -> Frame:
+    """The same picture with a CameraInfo that is wrong, by shares of focal length, image width and the corner's radius."""
+    K, D = frame.camera.K.copy(), frame.camera.D
+    if corner:
+        ray = np.linalg.solve(K, [0.0, 0.0, 1.0])[:2]
+        D = np.array([corner / (ray @ ray), 0.0, 0.0, 0.0, 0.0])
     K[[0, 1], [0, 1]] *= 1 + focal
-    K[:2, 2] += centre_px
-    return replace(frame, camera=replace(frame.camera, K=K))
-
-
-def off_centre(frame: Frame, across: float, down: float) -> Frame:
-    """The principal point given wrongly, in shares of the image width."""
-    return with_intrinsics(frame, centre_px=(across * frame.camera.width, down * frame.camera.width))
+    K[:2, 2] += frame.camera.width * np.array(centre)
+    return replace(frame, camera=replace(frame.camera, K=K, D=D))
 
 
 VARIANTS = {
     "as given": Variant(CLASSES_OFF),
-    "focal +3 %": Variant(CLASSES_OFF, partial(with_intrinsics, focal=0.03)),
-    "focal -3 %": Variant(CLASSES_OFF, partial(with_intrinsics, focal=-0.03)),
-    "focal +5 %": Variant(CLASSES_OFF, partial(with_intrinsics, focal=0.05)),
-    "centre 2 % across": Variant(CLASSES_OFF, partial(off_centre, across=0.02, down=0.0)),
-    "centre 2 % down": Variant(CLASSES_OFF, partial(off_centre, across=0.0, down=0.02)),
+    "focal +1 %": Variant(CLASSES_OFF, partial(claimed, focal=0.01)),
+    "focal +3 %": Variant(CLASSES_OFF, partial(claimed, focal=0.03)),
+    "focal -3 %": Variant(CLASSES_OFF, partial(claimed, focal=-0.03)),
+    "focal +5 %": Variant(CLASSES_OFF, partial(claimed, focal=0.05)),
+    "distortion of 5 %": Variant(CLASSES_OFF, partial(claimed, corner=0.05)),
+    "centre 2 % across": Variant(CLASSES_OFF, partial(claimed, centre=(0.02, 0.0))),
+    "centre 2 % down": Variant(CLASSES_OFF, partial(claimed, centre=(0.0, 0.02))),
 }
 
 
@@ -70,8 +70,8 @@ def sets(args: argparse.Namespace) -> Iterator[Case]:
 
 def searched(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
     """By a calibrator of the intrinsics that are claimed."""
-    claimed = Calibrator(case.frames[0].camera, calibrator.config)
-    result = claimed.estimate([claimed.extract(frame) for frame in case.frames], start_of(case, trial), BOX)
+    own = Calibrator(case.frames[0].camera, calibrator.config)
+    result = own.estimate([own.extract(frame) for frame in case.frames], start_of(case, trial), BOX)
     T = result.T_camera_lidar if result.optimum is None else result.optimum
     return End.at(T, case.truth, result.status, result=result)
 

@@ -69,12 +69,11 @@ from calib_ros_check.causes import (
 from calib_ros_check.evidence import PARAMETER_PENALTY, Candidate, freedom, is_off, shows_noise
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.sensors import LensChange, centre_instead, centre_of, judged
-from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, undecided, unknown
+from calib_ros_check.tolerance import ACCUSATION, MORE_FRAMES, judge, reason_of, undecided, unknown
 
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
-ACCUSATION = 0.01  # largest probability that what is accused is right
 CENTRES = 3  # principal points that are tried, one after the other
 NOT_THE_CLOCKS = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"

@@ -26,6 +26,7 @@ SCALES = 2.0 ** np.arange(-4, 9)
 SAMPLES = 20000
 QUANTILES = (np.arange(8) + 0.5) / 8  # of the variances that make up Student's distribution
 CONFIDENCE = 0.9  # probability from which a verdict is one
+ACCUSATION = 0.01  # largest probability that what is accused is right
 INTERVAL = 0.95
 MORE_FRAMES = "use more frames of other scenes, with objects in view of both sensors"
 # By axis: what a positive and what a negative error means. A positive rotation about y, which points down, moves all points to
@@ -108,7 +109,7 @@ def verdict_of(p_within: float, shown: bool = True) -> CheckVerdict:
     """The verdict by the probability that an error is within the tolerance. shown: its standard deviation is less than that."""
     if p_within >= CONFIDENCE:
         return CheckVerdict.PASS if shown else CheckVerdict.INCONCLUSIVE
-    return CheckVerdict.FAIL if p_within <= 1 - CONFIDENCE else CheckVerdict.INCONCLUSIVE
+    return CheckVerdict.FAIL if p_within <= ACCUSATION else CheckVerdict.INCONCLUSIVE
 
 
 def deviation(T_checked: Transform, T_estimated: Transform, covariance: Covariance) -> tuple[Matrix, Matrix]:
