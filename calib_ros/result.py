@@ -46,6 +46,7 @@ class RefusalCode(Enum):
     OBJECTIVES_DISAGREE = "objectives_disagree"
     WRONG_INTRINSICS = "wrong_intrinsics"
     WRONG_TIMES = "wrong_times"
+    MIRRORED_IMAGE = "mirrored_image"
 
 
 class InitialSource(Enum):

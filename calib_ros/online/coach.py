@@ -45,6 +45,7 @@ CURES = {
     RefusalCode.LOW_SCORE: "check the camera's exposure and focus, the topics and the time stamps",
     RefusalCode.TOO_FAR_FROM_START: "widen the search, or give a better initial extrinsic",
     RefusalCode.WRONG_INTRINSICS: "calibrate the camera's intrinsics anew, or have them refined",
+    RefusalCode.MIRRORED_IMAGE: "turn the mirroring of the images off in the driver",
     RefusalCode.WRONG_TIMES: "mend the time stamps of the drivers",
 }
 IF_RAW = "set image_is_rectified: false if straight lines are bent in the images"

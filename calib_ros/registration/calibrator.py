@@ -131,13 +131,11 @@ class Calibrator:
         def whole(camera: Camera) -> Result:
             start = nominal() if first.initial is None else first.initial
             seen = [replace(frame, camera=camera) for frame in frames]
-            return self._with_camera(camera)._calibrated(seen, start, box, progress, ())
+            own = Calibrator(camera, self.config, self.segmentation, self.extract.source_camera, self.extract.scans)
+            return own._calibrated(seen, start, box, progress, ())
 
         result = refined_with_camera(first, self.extract.source_camera, whole)
         return replace(result, origin=first.origin, elapsed_s=first.elapsed_s + time.perf_counter() - started)
-
-    def _with_camera(self, camera: Camera) -> Calibrator:
-        return Calibrator(camera, self.config, self.segmentation, self.extract.source_camera, self.extract.scans)
 
     def _calibrated(
         self,

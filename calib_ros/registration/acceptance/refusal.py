@@ -69,6 +69,12 @@ def low_score(score: float) -> Refusal:
     return _refusal(RefusalCode.LOW_SCORE, text, score=score)
 
 
+def mirrored_image(z_score: float, decoy_z: float) -> Refusal:
+    """The scenes match their mirror images beyond chance, and not the images as they come."""
+    text = f"the images are mirrored left to right: they match so (z-score {decoy_z:.1f}), and not as they come ({z_score:.1f})"
+    return _refusal(RefusalCode.MIRRORED_IMAGE, f"{text}; turn it off in the driver", z_score=z_score, decoy_z=decoy_z)
+
+
 def not_significant(z_score: float, decoy_z: float, p_value: float, largest: float, inconsistent: bool) -> Refusal:
     """The optimum is no better than chance alignments are. inconsistent: the classes of points and pixels disagree there too."""
     classes = " and few labelled points meet pixels of their class there" if inconsistent else ""

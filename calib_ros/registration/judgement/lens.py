@@ -249,15 +249,14 @@ class LensEstimate:
         bends = np.stack([own.bend for own in self.unknowns], axis=-1) / np.deg2rad(deg)
         best, off = self.explanations[0], [self._off(own, moves) if own.wrong.any() else 0.0 for own in self.explanations]
         farthest = bends[int(np.linalg.norm(bends @ best.mean, axis=1).argmax())]
-        ratios = [
-            _ratio(_beyond(part @ best.mean, part @ best.covariance @ part.T), self.freedom)
-            for part in (farthest, moves[:1], moves[1:])
-        ]
-        part = (farthest, moves[:1], moves[1:])[int(np.argmax(ratios))]
+        parts = farthest, moves[:1], moves[1:]
+        beyond = [_beyond(part @ best.mean, part @ best.covariance @ part.T) for part in parts]
+        ratio = 0.5 * (self.freedom + 1) * float(np.log1p(max(beyond) / self.freedom))  # Student's distribution
+        part = parts[int(np.argmax(beyond))]
         fault = LensFault(self, _main(part, best), best.mean, 1.0)
         # What is not shown, and only expected to be as it may be usually, accuses nothing.
         shown = abs(self.change[fault.k]) > ACCUSING * self.sigma[fault.k]
-        if shown and max(ratios) > np.log(1 / doubt - 1):
+        if shown and ratio > np.log(1 / doubt - 1):
             return fault
         if sum(off) <= OPEN_PROBABILITY:
             return None
@@ -303,11 +302,6 @@ def _beyond(mean: Matrix, covariance: Matrix) -> float:
     return float((mean - near) @ information @ (mean - near))
 
 
-def _ratio(distance: float, freedom: float) -> float:
-    """Log-likelihood ratio of a squared distance by Student's distribution."""
-    return 0.5 * (freedom + 1) * float(np.log1p(distance / freedom))
-
-
 @dataclass(frozen=True, eq=False)
 class LensFault:
     """What is wrong of a lens. k: the unknown that matters most. change: (n,). probability: less than 1 where it is left open."""
@@ -316,11 +310,6 @@ class LensFault:
     k: int
     change: Matrix
     probability: float
-
-    @property
-    def values(self) -> dict[str, float]:
-        """By name: shares of the focal length, the aspect, the image width and the corner's radius."""
-        return dict(zip([own.name for own in self.estimate.unknowns], map(float, self.change), strict=True))
 
     @property
     def deviations(self) -> float:
@@ -334,7 +323,8 @@ class LensFault:
         if self.probability < 1:
             value, sigma = own.unit * self.estimate.change[k], own.unit * self.estimate.sigma[k]
             return left_open(own.name, value, sigma, self.probability, deg, m)
-        return wrong_intrinsics(own.name, self.values, camera.width, bool(own.stated), self.removes_distortion, self.deviations)
+        values = dict(zip([own.name for own in self.estimate.unknowns], map(float, self.change), strict=True))
+        return wrong_intrinsics(own.name, values, camera.width, bool(own.stated), self.removes_distortion, self.deviations)
 
     @property
     def removes_distortion(self) -> bool:

@@ -48,10 +48,6 @@ def test_periods_count_the_datas_own_stamps(config: OnlineConfig, waits: bool) -
     assert moments(schedule, 32.0, 38.0, waits=waits) == [False, True]
 
 
-def later(frame: Frame, by: float) -> Frame:
-    return dataclasses.replace(frame, stamp=frame.stamp + seconds(by), cloud_stamp=None)
-
-
 def test_the_pipeline_in_manual_mode_waits_for_the_service(street: list[Frame], drive: SyntheticDrive) -> None:
     with Driven(drive, config(mode="manual")) as driven:
         driven.feed(*street[:5])
@@ -80,7 +76,8 @@ def test_cpu_time_is_booked_under_the_work_it_went_into(street: list[Frame], dri
     with Driven(drive, config(mode="manual")) as driven:
         driven.feed(street[0])
         once = driven.pipeline.load.counts().seconds
-        driven.feed(later(street[0], 0.01))  # too soon for a keyframe
+        soon = dataclasses.replace(street[0], stamp=street[0].stamp + seconds(0.01), cloud_stamp=None)
+        driven.feed(soon)  # too soon for a keyframe
         twice = driven.pipeline.load.counts().seconds
         assert once[Work.KEYFRAMES] > once[Work.INTAKE] > 0
         assert twice[Work.INTAKE] > once[Work.INTAKE]

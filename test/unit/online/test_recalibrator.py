@@ -71,10 +71,6 @@ def blocks(frame: Frame, seed: int) -> Frame:
     return replace(frame, image=image[: frame.image.shape[0], : frame.image.shape[1]].copy())
 
 
-def empty(frame: Frame) -> Frame:
-    return replace(frame, cloud=PointCloud(np.zeros((0, 3), np.float32)))
-
-
 def later(frame: Frame, seconds: float) -> Frame:
     return replace(frame, stamp=frame.stamp + round(seconds * NANOSECONDS), cloud_stamp=None)
 
@@ -178,7 +174,7 @@ def test_blind_sensors_are_reported_and_make_no_keyframes(drive, start, truth):
     seen_again(drive[0])
     for status in (CONVERGED, BLINDED):  # a scanner that shows nothing, likewise; and it is an error as well
         with pytest.raises(TooFewFeaturesError):
-            recalibrator.ingest(empty(drive[1]))
+            recalibrator.ingest(replace(drive[1], cloud=PointCloud(np.zeros((0, 3), np.float32))))
         assert recalibrator.current.result.status == status
     seen_again(drive[1])
 

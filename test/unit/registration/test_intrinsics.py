@@ -137,6 +137,11 @@ def test_they_are_checked_where_it_is_wanted(scene):
     assert calibrated(scene, camera, None).refusal is RefusalCode.WRONG_INTRINSICS  # without a search, too
 
 
+def test_mirrored_images_are_named(scene):
+    mirrored = [replace(f, image=np.ascontiguousarray(f.image[:, ::-1])) for f in scene.frames]
+    assert Calibrator(scene.camera, QUICK).calibrate(mirrored, scene.truth, BOX).refusal is RefusalCode.MIRRORED_IMAGE
+
+
 # --- refined --------------------------------------------------------------------------------------------------------------
 
 

@@ -37,10 +37,6 @@ def start(seed: int, deg: float = 1.5, m: float = 0.25) -> np.ndarray:
     return se3.perturb(OPTIMUM, rng.uniform(-deg, deg, 3), rng.uniform(-m, m, 3))
 
 
-def near(T: np.ndarray, deg: float, m: float) -> bool:
-    return se3.rotation_error_deg(OPTIMUM, T) < deg and se3.translation_error_m(OPTIMUM, T) < m
-
-
 @pytest.mark.parametrize(
     ("optimise", "far", "most_calls", "deg", "m", "less"),
     [
@@ -54,7 +50,8 @@ def test_the_optimum_is_found_within_the_evaluations(optimise, far, most_calls, 
         score = Bowl()
         T, value = optimise(score, start(seed, *far))
         assert score.calls <= most_calls
-        assert near(T, deg, m)
+        assert se3.rotation_error_deg(OPTIMUM, T) < deg
+        assert se3.translation_error_m(OPTIMUM, T) < m
         assert value == pytest.approx(score.value(T), abs=1e-9)
         assert value > max(0.7 - less, score.value(start(seed, *far)))
 

@@ -8,7 +8,7 @@ import pytest
 
 from calib_ros.errors import defect
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL
-from calib_ros.registration.acceptance.refusal import left_open, low_score, wrong_intrinsics, wrong_times
+from calib_ros.registration.acceptance.refusal import left_open, low_score, mirrored_image, wrong_intrinsics, wrong_times
 
 LENS = {FOCAL: 0.0, ASPECT: 0.0, CENTRE[0]: 0.0, CENTRE[1]: 0.0, RADIAL: 0.0}
 LENSES = [
@@ -28,6 +28,10 @@ LENSES = [
     ("said", "text"),
     [
         (wrong_times(-0.6, 0.0), "the clocks set 600 ms apart, which the scenes do not confirm: images"),
+        (
+            mirrored_image(3.0, 8.4),
+            "the images are mirrored left to right: they match so (z-score 8.4), and not as they come (3.0)",
+        ),
         (low_score(math.nan), "the image shows nothing where the LiDAR sees edges; check"),
         (left_open("time_offset_s", 0.0, math.inf, 0.13, 0.25, 0.05), "the scenes do not show time_offset_s, and leave open"),
         *((wrong_intrinsics(main, LENS | {main: value}, 1000, *given, 3.6), text) for main, value, given, text in LENSES),

@@ -161,10 +161,6 @@ def on_threads(scene: Scene, threads: int, **options: Any) -> tuple[object, ...]
     return result.T.tobytes(), result.agreed, result.optimised, result.rounds, result.decoy_z, nearby
 
 
-def pool_threads() -> list[str]:
-    return [t.name for t in threading.enumerate() if t.name.startswith("calib_search")]
-
-
 def test_any_number_of_threads_finds_the_same_to_the_last_bit(scene):
     reports: dict[int, list[float]] = {}
     results = {}
@@ -191,7 +187,7 @@ def test_a_callback_that_raises_ends_the_search(scene, threads, after):
     with pytest.raises(Ended):
         on_threads(scene, threads, progress=Progress(callback))
     assert all(share < after for share in shares[:-1])
-    assert not pool_threads()
+    assert not [t.name for t in threading.enumerate() if t.name.startswith("calib_search")]
     calls = len(shares)
     assert on_threads(scene, threads) == on_threads(scene, 1)  # nothing of it is left
     assert len(shares) == calls
