@@ -69,7 +69,7 @@ def counted() -> Iterator[list[int]]:
         return call
 
     slopes = dict.fromkeys(("jacobian", "linearise", "gradients"), LINEARISATION)
-    costs = {**dict.fromkeys(("sample", "values", "frame_values"), 1), **slopes}
+    costs = {**dict.fromkeys(("samples", "values", "frame_values"), 1), **slopes}
     for name, cost in costs.items():
         setattr(FastScore, name, counting(name, cost))
     try:

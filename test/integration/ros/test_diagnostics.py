@@ -158,6 +158,7 @@ def test_refined_intrinsics_are_told_in_numbers():
     }
     assert refined_values(RefinedCamera(camera, np.eye(4), changes, np.eye(9))) == {
         "refined focal length, px": "714.0 +- 0.7",
+        "refined fy, px": "unknown",
         "refined principal point x, px": "630.2 +- 1.5",
         "refined principal point y, px": "unknown",
         "refined k1": "-0.3100 +- 0.0040, as stated",
