@@ -16,17 +16,18 @@ from numpy.typing import ArrayLike
 from calib_ros import se3
 from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
-from calib_ros.config import Config, update
+from calib_ros.config import CameraConfig, Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
+from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
-from calib_ros.registration.judgement.lens import LensUnknown, estimate_lens, lens_unknowns
-from calib_ros.registration.nuisance.parameters import noise_of
+from calib_ros.registration.judgement.lens import LensEstimate, LensFault, estimate_lens, lens_unknowns
+from calib_ros.registration.nuisance.parameters import NEAR_LEVELS, TOLERANCE_DEG, noise_of, refined
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z
 from calib_ros.registration.score.point_score import PointScore
@@ -191,10 +192,8 @@ class Checker:
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
         turned = None if se3.rotation_error_deg(inputs.T, found) <= inputs.tolerance.deg else inputs.T
-        unknowns = self._unknowns(score) if judged(score) else ()
-        lens = estimate_lens(score, found, unlimited(found), unknowns, turned=turned)
-        fault = None if lens is None else lens.fault(inputs.tolerance.deg, inputs.tolerance.m, ACCUSATION)
-        fault = fault if fault is not None and fault.probability == 1 else None
+        lens, fault = self._lens(score, found, result, inputs, turned)
+        shared = result.shared_covariance
         causes = lens_findings(lens, fault, NOT_JUDGED, self.camera, inputs.tolerance)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
@@ -202,18 +201,19 @@ class Checker:
         least = 0.0 if lens is None or fault is None else max(lens.gain - PARAMETER_PENALTY, 0.0)
         significant = [own for own in others if own.significant and own.penalised_gain > least]
         if significant:
-            found, score, C = significant[0].T, significant[0].score, None
+            found, score, C, shared = significant[0].T, significant[0].score, None, None
             causes = instead(significant[0].hypothesis.finding, of_cameras(self.camera))
             if clocks.state is CauseState.FOUND:
                 clocks = NOT_THE_CLOCKS
-        elif lens is not None and not inputs.tolerance.covers(inputs.T, found):
-            _, T = seen = lens.seen(score)
+        elif lens is not None and (fault is not None or not inputs.tolerance.covers(inputs.T, found)):
+            seen, T = lens.seen(score)
             if fault is not None or inputs.tolerance.covers(inputs.T, T):  # a usual lens explains it
-                (score, found), C = seen, None
+                score, found = seen, refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0]
+                shared = lens.left_open
+                C = covariance_of(score, found) + shared
             elif clocks.state is not CauseState.FOUND:
                 own = self._possible_centre(score, found, inputs, others)
                 causes = tuple(own if own is not None and own.cause is finding.cause else finding for finding in causes)
-        shared = None if C is None else result.shared_covariance
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *causes)
         why = AS_GIVEN if inputs.tolerance.covers(inputs.T, found) else OFF
@@ -221,8 +221,16 @@ class Checker:
             why = OTHER_FITS
         return Explanation(score, found, C, inputs.T, result, (*causes, *not_mixed_up(why)), shared)
 
-    def _unknowns(self, score: PointScore) -> tuple[LensUnknown, ...]:
-        return lens_unknowns(self.config.camera, self.camera, score.camera)
+    def _lens(
+        self, score: PointScore, T: Matrix, result: Result, inputs: CheckInputs, turned: Matrix | None = None
+    ) -> tuple[LensEstimate | None, LensFault | None]:
+        """What the scenes tell of the lens at the optimum T (4, 4) of an estimate, and what is wrong of it with 99 %."""
+        known = self.config.camera if self.config.camera.focal_sigma else CameraConfig()  # to a check no lens is exact
+        unknowns = lens_unknowns(known, self.camera, score.camera) if judged(score) else ()
+        inflated = 1.0 if result.evidence is None else inflation(result.evidence.disagreement)
+        lens = estimate_lens(score, T, unlimited(T), unknowns, inflated, turned=turned)
+        fault = None if lens is None else lens.fault(inputs.tolerance.deg, inputs.tolerance.m, ACCUSATION)
+        return lens, fault if fault is not None and fault.probability == 1 else None
 
     def _other_cameras(
         self, score: PointScore, found: Matrix, inputs: CheckInputs, offset_s: float
@@ -295,7 +303,6 @@ class Checker:
     ) -> Result | None:
         """The estimate at the clocks as stamped, if another camera explains the frames better than the offset that was found; one
         may look like the other."""
-        tolerance = inputs.tolerance
         without = self._at_stamps.estimate(as_stamped, result.T_camera_lidar, None, inputs.progress)
         T = without.T_camera_lidar if without.converged else without.optimum
         if T is None:
@@ -305,9 +312,8 @@ class Checker:
             return None
         noise = noise_of(before, T, unlimited(T))
         gain = (after.at(-1).value(result.T_camera_lidar) - before.at(-1).value(T)) / noise
-        lens = estimate_lens(before, T, unlimited(T), self._unknowns(before))
-        fault = None if lens is None else lens.fault(tolerance.deg, tolerance.m, ACCUSATION)
-        better = lens is not None and fault is not None and lens.gain > gain
+        lens, fault = self._lens(before, T, without, inputs)
+        better = lens is not None and fault is not None and lens.gain - PARAMETER_PENALTY * (len(lens.unknowns) - 1) > gain
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 
     def _judged(self, found: Explanation, inputs: CheckInputs) -> CheckResult:

@@ -245,7 +245,9 @@ class Calibrator:
                 notes = [MAYBE_RAW, *notes]
             result = found.result(shared, clocks, refusal, self.config.motion, notes)
             if self.config.camera.intrinsics == REFINE and lens is not None:
-                result = replace(result, refined_camera=lens.refined_camera(self.extract.source_camera, found.covariance))
+                result = replace(
+                    result, refined_camera=lens.refined_camera(self.extract.source_camera, found.T, found.covariance)
+                )
             self.objectives.keep_maps(objective)
         except TooFewFeaturesError as error:
             result = insufficient(error, initial, len(features), notes)

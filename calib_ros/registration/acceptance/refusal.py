@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from calib_ros.camera import Camera
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL
 from calib_ros.registration.covariance import Direction
 from calib_ros.result import RefusalCode
@@ -120,13 +121,16 @@ def objectives_disagree(rotation_deg: float, translation_m: float) -> Refusal:
     return _refusal(RefusalCode.OBJECTIVES_DISAGREE, text, rotation_deg=rotation_deg, translation_m=translation_m)
 
 
-def wrong_intrinsics(
-    main: str, values: Mapping[str, float], width: int, distorts: bool, removed: bool, deviations: float
-) -> Refusal:
+def wrong_intrinsics(main: str, values: Mapping[str, float], camera: Camera, removed: bool, deviations: float) -> Refusal:
     """Another lens matches better. main: which of the values, by their names, matters most: shares of the focal length, the
-    aspect, the image width and the corner's radius. distorts, removed: a distortion is stated, and hardly any is seen.
+    aspect, the image width and the corner's radius. camera: as it is stated; removed: hardly any of its distortion is seen.
     deviations: how far `main` is off, in standard deviations of the scenes and of what is known in advance together."""
-    value, px, cure = values[main], width * values[main], "check K and D in camera_info, the image size they are for, and "
+    value, width, px, cure = (
+        values[main],
+        camera.width,
+        camera.width * values[main],
+        "check K and D in camera_info, the image size they are for, and ",
+    )
     cure += "image_is_rectified (--rectified)"
     if main == FOCAL:
         what = f"with a focal length about {abs(value):.1%} {'longer' if value > 0 else 'shorter'}"
@@ -140,7 +144,8 @@ def wrong_intrinsics(
         what = "without the lens distortion of camera_info, as if the images were rectified already"
         cure = "set image_is_rectified (--rectified), or check D"
     else:
-        missing = "other than camera_info states" if distorts else "that camera_info does not state"
+        missing = "that camera_info does not state" if camera.is_pinhole else "other than camera_info states"
+        cure = AS_RAW if camera.said_rectified else cure
         what = f"with a lens distortion {missing}, which moves the corners of the image by {value:+.1%} of their radius"
     text = f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); {cure}"
     units = {FOCAL: ("focal", 1), ASPECT: ("aspect", 1), CENTRE[0]: ("u", width), CENTRE[1]: ("v", width), RADIAL: ("radial", 1)}

@@ -80,7 +80,9 @@ def lens_unknowns(config: CameraConfig, source: Camera, working: Camera) -> tupl
     shift, width, stated = _shifts(source, rays), float(source.width), 0.0
     out = [(FOCAL, 1.0, config.focal_sigma, shift(FOCAL, DIFFERENCE)), (ASPECT, 1.0, ASPECT_USUAL, shift(ASPECT, DIFFERENCE))]
     out += [(name, width, config.centre_sigma, shift(name, 1.0) * width) for name in CENTRE]
-    if source.model in COEFFICIENTS:  # of the other models the first coefficient is no share of the radius
+    # Of the other models, and of a ratio of two polynomials, the first coefficient is no share of the radius.
+    bends = source.model in PERSPECTIVE or not source.is_pinhole
+    if source.model in COEFFICIENTS and bends and not np.any(source.D[5:]):
         radial = shift(RADIAL, DIFFERENCE)
         radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
         farthest = radius.max() if source.model in PERSPECTIVE else np.arctan(radius.max())
@@ -218,12 +220,16 @@ class LensEstimate:
         moves = np.clip(moves, -farthest, farthest)
         return np.asarray(moves @ moment @ moves.T)
 
-    def refined_camera(self, camera: Camera, extrinsic: Covariance) -> RefinedCamera:
-        """The camera with the change that is expected by now. extrinsic: covariance (6, 6) of the optimum by a known camera."""
+    @property
+    def left_open(self) -> Covariance:
+        """(6, 6), what the scenes leave open of the extrinsic by what they leave open of the lens."""
+        return np.asarray(self.moves @ self.posterior[1] @ self.moves.T)
+
+    def refined_camera(self, camera: Camera, T: Transform, extrinsic: Covariance) -> RefinedCamera:
+        """The camera with the change that is expected. T, extrinsic: the optimum (4, 4) by `camera`, its covariance (6, 6)."""
         mean, spread = self.posterior
         units = np.array([own.unit for own in self.unknowns])
-        T = se3.exp(self.moves @ (mean - self.change)) @ self.T
-        changes = {}
+        T, changes = se3.exp(self.moves @ mean) @ T, {}
         for own, value, sigma in zip(self.unknowns, mean * units, np.sqrt(np.diag(spread)) * units, strict=True):
             camera = changed(camera, own.name, float(value))
             changes[own.name] = IntrinsicEstimate(float(value), float(sigma), bool(sigma < OBSERVABLE * own.unit * own.usual))
@@ -324,7 +330,7 @@ class LensFault:
             value, sigma = own.unit * self.estimate.change[k], own.unit * self.estimate.sigma[k]
             return left_open(own.name, value, sigma, self.probability, deg, m)
         values = dict(zip([own.name for own in self.estimate.unknowns], map(float, self.change), strict=True))
-        return wrong_intrinsics(own.name, values, camera.width, bool(own.stated), self.removes_distortion, self.deviations)
+        return wrong_intrinsics(own.name, values, camera, self.removes_distortion, self.deviations)
 
     @property
     def removes_distortion(self) -> bool:
@@ -352,7 +358,7 @@ def estimate_lens(
         return None
     n, part, free = len(unknowns), score.subset(POINTS, np.random.default_rng(0)), unlimited(T)
     see, as_it_is = _seeing(part, unknowns), np.zeros(n)
-    T_given, _, lower, _ = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))
+    T_given, _, lower = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))
     starts = [(T, as_it_is, LEVELS), (T_given, as_it_is, NEAR_LEVELS)]
     # Few frames have several tops; and pictures that are rectified already are far from what is stated.
     radial, stated = np.array([own.name == RADIAL for own in unknowns], float), unknowns[-1].stated
@@ -363,7 +369,7 @@ def estimate_lens(
         looks = {CENTRE[0]: across[1], CENTRE[1]: -across[0]}
         change = np.array([looks.get(own.name, 0.0) for own in unknowns])
         starts.append((se3.from_parts(turned[:3, :3], T[:3, 3]), change, LEVELS))
-    ends = [ascend_jointly(see, *start, free)[:3] for start in starts]
+    ends = [ascend_jointly(see, *start, free) for start in starts]
     T, change, higher = max(ends, key=lambda end: end[2])
     there, own = see(T, change)[0], unlimited(np.eye(4))
     # Halves may disagree because of the wrong lens.

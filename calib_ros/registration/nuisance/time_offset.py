@@ -197,7 +197,7 @@ def _ascend(
     def see(T: Transform, offset: Matrix) -> JointView:
         return view_at(score.moved(twists, offset[0]), T, twists)
 
-    T, offset, value, _ = ascend_jointly(see, T, np.array([seconds]), NEAR_LEVELS, limits, prior)
+    T, offset, value = ascend_jointly(see, T, np.array([seconds]), NEAR_LEVELS, limits, prior)
     return T, float(offset[0]), value
 
 

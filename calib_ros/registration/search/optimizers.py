@@ -108,32 +108,26 @@ def ascend_jointly(
     limits: Limits,
     prior: Prior | None = None,
     free: NDArray[np.bool_] | None = None,
-    known: Callable[[Matrix], tuple[float, Matrix, Matrix]] | None = None,
-) -> tuple[Matrix, Matrix, float, float]:
+) -> tuple[Matrix, Matrix, float]:
     """The optimum of the extrinsic and n more unknowns near T (4, 4) and x (n,), level by level: damped Gauss-Newton steps as in
     `levenberg_marquardt`, whose curvature is learnt on the way.
 
-    free: (n,) which of x may change; None = all. known: cost of x in advance, to subtract from the score, its slope and its
-    information (n,). Returns T, x, the score, and the score less both costs.
+    free: (n,) which of x may change; None = all. Returns T, x and the score, the cost of the prior not subtracted.
     """
     n, of_x = len(x), np.ones(len(x), bool) if free is None else free
 
-    def penalised(value: float, T: Transform, x: Matrix) -> float:
-        return value - ((known(x)[0] if known else 0.0) + (prior.value(T) if prior else 0.0))
+    def penalised(value: float, T: Transform) -> float:
+        return value - (prior.value(T) if prior else 0.0)
 
     for level in levels:
         here = see(T, x)
         best = here[0].at(level).value(here[1])
-        objective = penalised(best, T, x)
+        objective = penalised(best, T)
         damping, H, last, step = 1e-2, np.zeros((6 + n, 6 + n)), np.zeros(6 + n), np.zeros(6 + n)
         for k in range(JOINT_ITERATIONS):
             ascent, scale = linearised(here, n, level)
             H = learned_curvature(H, step, last - ascent) if k else scale
             gradient, B = ascent.copy(), H.copy()
-            if known:
-                _, slope, information = known(x)
-                gradient[6:] -= slope
-                B[6:, 6:] += np.diag(information)
             if prior:
                 gradient[:6] -= prior.cost(T)[1]
                 B[:6, :6] += np.diag(prior.information)
@@ -145,7 +139,7 @@ def ascend_jointly(
                 candidate, later = limits.clip(se3.exp(step[:6]) @ T), x + step[6:]
                 moved = see(candidate, later)
                 value = moved[0].at(level).value(moved[1])
-                higher = penalised(value, candidate, later)
+                higher = penalised(value, candidate)
                 if higher > objective + GAIN:
                     break
                 damping = max(damping * 6, 1e-3)
@@ -155,7 +149,7 @@ def ascend_jointly(
             damping /= 4
             if np.abs(step[6:]).max() < 1e-5 and np.abs(step[:3]).max() < 2e-6 and np.abs(step[3:6]).max() < 2e-5:
                 break
-    return T, x, best, objective
+    return T, x, best
 
 
 def nelder_mead(
