@@ -349,13 +349,8 @@ class Diagnostics:
 
 def refined_values(refined: RefinedCamera | None) -> dict[str, str]:
     """What the keyframes tell of the intrinsics, with standard deviations; the published extrinsic is that of the stated ones."""
-    titles = {
-        FOCAL: "focal length, px",
-        ASPECT: "fy, px",
-        CENTRE[0]: "principal point x, px",
-        CENTRE[1]: "principal point y, px",
-        RADIAL: "k1",
-    }
+    titles = {FOCAL: "focal length, px", ASPECT: "fy against fx, share", RADIAL: "k1"}
+    titles |= {name: f"principal point {axis}, px" for name, axis in zip(CENTRE, "xy", strict=True)}
     values = {f"refined {title}": "unknown" for title in titles.values()}
     if refined is None:
         return values
@@ -365,12 +360,12 @@ def refined_values(refined: RefinedCamera | None) -> dict[str, str]:
         if name == FOCAL:
             value, scale = K[0, 0], K[0, 0] / (1 + change.value)  # a share of the stated one
         elif name == ASPECT:
-            value, scale = K[1, 1], K[1, 1] / (1 + change.value)
+            value, digits = change.value, 4
         elif name == RADIAL:
             value, digits = np.r_[refined.camera.D, 0.0][0], 4
         else:
             value = K[CENTRE.index(name), 2]
-        seen = "" if change.observable else ", as stated"
+        seen = "" if change.observable else ", hardly shown"
         values[f"refined {titles[name]}"] = f"{value:.{digits}f} +- {scale * change.sigma:.{digits}f}{seen}"
     return values
 

@@ -89,8 +89,9 @@ def lens_unknowns(config: CameraConfig, source: Camera, working: Camera) -> tupl
         share = float(farthest) ** 2  # by which a k1 of 1 moves the corner, but for what is stated
         out.append((RADIAL, 1 / share, RADIAL_USUAL, radial / share))
         stated = share * float(source.D[0]) if len(source.D) else 0.0
+    shape = NODES[1], NODES[0], 2
     return tuple(
-        LensUnknown(name, unit, usual, _grid(moved), _bend(rays, moved), stated if name == RADIAL else 0.0)
+        LensUnknown(name, unit, usual, moved.reshape(shape).astype(np.float32), _bend(rays, moved), stated * (name == RADIAL))
         for name, unit, usual, moved in out
     )
 
@@ -126,11 +127,6 @@ def _bend(rays: Matrix, shift: Matrix) -> Matrix:
     return np.asarray(turned - (common @ np.linalg.lstsq(common, turned.ravel(), rcond=None)[0]).reshape(-1, 3))
 
 
-def _grid(shift: Matrix) -> NDArray[np.float32]:
-    """(n, 2) -> (h, w, 2) of the nodes."""
-    return np.ascontiguousarray(shift.reshape(NODES[1], NODES[0], 2), np.float32)
-
-
 @dataclass(frozen=True, eq=False)
 class LensHypothesis:
     """One way in which a lens may be wrong. wrong: (n,) which unknowns are plainly so, the others as usual. probability: of it.
@@ -147,9 +143,10 @@ class LensEstimate:
     """What the scenes tell of a lens.
 
     change: (n,) where they match best, with T (4, 4), the extrinsic there; information: (n, n) of it, noise counted, the
-    extrinsic free. directions: (6, n) twist of the extrinsic, rad and m, per unit of each. T_given: (4, 4), the optimum by the
-    lens as it is. gain: log-likelihood over that. freedom: degrees of freedom of the noise. centre: (n,) change that is expected:
-    back to the stated camera, where this one corrects it. open_axes: (6,) of the extrinsic, which a lens may move.
+    extrinsic free. directions: (6, n) twist of the extrinsic, rad and m, per unit of each; 0 along fixed axes. T_given: (4, 4),
+    the optimum by the lens as it is. gain: log-likelihood over that. freedom: degrees of freedom of the noise. centre: (n,)
+    change that is expected: back to the stated camera, where this one corrects it. open_axes: (6,) of the extrinsic, which a lens
+    may move.
     """
 
     unknowns: tuple[LensUnknown, ...]
@@ -203,10 +200,11 @@ class LensEstimate:
     def moves(self) -> Matrix:
         """(6, n) twist of the extrinsic per unit of each change, such that the one to the optimum is included: farther away than
         a step, the score bends otherwise (the secant of Broyden 1965)."""
+        if not self.open_axes.all():  # both optima are those of all axes
+            return self.directions
         missing = se3.log(self.T @ se3.inverse(self.T_given)) - self.directions @ self.change
         weighed = self.information @ self.change
-        moves = self.directions + np.outer(missing, weighed) / (float(self.change @ weighed) + 1)
-        return np.where(self.open_axes[:, None], moves, 0.0)
+        return self.directions + np.outer(missing, weighed) / (float(self.change @ weighed) + 1)
 
     def added_covariance(self, constraints: PoseConstraints, covariance: Covariance, kept: Sequence[int] = ()) -> Covariance:
         """Second moment (6, 6) of the extrinsic about the optimum by the lens as it is, whose own covariance is `covariance`, if
@@ -278,7 +276,7 @@ class LensEstimate:
         return score.with_points(back[:3, :3] @ P + back[:3, 3:]), T
 
     def _off(self, explanation: LensHypothesis, moves: Matrix) -> float:
-        """Probability that it holds, and the extrinsic is off. moves: (4, n), see `refusal`, per unit of each change."""
+        """Probability that it holds, and the extrinsic is off. moves: (4, n), see `fault`, per unit of each change."""
         draws = np.linalg.cholesky(explanation.covariance) @ _draws(len(self.unknowns))
         ends = moves @ (explanation.mean[:, None] + draws)
         return explanation.probability * float(((np.abs(ends[0]) > 1) | (np.linalg.norm(ends[1:], axis=0) > 1)).mean())
@@ -325,9 +323,9 @@ class LensFault:
 
     def refusal(self, camera: Camera, deg: float, m: float) -> Refusal:
         """Why an extrinsic is not to be used. camera: as it is stated. deg, m: the tolerance."""
-        own, k = self.estimate.unknowns[self.k], self.k
+        own = self.estimate.unknowns[self.k]
         if self.probability < 1:
-            value, sigma = own.unit * self.estimate.change[k], own.unit * self.estimate.sigma[k]
+            value, sigma = (own.unit * known[self.k] for known in (self.estimate.change, self.estimate.sigma))
             return left_open(own.name, value, sigma, self.probability, deg, m)
         values = dict(zip([own.name for own in self.estimate.unknowns], map(float, self.change), strict=True))
         return wrong_intrinsics(own.name, values, camera, self.removes_distortion, self.deviations)
@@ -374,7 +372,7 @@ def estimate_lens(
     there, own = see(T, change)[0], unlimited(np.eye(4))
     # Halves may disagree because of the wrong lens.
     noise = noise_of(there, np.eye(4), own) * min(inflated, inflation(disagreement(there, np.eye(4), own)))
-    bending = _bending(see, T, change, unknowns, part, noise)
+    bending = _bending(see, T, change, unknowns, part, noise, limits.open_axes)
     freedom = max(REGIONS * effective_frames(score) - 6 - n, 1.0)
     centre, gain = as_it_is if centre is None else centre, max(higher - lower, 0.0) / noise
     return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, centre, gain, limits.open_axes)
@@ -410,6 +408,7 @@ def _bending(
     unknowns: Sequence[LensUnknown],
     score: PointScore,
     noise: float,
+    open_axes: NDArray[np.bool_],
 ) -> tuple[Matrix, Matrix]:
     """Information (n, n) of a change and the twist (6, n) of the extrinsic per unit of it: by central differences of the
     gradient, over steps as far as those of the extrinsic's own covariance move a picture."""
@@ -433,9 +432,11 @@ def _bending(
     root = vectors / np.sqrt(np.maximum(values, NO_NOISE * values.max()))
     values, vectors = np.linalg.eigh(root.T @ (H * units) @ root)
     half = root @ vectors
-    C = units * ((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)
-    lens = C[6:, 6:]
-    directions = C[:6, 6:] @ np.linalg.inv(lens)
+    C = (half / np.maximum(values, LEAST_CURVATURE)) @ half.T
+    lens, own = units[6:, 6:] * C[6:, 6:], np.flatnonzero(open_axes)
+    bent, directions = np.linalg.inv(C), np.zeros((6, n))
+    # The optimum of the open axes, the others held.
+    directions[own] = -np.linalg.solve(bent[np.ix_(own, own)], bent[own, 6:]) * (steps[own, None] / steps[6:])
     # What shifts the border of the image as far as the systematic error of a rotation does.
     px = SYSTEMATIC_ERROR[0] * K[0, 0]
     systematic = np.array([px / score.camera.width * (1.0 if own.name in CENTRE else 2.0) for own in unknowns])

@@ -1,6 +1,6 @@
 """What an estimate takes for granted besides the extrinsic: the lens (judgement/lens.py) and the clocks (time_offset.py).
 
-The extrinsic is refined anew with another value of an unknown, and the match gets worse, or clearly better. What the scenes do
+The extrinsic is refined anew with other clocks, and the match gets worse, or clearly better. What the scenes do
 not tell of it moves the extrinsic along one direction, and belongs to its covariance.
 """
 

@@ -158,10 +158,10 @@ def test_refined_intrinsics_are_told_in_numbers():
     }
     assert refined_values(RefinedCamera(camera, np.eye(4), changes, np.eye(9))) == {
         "refined focal length, px": "714.0 +- 0.7",
-        "refined fy, px": "unknown",
+        "refined fy against fx, share": "unknown",
         "refined principal point x, px": "630.2 +- 1.5",
         "refined principal point y, px": "unknown",
-        "refined k1": "-0.3100 +- 0.0040, as stated",
+        "refined k1": "-0.3100 +- 0.0040, hardly shown",
     }
     assert set(refined_values(None).values()) == {"unknown"}
 
