@@ -241,12 +241,12 @@ class Rectifier:
 
     @cached_property
     def _pixels(self) -> NDArray[np.float32]:
-        """Pixel (H, W, 2) of the lens that each pixel of the target shows; NaN = none."""
+        """Pixel (H, W, 2) of the lens that each pixel of the target shows; NaN = none, and ±MAX_SIDE are beyond any image."""
         columns, rows = np.arange(self.camera.width), np.arange(self.camera.height)
         out = np.empty((len(rows), len(columns), 2), np.float32)
         for part in np.array_split(rows, max(1, out.size >> 19)):  # bounds the memory of what is between
             uv = np.stack(np.meshgrid(columns, part), axis=-1)
-            out[part] = self.source._lens_pixels(self.camera.unproject(uv)).reshape(uv.shape)
+            out[part] = np.clip(self.source._lens_pixels(self.camera.unproject(uv)), -MAX_SIDE, MAX_SIDE).reshape(uv.shape)
         return out
 
     def seen(self) -> NDArray[np.bool_] | None:
