@@ -46,7 +46,44 @@ class RefusalCode(Enum):
     OBJECTIVES_DISAGREE = "objectives_disagree"
     WRONG_INTRINSICS = "wrong_intrinsics"
     WRONG_TIMES = "wrong_times"
-    MIRRORED_IMAGE = "mirrored_image"
+
+
+_INTRINSICS = "calibrate the camera's intrinsics anew, or have them refined"
+
+
+class Cause(Enum):
+    """What is wrong besides the mount, where the frames show it; the simplest first."""
+
+    TIME_OFFSET = "time_offset", "clocks apart", "mend the time stamps of the drivers"
+    FOCAL_LENGTH = "focal_length", "wrong focal length", _INTRINSICS  # or fx against fy
+    PRINCIPAL_POINT = "principal_point", "wrong principal point", _INTRINSICS
+    OTHER_CAMERA = "other_camera", "another camera's CameraInfo", "give K and D of this camera for this image size"
+    NOT_RECTIFIED = (
+        "not_rectified",
+        "distorted image called rectified",
+        "take the rectified topic, or the CameraInfo of the raw one",
+    )
+    ALREADY_RECTIFIED = "already_rectified", "rectified image called distorted", "set image_is_rectified: true"
+    MIRRORED_IMAGE = "mirrored_image", "mirrored image", "switch the mirroring of the images off in the driver"
+    ROTATED_IMAGE = "rotated_image", "turned image", "turn the images back, or mend the driver's rotation"
+    INVERSE_TRANSFORM = "inverse_transform", "transform the wrong way round", "invert the transform"
+    BODY_FRAME = (
+        "body_frame",
+        "camera_link instead of the optical frame",
+        "give the transform of the optical frame",
+    )  # or vice versa
+    QUATERNION_ORDER = "quaternion_order", "quaternion in another order", "give the quaternion as (x, y, z, w)"
+    MILLIMETRES = "millimetres", "millimetres instead of metres", "give the translation in metres"
+    CLOUD_FRAME = "cloud_frame", "points in another frame", "publish the points in the scanner's frame"
+
+    words: str  # for people
+    advice: str  # what to do
+
+    def __new__(cls, value: str, words: str, advice: str) -> Cause:
+        """A member by its value in files and messages."""
+        own = object.__new__(cls)
+        own._value_, own.words, own.advice = value, words, advice
+        return own
 
 
 class InitialSource(Enum):
@@ -112,7 +149,7 @@ class Result:
     reference_error : deg and m, if the source knows a reference.
     motion : for people, how the vehicle's motion was dealt with.
     refusal : why it is refused or insufficient. refusal_figures : numbers that this rests on, by name, as ``seconds`` of
-        ``wrong_times``.
+        ``wrong_times``. cause : what is wrong besides the mount, if the frames show it.
     optimum : (4, 4), the one that was refused. Not to be used as a calibration. optimum_covariance* : (6, 6), of that one.
     evidence : what speaks for the optimum.
     intrinsics : ``focal_length_share``, ``principal_point_x_px`` and ``principal_point_y_px``: which change of the given ones, to
@@ -152,6 +189,7 @@ class Result:
     stamp: str = field(default_factory=_now)
     refusal: RefusalCode | None = None
     refusal_figures: Mapping[str, float] = field(default_factory=dict)
+    cause: Cause | None = None
     optimum: Transform | None = None
     optimum_covariance: Covariance | None = None
     evidence: Evidence | None = None
@@ -188,6 +226,7 @@ class Result:
             "status": self.status,
             "reason": self.reason,
             "refusal": None if self.refusal is None else self.refusal.value,
+            "cause": None if self.cause is None else self.cause.value,
             "refusal_figures": dict(self.refusal_figures),
             "optimum": None if self.optimum is None else self.optimum.tolist(),
             "evidence": None if self.evidence is None else asdict(self.evidence),

@@ -7,51 +7,48 @@ mixed up, or is the extrinsic far off? Then what is left: clocks, intrinsics, an
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_ros import se3
-from calib_ros.arrays import Matrix
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
-from calib_ros.config import CameraConfig, Config, update
+from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
 from calib_ros.datasets.positions import spread_positions
-from calib_ros.errors import BadInputError
+from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.acceptance.split_half import inflation
+from calib_ros.intrinsics import CENTRE
+from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, at_time_offset
+from calib_ros.registration.covariance import covariance
+from calib_ros.registration.features import FrameFeatures, ScanEdges, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
-from calib_ros.registration.judgement.lens import LensEstimate, LensFault, estimate_lens, lens_unknowns
+from calib_ros.registration.judgement.evidence import (
+    Match,
+    convinces,
+    freedom,
+    log_odds,
+    rare_odds,
+    shows_lens,
+    shows_noise,
+)
+from calib_ros.registration.judgement.hypotheses import AsTaken, fisheyes
+from calib_ros.registration.judgement.judge import NEAR, Candidate, Question, is_only_off
+from calib_ros.registration.judgement.lens import LensEstimate, LensFault
 from calib_ros.registration.nuisance.parameters import NEAR_LEVELS, TOLERANCE_DEG, noise_of, refined
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import FRUITLESS_ROUNDS
-from calib_ros.result import CONVERGED, RefusalCode, Result
-from calib_ros_check.alternatives import (
-    NEAR,
-    NOT_JUDGED,
-    Alternatives,
-    CheckInputs,
-    Explanation,
-    covariance_of,
-    look,
-    match_of,
-)
-from calib_ros_check.cameras import (
-    CameraGuess,
-    gain_over,
-    other_centre,
-    other_focal_lengths,
-    rectified_already,
-    unrectified_fisheye,
-)
+from calib_ros.result import CONVERGED, Cause, Evidence, RefusalCode, Result
 from calib_ros_check.causes import (
     AS_GIVEN,
     OFF,
@@ -59,25 +56,52 @@ from calib_ros_check.causes import (
     centre_finding,
     clock_finding,
     complete,
-    distorts,
+    explained,
     findings,
-    instead,
     lens_findings,
     not_mixed_up,
-    of_cameras,
     possible_causes,
 )
-from calib_ros_check.evidence import PARAMETER_PENALTY, Candidate, freedom, is_off, shows_noise
-from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
-from calib_ros_check.sensors import LensChange, centre_instead, centre_of, judged
-from calib_ros_check.tolerance import ACCUSATION, MORE_FRAMES, judge, reason_of, undecided, unknown
+from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
+from calib_ros_check.tolerance import ACCUSATION, MORE_FRAMES, is_off, judge, reason_of, undecided, unknown
 
+Classified = Callable[[Sequence[int]], Sequence[FrameFeatures]]  # of the frames with these numbers
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
-CENTRES = 3  # principal points that are tried, one after the other
+PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
+NOT_JUDGED = "one scene does not tell, nor do unrolled pictures of wide lenses"
 NOT_THE_CLOCKS = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
+
+
+@dataclass(frozen=True, eq=False)
+class CheckInputs:
+    """What is to be checked, and the inputs of the check besides the frames' features.
+
+    T: T_camera_lidar (4, 4). classified: makes the features with classes, asked for in doubt; as_taken: makes those that another
+    camera would have; None = they cannot be had. vehicle_frames: T_camera_F (4, 4) of frames F of the vehicle, by name, in which
+    the clouds may be. progress: may raise, which ends the check.
+    """
+
+    T: Transform
+    tolerance: Tolerance
+    classified: Classified | None = None
+    as_taken: AsTaken | None = None
+    vehicle_frames: Mapping[str, Matrix] = field(default_factory=dict)
+    progress: Callback | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation(Match):
+    """What the scenes show. covariance: (6, 6) of a left twist; shared: the part of it that intrinsics and clocks leave open.
+    T_corrected: the extrinsic that was checked, with what was mixed up put right. result: of the estimate."""
+
+    covariance: Covariance
+    T_corrected: Transform
+    result: Result
+    causes: tuple[CauseFinding, ...] = ()
+    shared: Covariance | None = None
 
 
 class Checker:
@@ -101,7 +125,7 @@ class Checker:
         self.config = update(config, {"refine": refine, "search": search})
         self.camera = camera
         self._calibrator = Calibrator(camera, self.config, segmentation, scans=scans)
-        self._alternatives = Alternatives(self._calibrator, camera)
+        self._judge = self._calibrator.judge
         as_stamped = update(self.config, {"motion": {"time_offset": "fixed"}})
         self._at_stamps = Calibrator(camera, as_stamped, self._calibrator.segmentation)
         # Another look is another chance of being wrong; with another seed, since a search misses an optimum now and then.
@@ -133,13 +157,8 @@ class Checker:
             watch, chosen = Progress(progress, "classes"), [used[k] for k in numbers]
             return with_classes(chosen, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
 
-        def as_taken(camera: Camera, numbers: Sequence[int] | None) -> Sequence[FrameFeatures]:
-            extract = FeatureExtractor(camera, self.config)
-            chosen = used if numbers is None else [used[k] for k in numbers]
-            return [extract.seen_anew(own, frame.image) for frame, own in chosen]
-
         in_doubt = classified if calibrator.segmentation.active else None
-        inputs = CheckInputs(T, tolerance or Tolerance(), in_doubt, as_taken, vehicle_frames or {}, progress)
+        inputs = CheckInputs(T, tolerance or Tolerance(), in_doubt, calibrator.pictures_of(used), vehicle_frames or {}, progress)
         result = self.check_features([own for _, own in used], inputs)
         elapsed_s, cpu_s = time.perf_counter() - started, time.process_time() - cpu
         return replace(result, notes=(*notes, *result.notes), elapsed_s=elapsed_s, cpu_s=cpu_s)
@@ -161,18 +180,23 @@ class Checker:
     def _find(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation | None:
         """What the scenes show; None if nothing matches beyond chance."""
         optima: list[Matrix] = []
-        alternatives = self._alternatives
         both = [look(self._calibrator, features, box, inputs, optima) for box in (None, NEAR)]
         near = max((own for own in both if own is not None), key=match_of, default=None)
         # What is off by more than NEAR is as rare as something mixed up, and is looked for afterwards.
-        given = alternatives.as_given(features, inputs.T, optima)
+        given = self._judge.as_given(features, inputs.T, optima)
         # Where the scenes match beyond doubt, only a picture can be another one: a transform would lead elsewhere.
-        tried = alternatives.hypotheses(features, inputs, near is not None and match_of(near) >= UNDOUBTED_Z)
-        explained = alternatives.mixed_up(features, inputs, tried, given)
-        if explained is None and near is None:
-            explained = alternatives.another_camera(features, inputs, given, len(tried))
-        if explained is not None:
-            return explained
+        undoubted = near is not None and match_of(near) >= UNDOUBTED_Z
+        asked = Question(features, inputs.T, None, inputs.as_taken, inputs.vehicle_frames, undoubted, near is None)
+        tolerance = inputs.tolerance
+        asked = replace(asked, progress=Progress(inputs.progress, "causes"))
+        one = self._judge.explain(asked, given, tolerance.deg, tolerance.m)
+        if one is not None:
+            # What holds on most vehicles has to hold exactly; else its optimum tells how far the extrinsic is off.
+            off = is_only_off(one, tolerance.deg, tolerance.m)
+            told = not_mixed_up(OFF) if off else explained(one.hypothesis, self.camera)
+            known = Result(one.T, CONVERGED, frames_used=len(features), evidence=Evidence(one.z_score, None, np.nan, np.nan))
+            T_corrected = inputs.T if off else one.hypothesis.T
+            return Explanation(one.score, one.T, covariance_of(one.score, one.T), T_corrected, known, told)
         found = near or look(self._further, features, FAR, inputs, optima)
         if found is None and inputs.classified is not None:
             # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
@@ -190,19 +214,17 @@ class Checker:
                 features, result = as_stamped, better
                 clocks = NOT_THE_CLOCKS
         found, C = result.T_camera_lidar, result.covariance
-        score = self._alternatives.score(features, found)
+        score = self._judge.score(features, found)
         turned = None if se3.rotation_error_deg(inputs.T, found) <= inputs.tolerance.deg else inputs.T
         lens, fault = self._lens(score, found, result, inputs, turned)
         shared = result.shared_covariance
         causes = lens_findings(lens, fault, NOT_JUDGED, self.camera, inputs.tolerance)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
-        others = self._other_cameras(score, found, inputs, offset)
-        least = 0.0 if lens is None or fault is None else max(lens.gain - PARAMETER_PENALTY, 0.0)
-        significant = [own for own in others if own.significant and own.penalised_gain > least]
-        if significant:
-            found, score, C, shared = significant[0].T, significant[0].score, None, None
-            causes = instead(significant[0].hypothesis.finding, of_cameras(self.camera))
+        other = None if fault is not None else self._another_fisheye(score, found, inputs, offset)
+        if other is not None:
+            found, score, C, shared = other.T, other.score, None, None
+            causes = explained(other.hypothesis, self.camera)
             if clocks.state is CauseState.FOUND:
                 clocks = NOT_THE_CLOCKS
         elif lens is not None and (fault is not None or not inputs.tolerance.covers(inputs.T, found)):
@@ -212,7 +234,7 @@ class Checker:
                 shared = lens.left_open
                 C = covariance_of(score, found) + shared
             elif clocks.state is not CauseState.FOUND:
-                own = self._possible_centre(score, found, inputs, others)
+                own = self._possible_centre(lens, inputs)
                 causes = tuple(own if own is not None and own.cause is finding.cause else finding for finding in causes)
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *causes)
@@ -225,60 +247,34 @@ class Checker:
         self, score: PointScore, T: Matrix, result: Result, inputs: CheckInputs, turned: Matrix | None = None
     ) -> tuple[LensEstimate | None, LensFault | None]:
         """What the scenes tell of the lens at the optimum T (4, 4) of an estimate, and what is wrong of it with 99 %."""
-        known = self.config.camera if self.config.camera.focal_sigma else CameraConfig()  # to a check no lens is exact
-        unknowns = lens_unknowns(known, self.camera, score.camera) if judged(score) else ()
         inflated = 1.0 if result.evidence is None else inflation(result.evidence.disagreement)
-        lens = estimate_lens(score, T, unlimited(T), unknowns, inflated, turned=turned)
+        lens = self._judge.lens(score, T, inflated, turned)
         fault = None if lens is None else lens.fault(inputs.tolerance.deg, inputs.tolerance.m, ACCUSATION)
         return lens, fault if fault is not None and fault.probability == 1 else None
 
-    def _other_cameras(
-        self, score: PointScore, found: Matrix, inputs: CheckInputs, offset_s: float
-    ) -> list[Candidate[CameraGuess]]:
-        """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""
-        if not shows_noise(score):
-            return []
-        off = se3.rotation_error_deg(inputs.T, found) > inputs.tolerance.deg
-        guesses = [*rectified_already(self.camera)]
-        if score.camera.is_sphere:
-            guesses += other_focal_lengths(self.camera)
-        if not inputs.tolerance.covers(inputs.T, found):
-            guesses += unrectified_fisheye(self.camera)
-        others = list(self._alternatives.cameras(guesses, (found, inputs.T), inputs, offset_s))
-        others += self._other_centres(found, inputs, offset_s) if off else []
-        best_first = sorted(others, key=lambda own: -own.z_score)
-        return [gain_over(score, found, own, len(others)) for own in best_first]
+    def _another_fisheye(self, score: PointScore, found: Matrix, inputs: CheckInputs, offset_s: float) -> Candidate | None:
+        """A fisheye with another focal length, or one that is said to be rectified, if it explains the frames better than the
+        camera as it is given does at the optimum (4, 4) of a score."""
+        off = not inputs.tolerance.covers(inputs.T, found)
+        guesses = [*fisheyes(found, self.camera)] if shows_noise(score) and (off or score.camera.is_sphere) else []
+        asked, others = Question((), inputs.T, as_taken=inputs.as_taken), list[Candidate]()
+        for guess, T in product(guesses, (found, inputs.T)):
+            with suppress(TooFewFeaturesError, BadInputError):
+                own = self._judge.by_camera(guess, asked, T, offset_s=offset_s)
+                others += [] if own is None else [own]
+        best = max(others, key=lambda own: own.z_score, default=None)
+        better = best is not None and convinces(log_odds(best, Match(score, found)), rare_odds(len(guesses)))
+        return best if better else None
 
-    def _other_centres(self, found: Matrix, inputs: CheckInputs, offset_s: float) -> list[Candidate[CameraGuess]]:
-        """Principal points that look like the rotation to the optimum (4, 4), each better than the one before it: at first, the
-        optimum is one of blurred edges."""
-        out: list[Candidate[CameraGuess]] = []
-        centre, T = LensChange(), found
-        for _ in range(CENTRES):
-            step = centre_of(self.camera, inputs.T, T)
-            centre = LensChange(u=centre.u + step.u, v=centre.v + step.v)
-            guesses = other_centre(self.camera, centre, se3.from_parts(inputs.T[:3, :3], T[:3, 3]))
-            match = next(self._alternatives.cameras(guesses, (), inputs, offset_s), None)
-            if match is None or (out and match.z_score <= out[-1].z_score):
-                break
-            out.append(match)
-            T = match.T
-            if inputs.tolerance.covers(inputs.T, T):
-                break
-        return out
-
-    def _possible_centre(
-        self, score: PointScore, found: Matrix, inputs: CheckInputs, others: Sequence[Candidate[CameraGuess]]
-    ) -> CauseFinding | None:
-        """A principal point that explains the frames as well as the rotation to the optimum (4, 4) of a score does."""
-        T, tolerance, centre = inputs.T, inputs.tolerance, None
-        if not distorts(self.camera):
-            centre = centre_instead(score, T, found, tolerance)
-        for own in others:
-            is_centre = own.hypothesis.finding.cause is Cause.PRINCIPAL_POINT
-            if is_centre and tolerance.covers(T, own.T) and -own.gain <= PARAMETER_PENALTY:
-                centre = centre_of(self.camera, T, found)
-        return None if centre is None else centre_finding(centre, self.camera, CauseState.POSSIBLE)
+    def _possible_centre(self, lens: LensEstimate, inputs: CheckInputs) -> CauseFinding | None:
+        """A principal point that explains the frames as well as the rotation to the optimum does."""
+        if lens.instead is None:
+            return None
+        change, T, loss = lens.instead
+        if loss > PARAMETER_PENALTY or not inputs.tolerance.covers(inputs.T, T):
+            return None
+        found = {own.name: own.unit * float(value) for own, value in zip(lens.unknowns, change, strict=True)}
+        return centre_finding(*(found[name] for name in CENTRE))
 
     def _on_right_clocks(
         self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs
@@ -307,8 +303,8 @@ class Checker:
         T = without.T_camera_lidar if without.converged else without.optimum
         if T is None:
             return None
-        before, after = self._alternatives.score(as_stamped, T), self._alternatives.score(moved, result.T_camera_lidar)
-        if not judged(before):
+        before, after = self._judge.score(as_stamped, T), self._judge.score(moved, result.T_camera_lidar)
+        if not shows_lens(before):
             return None
         noise = noise_of(before, T, unlimited(T))
         gain = (after.at(-1).value(result.T_camera_lidar) - before.at(-1).value(T)) / noise
@@ -345,3 +341,27 @@ class Checker:
         causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
         known = {"tolerance": inputs.tolerance, "T_checked": inputs.T, "T_estimated": None, "covariance": None}
         return CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)
+
+
+def covariance_of(score: PointScore, T: Transform) -> Covariance:
+    """Covariance (6, 6) of an optimum T (4, 4)."""
+    return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))
+
+
+def look(
+    calibrator: Calibrator, features: Sequence[FrameFeatures], box: SearchBox | None, inputs: CheckInputs, optima: list[Matrix]
+) -> Result | None:
+    """The match of a refinement (None), or of a search in a box, from the extrinsic; None if it is one of chance. optima: its
+    T_camera_lidar (4, 4) is added, by chance or not."""
+    result = calibrator.estimate(features, inputs.T, box, inputs.progress)
+    optimum = result.T_camera_lidar if result.converged else result.optimum
+    if optimum is not None:
+        optima.append(optimum)
+    if result.refusal is RefusalCode.WRONG_TIMES and result.evidence is not None:  # an optimum that matches for all that
+        return result if result.evidence.p_value <= calibrator.config.refine.max_p_value else None
+    return result if result.converged else None
+
+
+def match_of(result: Result) -> float:
+    """z-score of a match."""
+    return result.evidence.z_score if result.evidence is not None else -np.inf

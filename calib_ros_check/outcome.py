@@ -15,7 +15,7 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
-from calib_ros.result import VERSION
+from calib_ros.result import VERSION, Cause
 
 
 class CheckVerdict(Enum):
@@ -24,22 +24,6 @@ class CheckVerdict(Enum):
     PASS = "pass"
     FAIL = "fail"
     INCONCLUSIVE = "inconclusive"  # the scenes do not tell
-
-
-class Cause(Enum):
-    """What else than the mount may be wrong."""
-
-    TIME_OFFSET = "time_offset"  # clocks of camera and LiDAR
-    FOCAL_LENGTH = "focal_length"
-    PRINCIPAL_POINT = "principal_point"
-    OTHER_CAMERA = "other_camera"  # focal length and principal point: CameraInfo of another camera, or of another image size
-    NOT_RECTIFIED = "not_rectified"  # the image shows a lens distortion that its CameraInfo does not
-    ALREADY_RECTIFIED = "already_rectified"  # CameraInfo has a lens distortion that the image does not show
-    MIRRORED_IMAGE = "mirrored_image"
-    ROTATED_IMAGE = "rotated_image"
-    INVERSE_TRANSFORM = "inverse_transform"  # T_lidar_camera instead of T_camera_lidar
-    BODY_FRAME = "body_frame"  # of the camera's body (x forward) instead of its optical frame (z forward), or the other way
-    CLOUD_FRAME = "cloud_frame"  # points in another frame than the extrinsic is of
 
 
 class CauseState(Enum):

@@ -33,19 +33,6 @@ LONG_NAMES = {
     "rotation": "rotation in all",
     "translation": "translation in all",
 }
-CAUSE_NAMES = {
-    "time_offset": "clocks apart",
-    "focal_length": "wrong focal length",
-    "principal_point": "wrong principal point",
-    "other_camera": "another camera's CameraInfo",
-    "not_rectified": "distorted image called rectified",
-    "already_rectified": "rectified image called distorted",
-    "mirrored_image": "mirrored image",
-    "rotated_image": "turned image",
-    "inverse_transform": "transform the wrong way round",
-    "body_frame": "camera_link instead of the optical frame",
-    "cloud_frame": "points in another frame",
-}
 STYLE = """\
 .verdict { display: inline-block; padding: .25rem .9rem; border-radius: 6px; color: #fff; font-weight: 700; font-size: 1.2rem; }
 .pass { background: #1d7a3a; } .fail { background: #b3261e; } .inconclusive { background: #8a6d00; }
@@ -149,7 +136,7 @@ def write_report(path: str | Path, checked: Checked) -> None:
         facts=facts,
         result=result,
         rows=deviation_rows(result, result.tolerance),
-        causes=[(CAUSE_NAMES[f.cause.value], f.state.value, f.message) for f in result.causes],
+        causes=[(f.cause.words, f.state.value, f.message) for f in result.causes],
         pictures=pictures,
         both=result.T_estimated is not None,
     )

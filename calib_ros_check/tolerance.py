@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,6 +19,9 @@ from scipy.stats import chi2
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.registration.judgement.evidence import CONFIDENCE, EVEN, Match, convinces, evidence, log_odds
+from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, TOLERANCE_DEG, refined
+from calib_ros.registration.search.constraints import Limits
 from calib_ros_check.outcome import CauseFinding, CheckVerdict, Deviation, Tolerance
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -25,9 +29,9 @@ AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 SCALES = 2.0 ** np.arange(-4, 9)
 SAMPLES = 20000
 QUANTILES = (np.arange(8) + 0.5) / 8  # of the variances that make up Student's distribution
-CONFIDENCE = 0.9  # probability from which a verdict is one
 ACCUSATION = 0.01  # largest probability that what is accused is right
 INTERVAL = 0.95
+NEAREST_ROUNDS = 50  # of the fixed point
 MORE_FRAMES = "use more frames of other scenes, with objects in view of both sensors"
 # By axis: what a positive and what a negative error means. A positive rotation about y, which points down, moves all points to
 # the right in the image: the camera is taken to look further left than it does.
@@ -110,6 +114,30 @@ def verdict_of(p_within: float, shown: bool = True) -> CheckVerdict:
     if p_within >= CONFIDENCE:
         return CheckVerdict.PASS if shown else CheckVerdict.INCONCLUSIVE
     return CheckVerdict.FAIL if p_within <= ACCUSATION else CheckVerdict.INCONCLUSIVE
+
+
+def is_off(optimum: Match, covariance: Covariance, T_checked: Transform, tolerance: Tolerance) -> bool:
+    """Whether an optimum convinces against every extrinsic within the tolerance of T_checked (4, 4). Its covariance (6, 6) tells
+    where the best of these is, but knows one top of the score only."""
+    part = optimum.score.subset(POINTS, np.random.default_rng(0))
+    half = np.array([np.deg2rad(tolerance.deg)] * 3 + [tolerance.m] * 3)
+    nearest = se3.exp(_nearest_within(se3.log(optimum.T @ se3.inverse(T_checked)), covariance, half)) @ T_checked
+    limits, ends = Limits(T_checked, half / np.sqrt(3)), [nearest]
+    for start, levels in product((T_checked, limits.clip(nearest)), (LEVELS, NEAR_LEVELS)):
+        ends.append(refined(part, start, limits, levels, TOLERANCE_DEG)[0])
+    best = max((Match(part, T) for T in ends), key=evidence)
+    return convinces(log_odds(Match(part, optimum.T), best), EVEN)
+
+
+def _nearest_within(error: Matrix, covariance: Covariance, half: Matrix) -> Matrix:
+    """The twist (6,) whose rotation and shift are within half (6,), rad and m, that is nearest to an error (6,) by its covariance
+    (6, 6): by the multipliers of both limits, found as a fixed point."""
+    information, multipliers, twist = np.linalg.inv(covariance), half**-2.0, error
+    for _ in range(NEAREST_ROUNDS):
+        twist = np.linalg.solve(information + np.diag(multipliers), information @ error)
+        sizes = np.repeat(np.linalg.norm(twist.reshape(2, 3), axis=1), 3)
+        multipliers = np.maximum(multipliers, 1e-12) * (sizes / half) ** 2
+    return twist * min(1.0, float((half / np.maximum(sizes, 1e-12)).min()))
 
 
 def deviation(T_checked: Transform, T_estimated: Transform, covariance: Covariance) -> tuple[Matrix, Matrix]:

@@ -124,6 +124,7 @@ class BlackBox:
             p_value=extrinsic.p_value,
             refusal=None if result.refusal is None else result.refusal.value,
             refusal_figures=dict(result.refusal_figures),
+            cause=None if result.cause is None else result.cause.value,
             disputed_since_ns=extrinsic.disputed_since if doubted else 0,
         )
         self._events.append(event)
@@ -133,7 +134,7 @@ class BlackBox:
             happens = (changed and kind == result.status) or (refused and kind == REFUSED)
             if happens and now - self._begun.get(kind, -math.inf) >= SPACING_S:
                 self._begun[kind] = now
-                said = ("status", "reason", "refusal", "refusal_figures", "optimum")
+                said = ("status", "reason", "refusal", "refusal_figures", "cause", "optimum")
                 used = replace(self._relied_on or result, **{name: getattr(result, name) for name in said})
                 capture = {**event, "event": "capture", "kind": kind}
                 self._pending.append(Occasion(kind, used, capture, now + LONGEST_AFTER_S))

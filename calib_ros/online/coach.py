@@ -44,9 +44,6 @@ FAULTS = {
 CURES = {
     RefusalCode.LOW_SCORE: "check the camera's exposure and focus, the topics and the time stamps",
     RefusalCode.TOO_FAR_FROM_START: "widen the search, or give a better initial extrinsic",
-    RefusalCode.WRONG_INTRINSICS: "calibrate the camera's intrinsics anew, or have them refined",
-    RefusalCode.MIRRORED_IMAGE: "turn the mirroring of the images off in the driver",
-    RefusalCode.WRONG_TIMES: "mend the time stamps of the drivers",
 }
 IF_RAW = "set image_is_rectified: false if straight lines are bent in the images"
 
@@ -206,9 +203,11 @@ def _text(result: Result, config: Config, counted: Counted, lacking: Need | None
         if not counted.keyframes:
             return f"no keyframe yet: drive where there are {STRUCTURE}, in light", True
         return f"keep driving: {counted.keyframes} of {needed} keyframes, each of another view", True
-    if result.refusal in CURES:
+    if result.cause is not None:
         raw = result.refusal is RefusalCode.WRONG_INTRINSICS and camera.said_rectified
-        return f"{IF_RAW}, else {CURES[result.refusal]}" if raw else CURES[result.refusal], False
+        return f"{IF_RAW}, else {result.cause.advice}" if raw else result.cause.advice, False
+    if result.refusal in CURES:
+        return CURES[result.refusal], False
     if config.online.mode == MANUAL and status != TENTATIVE:
         return f"{weak}; then call ~/calibrate" if weak else "call ~/calibrate", False
     if weak:

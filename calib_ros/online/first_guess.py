@@ -16,7 +16,7 @@ from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeatur
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import CLOUD, IMAGE, Hypothesis
+from calib_ros.registration.classes import CLOUD, IMAGE, PoseHypothesis
 from calib_ros.registration.features import FrameFeatures, views_of
 from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, MOTION
 from calib_ros.registration.motion_guess.guess import motion_guess
@@ -146,7 +146,7 @@ class FirstGuess:
         def register(T: Transform, box: SearchBox) -> Result:
             return calibrator.estimate(features, T, box, progress)
 
-        hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
+        hypotheses = [PoseHypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
         result, _ = best_registration(hypotheses, register, guess.box)
         self._tried_at, self._failure = newest, result.reason
         return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)

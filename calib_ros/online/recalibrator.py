@@ -30,7 +30,7 @@ from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
 from calib_ros.registration.acceptance.checks import leaves_doubt
-from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.calibrator import NO_MATCH, Calibrator
 from calib_ros.registration.classes import ALL, CLASSES, Segmentation
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import FrameFeatures
@@ -39,6 +39,7 @@ from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, RefusalCode, Result
 
+JUDGED_AFTER = 3  # estimates in a row where nothing matches: then the judge is asked once what may be mixed up
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 # p value of a keyframe that asks for an estimate at rest: by chance, of the two tests at each, one rest in twenty ends early.
@@ -107,6 +108,7 @@ class Recalibrator:
         self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
+        self._unmatched, self._mixed_up = 0, Result(self.tracker.T, INITIAL)  # estimates in a row; what was found then
         self._seen_motion = SeenMotion()
         self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
@@ -380,6 +382,7 @@ class Recalibrator:
                 # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
                 anchor = tracker.initial.T_camera_lidar
                 result = self.calibrator.estimate(batch.features, start, box, progress, anchor=anchor, near=box is None)
+                result = self._explained(result, batch, box, progress)
         except Cancelled:
             with self._lock:
                 self.keyframes.give_back(batch)
@@ -391,6 +394,18 @@ class Recalibrator:
         if self.config.online.mode != CONTINUOUS or self.tracker.steady:
             self.calibrator.objectives.free_memory()
         return extrinsic
+
+    def _explained(self, result: Result, batch: Batch, box: SearchBox | None, progress: Callback | None) -> Result:
+        """The result; where nothing has matched several times in a row, with the cause that was found then, if any."""
+        if result.refusal not in NO_MATCH or result.cause is not None:
+            self._unmatched = 0
+            return result
+        self._unmatched += 1
+        if self._unmatched == JUDGED_AFTER:
+            self._mixed_up = self.calibrator.explained(result, batch.features, box, progress=progress)
+        if self._unmatched < JUDGED_AFTER or self._mixed_up.cause is None:
+            return result
+        return replace(result, cause=self._mixed_up.cause, reason=self._mixed_up.reason)
 
     def _search_box(self, rounds: int | None = None) -> SearchBox:
         return SearchBox(self.config.search.rotation_deg, self.config.search.translation_m, rounds)
@@ -474,5 +489,5 @@ class Recalibrator:
         """With the lock held. Features and estimates that are being computed from the old keyframes become void."""
         self.keyframes.clear()
         self._restart_monitor = self._in_doubt = True
-        self._to_segment = None
+        self._to_segment, self._unmatched = None, 0
         self.selector.reset()

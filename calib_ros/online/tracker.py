@@ -227,6 +227,7 @@ class Tracker:
             frames_used=estimate.frames_used,
             score=estimate.score,
             refusal=estimate.refusal,
+            cause=estimate.cause,
             optimum=estimate.optimum,
             optimum_covariance=estimate.optimum_covariance,
         )

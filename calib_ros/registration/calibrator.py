@@ -36,9 +36,11 @@ from calib_ros.registration.estimate import (
     reject_outlier_frames,
 )
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, other_objective, views_of
-from calib_ros.registration.frames import usable_frames, with_classes
+from calib_ros.registration.frames import Used, usable_frames, with_classes
 from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import JointSearch
+from calib_ros.registration.judgement.hypotheses import AsTaken
+from calib_ros.registration.judgement.judge import Judge, Question, is_only_off
 from calib_ros.registration.judgement.lens import LensEstimate, estimate_lens, lens_unknowns
 from calib_ros.registration.motion_guess.registration import best_registration, from_anything, from_motion
 from calib_ros.registration.objective import Objective, ObjectiveMaker
@@ -47,6 +49,12 @@ from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result
 
 LACKS_EVIDENCE = (RefusalCode.NOT_SIGNIFICANT, RefusalCode.TOO_UNCERTAIN)
+# Refusals where nothing matches: then something may be mixed up.
+NO_MATCH = (
+    *(RefusalCode.TOO_FEW_FEATURES, RefusalCode.LOW_SCORE, RefusalCode.NOT_SIGNIFICANT),
+    *(RefusalCode.WORSE_THAN_START, RefusalCode.TOO_FAR_FROM_START),
+)
+Classified = Callable[[], tuple[Sequence[FrameFeatures], Sequence[str]]]
 
 
 class Calibrator:
@@ -79,6 +87,7 @@ class Calibrator:
         self.extract = FeatureExtractor(camera, self.config, scans)
         self.segmentation = segmentation or models_of(self.config.semantics)
         self.objectives = ObjectiveMaker(self.config, camera)
+        self.judge = Judge(self.objectives, self.config, camera)
 
     def calibrate(
         self,
@@ -116,7 +125,7 @@ class Calibrator:
             pictures that show no intrinsics.
         """
         if self.config.camera.intrinsics != REFINE:
-            return self._calibrated(frames, initial, search, progress, consecutive)
+            return self._calibrated(frames, initial, search, progress, consecutive, explained=True)
         if self.extract.camera.is_sphere:
             raise BadInputError(
                 "camera.intrinsics: refine needs pictures that show the intrinsics, and those of this lens are unrolled, where "
@@ -125,7 +134,7 @@ class Calibrator:
             )
         if search is None and not isinstance(initial, str):
             search = SearchBox(0.0, 0.0)  # as None, but intrinsics are searched
-        first = self._calibrated(frames, initial, search, progress, consecutive)
+        first = self._calibrated(frames, initial, search, progress, consecutive, explained=True)
         started, box = time.perf_counter(), search or SEMANTIC_BOX
 
         def whole(camera: Camera) -> Result:
@@ -144,8 +153,9 @@ class Calibrator:
         search: SearchBox | None,
         progress: Callback | None,
         consecutive: Sequence[Frame],
+        explained: bool = False,
     ) -> Result:
-        """`calibrate` by the camera as it is."""
+        """`calibrate` by the camera as it is. explained: why nothing matches is looked for."""
         started = time.perf_counter()
         T0 = None if isinstance(initial, str) else se3.as_transform(initial, "the initial extrinsic")
         if T0 is None and initial not in GUESSES:
@@ -168,11 +178,13 @@ class Calibrator:
         features = [features for _, features in used]
         if T0 is None:
             result = self.guess(features, search, progress, notes, str(initial))
-        elif wait:
-            seen = partial(with_classes, used, self.extract, self.segmentation, T0, search, Progress(progress, "classes"))
-            result = self.estimate_in_doubt(features, seen, T0, search, progress, notes)
         else:
+            seen = partial(with_classes, used, self.extract, self.segmentation, T0, search, Progress(progress, "classes"))
             result = self.estimate(features, T0, search, progress, notes)
+            if explained:
+                result = self.explained(result, features, search, self.pictures_of(used), progress)
+            if wait:
+                result = self.again_in_doubt(result, features, seen, T0, search, progress, notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
 
     def guess(
@@ -261,18 +273,18 @@ class Calibrator:
         centre = np.array([-change_between(given, camera, own.name) / own.unit for own in unknowns])
         return estimate_lens(score, T, objective.constraints.limits, unknowns, inflated, centre)
 
-    def estimate_in_doubt(
+    def again_in_doubt(
         self,
+        result: Result,
         plain: Sequence[FrameFeatures],
-        classified: Callable[[], tuple[Sequence[FrameFeatures], Sequence[str]]],
+        classified: Classified,
         initial: Transform,
         box: SearchBox | None = None,
         progress: Callback | None = None,
         notes: Sequence[str] = (),
     ) -> Result:
-        """`estimate` from features without classes, and where that leaves doubt, again from those with classes and their notes.
-        What edges alone are sure of is not refused for want of evidence there: classes halve the weight of many edges."""
-        result = self.estimate(plain, initial, box, progress, notes)
+        """The result of `estimate` from features without classes, or where that leaves doubt, of those with classes and their
+        notes. What edges alone are sure of is not refused for want of evidence there: classes halve the weight of many edges."""
         if not plain or not self.segmentation.active or not leaves_doubt(result):
             return result
         features, more = classified()
@@ -284,6 +296,39 @@ class Calibrator:
             if deg <= self.config.refine.tolerance_deg and m <= self.config.refine.tolerance_m:
                 return replace(result, reason=joined([result.reason, *more]))
         return again
+
+    def explained(
+        self,
+        result: Result,
+        features: Sequence[FrameFeatures],
+        box: SearchBox | None,
+        as_taken: AsTaken | None = None,
+        progress: Callback | None = None,
+    ) -> Result:
+        """The result; where nothing matches, with its cause, if a hypothesis about what was mixed up explains these features.
+        box: that was searched about its start."""
+        if result.refusal not in NO_MATCH or result.cause is not None or not features or result.initial is None:
+            return result
+        optima = [] if result.optimum is None else [result.optimum]
+        refine = self.config.refine
+        asked = Question(features, result.initial, box, as_taken, progress=Progress(progress, "causes"))
+        given = self.judge.as_given(features, result.initial, optima)
+        found = self.judge.explain(asked, given, refine.tolerance_deg, refine.tolerance_m)
+        if found is None or is_only_off(found, refine.tolerance_deg, refine.tolerance_m):
+            return result
+        figures = {**result.refusal_figures, "z_score_mended": found.z_score}
+        reason = f"{found.hypothesis.message} (with that mended they match, z-score {found.z_score:.1f})"
+        return replace(result, reason=reason, cause=found.hypothesis.cause, refusal_figures=figures)
+
+    def pictures_of(self, used: Sequence[Used]) -> AsTaken:
+        """The features of frames (those with these numbers, None = all), had another camera taken them."""
+
+        def as_taken(camera: Camera, numbers: Sequence[int] | None) -> Sequence[FrameFeatures]:
+            extract = FeatureExtractor(camera, self.config)
+            chosen = used if numbers is None else [used[k] for k in numbers]
+            return [extract.seen_anew(own, frame.image) for frame, own in chosen]
+
+        return as_taken
 
     @property
     def classes_in_doubt_only(self) -> bool:

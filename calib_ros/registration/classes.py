@@ -45,7 +45,7 @@ class FrameSemantics:
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class PoseHypothesis:
     """A guess of T_camera_lidar (4, 4). score: comparable within one source; 0 = as good as chance. margin: by how much it beats
     the next hypothesis of another viewing direction. kind: its source. inliers: objects of the images that meet one in the cloud.
     """
@@ -102,7 +102,7 @@ class ClassModels(Protocol):
     def consistency(self, views: Sequence[Any]) -> PointScore | None:
         """How well labelled points meet pixels of their class; None where the frames show too little in common."""
 
-    def first_guess(self, views: Sequence[Any], seed: int, sweep: bool) -> list[Hypothesis]:
+    def first_guess(self, views: Sequence[Any], seed: int, sweep: bool) -> list[PoseHypothesis]:
         """Hypotheses of the extrinsic, best first (thesis 3.5); sweep: not by centroids alone. TooFewFeaturesError if too few."""
 
 

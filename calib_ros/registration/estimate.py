@@ -115,6 +115,7 @@ class Estimate:
             frames_left_out=tuple(outliers),
             refusal=refusal.code if refusal else None,
             refusal_figures=refusal.figures if refusal else {},
+            cause=refusal.cause if refusal else None,
             optimum=self.T if refusal else None,
             optimum_covariance=self.covariance if refusal else None,
             data_stamp=max(f.stamp for f in features),

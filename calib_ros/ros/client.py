@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError
 from calib_ros.messages import decode_image, stamp_ns
-from calib_ros.result import Result
+from calib_ros.result import Cause, Result
 from calib_ros.ros.conversions import covariance_from_ros, matrix_from_transform
 from calib_ros.ros.dds import use_large_message_profile
 
@@ -35,6 +35,7 @@ def result_from_message(msg: Any) -> Result:
         int(msg.frames_used),
         msg.transform.header.frame_id,
         msg.transform.child_frame_id,
+        cause=next((cause for cause in Cause if cause.value == msg.cause), None),
         time_offset_s=msg.time_offset if known else None,
         time_offset_sigma_s=msg.time_offset_sigma if known else None,
     )

@@ -147,6 +147,7 @@ def extrinsic_message(
     msg.covariance = covariance_for_ros(result.covariance)
     msg.score = float(result.score)
     msg.status, msg.reason = result.status, "; ".join(filter(None, [validity.reason, result.reason]))
+    msg.cause = "" if result.cause is None else result.cause.value
     msg.frames_used, msg.drift = int(result.frames_used), float(extrinsic.normalised_innovation)
     msg.usable, msg.valid_until = validity.usable, time_message(validity.valid_until)
     msg.data_age, msg.estimated_at = duration_message(validity.data_age_s), time_message(extrinsic.estimated_at)

@@ -245,12 +245,19 @@ class Diagnostics:
         # With the monitor's last assessment, which is not published while the extrinsic is right.
         state = self._health.extrinsic if recalibrator is None else recalibrator.current
         if state is None:
-            return {"estimates accepted": "0", "age of the last estimate, s": "none", "status": "none", "drift": "none"}
+            return {
+                "estimates accepted": "0",
+                "age of the last estimate, s": "none",
+                "status": "none",
+                "cause": "none",
+                "drift": "none",
+            }
         result = state.result
         values = {
             "estimates accepted": str(state.accepted),
             "age of the last estimate, s": "none" if age is None else f"{age:.1f}",
             "status": result.status,
+            "cause": "none" if result.cause is None else result.cause.value,
             "score": f"{result.score:.3f}",
             "drift": f"{state.normalised_innovation:.2f}",
             "sigma of rotation, deg": "unknown",

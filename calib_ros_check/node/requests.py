@@ -19,11 +19,10 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.requests import Pending
+from calib_ros.registration.judgement.hypotheses import distorts
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.parallel import cpu_time
-from calib_ros_check.alternatives import CheckInputs
-from calib_ros_check.causes import distorts
-from calib_ros_check.checker import Checker
+from calib_ros_check.checker import Checker, CheckInputs
 from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance
 
 NO_PAIR = "no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'"

@@ -16,16 +16,17 @@ from calib_ros.datasets.rig import open_rig
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.io import write_atomically
-from calib_ros.result import VERSION
+from calib_ros.registration.judgement.evidence import CONFIDENCE
+from calib_ros.result import VERSION, Cause
 from calib_ros.rig.description import MAX_SIGMA_DEG, MAX_SIGMA_M, RigDescription, prior_covariance, read_rig
 from calib_ros.rig.edges import Measurement, Progress, RigMeasurer
 from calib_ros.rig.graph import Edge, RigSolution, solve
 from calib_ros.rig.report import load, loop_dict
 from calib_ros_check.checker import Checker
-from calib_ros_check.outcome import Cause, CheckResult, CheckVerdict, Tolerance, plain
+from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance, plain
 from calib_ros_check.recording import FRAMES, REFERENCE, TF, CheckOptions
 from calib_ros_check.rig.blame import Blame, blame, claimed
-from calib_ros_check.tolerance import CONFIDENCE, MORE_FRAMES, Judgement, judge, unknown
+from calib_ros_check.tolerance import MORE_FRAMES, Judgement, judge, unknown
 
 PASS, FAIL, INCONCLUSIVE = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE
 OF_ONE_PAIR = ("camera", "image_topic", "points_topic", "camera_info_topic")

@@ -50,7 +50,7 @@ class Own(Extracting):
         with counted() as count:
             if calibrator.classes_in_doubt_only:
                 plain = [f.plain or f for f in features]
-                result = calibrator.estimate_in_doubt(plain, lambda: (features, ()), T, reach)
+                result = calibrator.again_in_doubt(calibrator.estimate(plain, T, reach), plain, lambda: (features, ()), T, reach)
             else:
                 result = calibrator.estimate(features, T, reach)
         return Outcome(result.T_camera_lidar, count[0], "" if result.converged else result.reason)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.classes import Hypothesis
+from calib_ros.registration.classes import PoseHypothesis
 from calib_ros.registration.initial_guess import MAX_DISTANCE_M, MAX_TILT_DEG, allowed, poses, rotation_distance_deg
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.starts import Sobol
@@ -38,7 +38,7 @@ SAME_DEG = (6.0, 2.0, 1.0)  # hypotheses nearer than this are one: at first, aft
 OTHER_WAY_DEG = 2 * AROUND_DEG  # nearer hypotheses are places of one direction
 
 
-def first_guess(views: Sequence[ClassView], seed: int = 0, sweep: bool = True) -> list[Hypothesis]:
+def first_guess(views: Sequence[ClassView], seed: int = 0, sweep: bool = True) -> list[PoseHypothesis]:
     """Hypotheses of the extrinsic that all views have in common, best first; at least one. The LiDAR's z axis points up within
     MAX_TILT_DEG, its yaw is unknown. sweep: try all yaws, whatever the centroids say.
 
@@ -70,7 +70,7 @@ def first_guess(views: Sequence[ClassView], seed: int = 0, sweep: bool = True) -
             "of points and pixels together; check labels, topics and time stamps, or use more frames"
         )
     return [
-        Hypothesis(T[k], float(values[k]), _margin(T[k:], values[k:]), str(kinds[k]), pairs.inliers(T[k]))
+        PoseHypothesis(T[k], float(values[k]), _margin(T[k:], values[k:]), str(kinds[k]), pairs.inliers(T[k]))
         for k in range(min(len(T), CANDIDATES))
     ]
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_check.alternatives import CheckInputs
-from calib_ros_check.checker import Checker
+from calib_ros_check.checker import Checker, CheckInputs
 from calib_ros_check.outcome import CheckResult, Tolerance
 from calib_ros_view.session.session import Session, SessionState
 

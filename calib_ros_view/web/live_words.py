@@ -125,7 +125,8 @@ def said_of(watch: Watch, now: float) -> Said:
     own = state.result.reason.strip(" :;")
     for sign in ":;":  # the badge says the status already
         problem = problem.removeprefix(f"{state.result.status}{sign} ")
-    reason = problem if own in problem else "; ".join(filter(None, [own, problem]))
+    told, cause = problem if own in problem else "; ".join(filter(None, [own, problem])), state.result.cause
+    reason = told if cause is None else f"{cause.words}: {told}"
     return Said(state.result.status, state.level, "usable" if state.usable else "not usable", state.words, reason, state.advice)
 
 

@@ -157,7 +157,7 @@ class Acceptance:
 
 def leaves_doubt(result: Result) -> bool:
     """Can classes change this result of an estimate without them? They help to find an optimum, and to tell it from chance."""
-    if result.refusal in (RefusalCode.WRONG_INTRINSICS, RefusalCode.WRONG_TIMES):
+    if result.cause is not None or result.refusal in (RefusalCode.WRONG_INTRINSICS, RefusalCode.WRONG_TIMES):
         return False
     return not result.converged or result.evidence is None or result.evidence.z_score < UNDOUBTED_Z
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from calib_ros.camera import Camera
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL
 from calib_ros.registration.covariance import Direction
-from calib_ros.result import RefusalCode
+from calib_ros.result import Cause, RefusalCode
 
 # What a Result notes whether or not it is refused.
 LEFT_OUT = (
@@ -27,11 +27,13 @@ SUSPECT_INTRINSICS = (RefusalCode.WRONG_INTRINSICS, RefusalCode.NOT_SIGNIFICANT,
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why an optimum is not to be used. figures: its numbers, by name. str() is the message."""
+    """Why an optimum is not to be used. figures: its numbers, by name. cause: what is wrong, if that is known. str() is the
+    message."""
 
     code: RefusalCode
     text: str
     figures: Mapping[str, float]
+    cause: Cause | None = None
 
     def __str__(self) -> str:
         return self.text
@@ -73,7 +75,8 @@ def low_score(score: float) -> Refusal:
 def mirrored_image(z_score: float, decoy_z: float) -> Refusal:
     """The scenes match their mirror images beyond chance, and not the images as they come."""
     text = f"the images are mirrored left to right: they match so (z-score {decoy_z:.1f}), and not as they come ({z_score:.1f})"
-    return _refusal(RefusalCode.MIRRORED_IMAGE, f"{text}; turn it off in the driver", z_score=z_score, decoy_z=decoy_z)
+    figures = {"z_score": z_score, "decoy_z": decoy_z}
+    return Refusal(RefusalCode.NOT_SIGNIFICANT, f"{text}; turn it off in the driver", figures, Cause.MIRRORED_IMAGE)
 
 
 def not_significant(z_score: float, decoy_z: float, p_value: float, largest: float, inconsistent: bool) -> Refusal:
@@ -125,13 +128,9 @@ def wrong_intrinsics(main: str, values: Mapping[str, float], camera: Camera, rem
     """Another lens matches better. main: which of the values, by their names, matters most: shares of the focal length, the
     aspect, the image width and the corner's radius. camera: as it is stated; removed: hardly any of its distortion is seen.
     deviations: how far `main` is off, in standard deviations of the scenes and of what is known in advance together."""
-    value, width, px, cure = (
-        values[main],
-        camera.width,
-        camera.width * values[main],
-        "check K and D in camera_info, the image size they are for, and ",
-    )
-    cure += "image_is_rectified (--rectified)"
+    value, width, px = values[main], camera.width, camera.width * values[main]
+    cure = "check K and D in camera_info, the image size they are for, and image_is_rectified (--rectified)"
+    cause = Cause.PRINCIPAL_POINT if main in CENTRE else Cause.FOCAL_LENGTH
     if main == FOCAL:
         what = f"with a focal length about {abs(value):.1%} {'longer' if value > 0 else 'shorter'}"
     elif main == ASPECT:
@@ -142,15 +141,15 @@ def wrong_intrinsics(main: str, values: Mapping[str, float], camera: Camera, rem
         what = f"with the principal point about {abs(px):.3g} px further {'down' if value > 0 else 'up'}"
     elif removed:
         what = "without the lens distortion of camera_info, as if the images were rectified already"
-        cure = "set image_is_rectified (--rectified), or check D"
+        cure, cause = "set image_is_rectified (--rectified), or check D", Cause.ALREADY_RECTIFIED
     else:
         missing = "that camera_info does not state" if camera.is_pinhole else "other than camera_info states"
-        cure = AS_RAW if camera.said_rectified else cure
+        cure, cause = AS_RAW if camera.said_rectified else cure, Cause.NOT_RECTIFIED
         what = f"with a lens distortion {missing}, which moves the corners of the image by {value:+.1%} of their radius"
     text = f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); {cure}"
     units = {FOCAL: ("focal", 1), ASPECT: ("aspect", 1), CENTRE[0]: ("u", width), CENTRE[1]: ("v", width), RADIAL: ("radial", 1)}
     figures = {units[name][0]: units[name][1] * value for name, value in values.items()}
-    return _refusal(RefusalCode.WRONG_INTRINSICS, text, **figures, deviations=deviations)
+    return Refusal(RefusalCode.WRONG_INTRINSICS, text, {**figures, "deviations": float(deviations)}, cause)
 
 
 def wrong_times(seconds: float, deviations: float) -> Refusal:
@@ -165,7 +164,7 @@ def wrong_times(seconds: float, deviations: float) -> Refusal:
         f"wrong times: {match}: {late}, or the scans the other way; synchronise the clocks, or add {seconds:.3g} to "
         "motion.time_offset_s"
     )
-    return _refusal(RefusalCode.WRONG_TIMES, text, seconds=seconds, deviations=deviations)
+    return Refusal(RefusalCode.WRONG_TIMES, text, {"seconds": float(seconds), "deviations": float(deviations)}, Cause.TIME_OFFSET)
 
 
 def joined(parts: Sequence[str]) -> str:

@@ -146,7 +146,8 @@ class LensEstimate:
     extrinsic free. directions: (6, n) twist of the extrinsic, rad and m, per unit of each; 0 along fixed axes. T_given: (4, 4),
     the optimum by the lens as it is. gain: log-likelihood over that. freedom: degrees of freedom of the noise. centre: (n,)
     change that is expected: back to the stated camera, where this one corrects it. open_axes: (6,) of the extrinsic, which a lens
-    may move.
+    may move. instead: (n,) with T (4, 4) and the log-likelihood that is lost there, where a principal point takes the place of a
+    rotation; None where none was asked about.
     """
 
     unknowns: tuple[LensUnknown, ...]
@@ -159,6 +160,7 @@ class LensEstimate:
     centre: Matrix
     gain: float
     open_axes: NDArray[np.bool_]
+    instead: tuple[Matrix, Transform, float] | None = None
 
     @cached_property
     def usual(self) -> Matrix:
@@ -375,7 +377,9 @@ def estimate_lens(
     bending = _bending(see, T, change, unknowns, part, noise, limits.open_axes)
     freedom = max(REGIONS * effective_frames(score) - 6 - n, 1.0)
     centre, gain = as_it_is if centre is None else centre, max(higher - lower, 0.0) / noise
-    return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, centre, gain, limits.open_axes)
+    at, by, value = ends[-1]
+    instead = None if turned is None else (by, at, (higher - value) / noise)
+    return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, centre, gain, limits.open_axes, instead)
 
 
 def _seeing(score: PointScore, unknowns: Sequence[LensUnknown]) -> Callable[[Transform, Matrix], JointView]:

@@ -11,7 +11,7 @@ from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.acceptance.refusal import joined
-from calib_ros.registration.classes import Hypothesis
+from calib_ros.registration.classes import PoseHypothesis
 from calib_ros.registration.estimate import insufficient
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import MOTION, SEMANTIC, nominal
@@ -35,7 +35,7 @@ def search_boxes(box: SearchBox) -> tuple[SearchBox, ...]:
 
 
 def best_registration(
-    hypotheses: Sequence[Hypothesis], estimate: Callable[[Matrix, SearchBox], Result], box: SearchBox = SEMANTIC_BOX
+    hypotheses: Sequence[PoseHypothesis], estimate: Callable[[Matrix, SearchBox], Result], box: SearchBox = SEMANTIC_BOX
 ) -> tuple[Result, int]:
     """The result that counts, and how many hypotheses were tried: converged before not, then by score.
 
@@ -68,7 +68,7 @@ def from_motion(
         guess = motion_guess(consecutive, extract, extract.config.search.seed)
     except TooFewFeaturesError as error:
         return insufficient(error, nominal(), frames)
-    hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
+    hypotheses = [PoseHypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
     result, _ = best_registration(hypotheses, register, box or guess.box)
     return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
 

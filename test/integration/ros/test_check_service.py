@@ -18,9 +18,10 @@ from vehicle import QUICK, Vehicle
 
 from calib_ros import se3
 from calib_ros.frame import Frame
+from calib_ros.result import Cause
 from calib_ros.ros.conversions import matrix_from_transform, transform_message
 from calib_ros_check.node.requests import check_keyframes
-from calib_ros_check.outcome import Cause, CheckVerdict
+from calib_ros_check.outcome import CheckVerdict
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 INCONCLUSIVE, PASS, FAIL = Check.Response.INCONCLUSIVE, Check.Response.PASS, Check.Response.FAIL

@@ -13,13 +13,11 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, MotionConfig, SearchConfig
 from calib_ros.datasets import open_dataset
-from calib_ros.result import CONVERGED, Result
-from calib_ros_check.cameras import camera_guesses, turned_over
-from calib_ros_check.causes import KNOW_CLOCKS, changed_findings, clock_finding
+from calib_ros.registration.judgement.hypotheses import fisheyes, other_lenses, rectified_otherwise, resized, turned_over
+from calib_ros.result import CONVERGED, Cause, Result
+from calib_ros_check.causes import KNOW_CLOCKS, clock_finding
 from calib_ros_check.checker import Checker
-from calib_ros_check.evidence import Candidate
-from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
-from calib_ros_check.sensors import LensChange
+from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 QUICK = Config(search=SearchConfig(rounds=1, starts=64))
@@ -46,15 +44,6 @@ def halved(camera):
     return replace(camera, K=camera.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]]))
 
 
-def fitted(lens, deviations, tried=1):
-    return Candidate(None, np.eye(4), lens, 0.0, 0.5 * deviations**2, 0.2, tried)
-
-
-@pytest.mark.parametrize(("gain", "tried", "found"), [(3.0, 1, True), (3.0, 32, False), (3.6, 32, True), (2.2, 1, False)])
-def test_the_more_cameras_are_tried_the_more_one_has_to_gain(gain, tried, found):
-    assert fitted(LensChange(u=0.02), gain, tried).significant is found
-
-
 @pytest.mark.parametrize(
     ("model", "D"),
     [
@@ -67,26 +56,41 @@ def test_a_camera_turned_over_sees_a_turned_scene_upside_down(model, D):
     camera = Camera(np.array([[400.0, 0, 330], [0, 410.0, 110], [0, 0, 1]]), 640, 240, model, np.array(D))
     points = np.random.default_rng(0).uniform([-1, -0.4, 1], [1, 0.4, 3], (50, 3))
     upright = camera.project(points)[0]
-    turned = turned_over(camera).project(points * [-1, -1, 1])[0]
+    turned = turned_over(np.eye(4), camera).camera.project(points * [-1, -1, 1])[0]
     np.testing.assert_allclose(turned, [639, 239] - upright, atol=1e-6)
 
 
 def test_guesses_about_cameras_with_and_without_a_distortion():
     K = np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]])
-    (fisheye,) = camera_guesses(Camera(K, 640, 240))
-    assert (fisheye.finding.cause, fisheye.camera.model, fisheye.camera.is_pinhole) == (Cause.NOT_RECTIFIED, "equidistant", False)
-    guesses = list(camera_guesses(Camera(K, 640, 240, D=BARREL)))
-    assert [guess.camera.is_pinhole for guess in guesses].count(True) == 1
-    assert {guess.finding.cause for guess in guesses} == {Cause.ALREADY_RECTIFIED, Cause.OTHER_CAMERA}
+    straight, bent = Camera(K, 640, 240), Camera(K, 640, 240, D=BARREL)
+    (fisheye,) = fisheyes(np.eye(4), straight)
+    assert (fisheye.cause, fisheye.camera.model, fisheye.camera.is_pinhole) == (Cause.NOT_RECTIFIED, "equidistant", False)
+    assert [*rectified_otherwise(np.eye(4), straight), *other_lenses(np.eye(4), bent), *fisheyes(np.eye(4), bent)] == []
+    (rectified,) = rectified_otherwise(np.eye(4), bent)
+    assert (rectified.cause, rectified.camera.is_pinhole) == (Cause.ALREADY_RECTIFIED, True)
+    for camera, anew in ((straight, False), (bent, True)):
+        made = list(resized(np.eye(4), camera, straight))
+        assert {(guess.cause, guess.camera is not None) for guess in made} == {(Cause.OTHER_CAMERA, anew)}
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+def test_a_raw_picture_with_the_intrinsics_of_the_rectified_one_has_those_that_opencv_made_it_from(alpha):
+    K, D = np.array([[1400.0, 0, 980], [0, 1400.0, 560], [0, 0, 1]]), np.array([-0.35, 0.12, 0.001, 0, 0])
+    made = cv2.getOptimalNewCameraMatrix(K, D, (1920, 1080), alpha)[0]
+    guesses = rectified_otherwise(np.eye(4), Camera(made, 1920, 1080, D=D))
+    (found,) = (guess.camera.K for guess in guesses if guess.cause is Cause.OTHER_CAMERA)
+    np.testing.assert_allclose(found, K, atol=1.0)
 
 
 def test_raw_images_that_are_taken_for_rectified_are_to_be_taken_as_raw():
     camera = Camera(np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]]), 640, 240)
-    bent = replace(fitted(LensChange(barrel=0.1), 9.0), parts={"barrel": 40.0})
     for said, cure in ((True, "--no-rectified, or image_is_rectified: false to the node"), (False, "take the rectified topic")):
         own = replace(camera, said_rectified=said)
-        found = [changed_findings(bent, own)[0], *(guess.finding for guess in camera_guesses(own))]
-        assert [(finding.cause, cure in finding.message) for finding in found] == [(Cause.NOT_RECTIFIED, True)] * 2
+        found = [
+            guess for guess in (*other_lenses(np.eye(4), own), *fisheyes(np.eye(4), own)) if guess.cause is Cause.NOT_RECTIFIED
+        ]
+        assert len(found) > 2
+        assert all(cure in guess.message for guess in found)
 
 
 @pytest.mark.parametrize(("count", "why"), [(1, "one frame does not tell"), (3, "all frames move alike")])

@@ -7,18 +7,10 @@ import pytest
 from scenes import RenderedDrive
 
 from calib_ros import se3
+from calib_ros.registration.judgement.evidence import EVEN, Match, convinces, freedom, log_odds, rare_odds, shows_noise
 from calib_ros_check.checker import Checker
-from calib_ros_check.evidence import (
-    EVEN,
-    Match,
-    convinces,
-    freedom,
-    is_off,
-    log_odds,
-    rare_odds,
-    shows_noise,
-)
 from calib_ros_check.outcome import Tolerance
+from calib_ros_check.tolerance import is_off
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 SHARP = np.diag([np.deg2rad(0.05) ** 2] * 3 + [0.01**2] * 3)
@@ -33,7 +25,7 @@ def drive():
 def score_of(drive):
     checker = Checker(drive.camera)
     features = [checker._calibrator.extract(drive[k]) for k in (0, 1, 2, 3)]
-    return lambda numbers, T: checker._alternatives.score([features[k] for k in numbers], T)
+    return lambda numbers, T: checker._judge.score([features[k] for k in numbers], T)
 
 
 def test_the_rarer_an_explanation_the_more_it_has_to_say():

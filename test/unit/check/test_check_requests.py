@@ -15,9 +15,10 @@ from calib_ros import se3
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.online.pacing import Work
+from calib_ros.result import Cause
 from calib_ros_check.node import requests as checks
 from calib_ros_check.node.requests import CheckRequest, request_check
-from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
+from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
 from calib_ros_synthetic.drive import SyntheticDrive
 
 SOON = LIMIT_S

@@ -17,14 +17,11 @@ from calib_ros.config import Config, SearchConfig
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.scanner_pose import ScannerPose
-from calib_ros.registration.features import FeatureExtractor
-from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
-from calib_ros_check.alternatives import FEW_FRAMES, NEAR, CheckInputs, look
-from calib_ros_check.cameras import camera_guesses
-from calib_ros_check.checker import Checker
-from calib_ros_check.evidence import Candidate
-from calib_ros_check.hypotheses import axis_rotations, distinct_poses, hypotheses, says_more_than
-from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
+from calib_ros.registration.judgement.hypotheses import axis_rotations, distinct_poses, mix_ups
+from calib_ros.registration.judgement.judge import FEW_FRAMES, NEAR, Candidate, Question
+from calib_ros.result import REFUSED, Cause, Evidence, RefusalCode, Result
+from calib_ros_check.checker import Checker, CheckInputs, look
+from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 QUICK = Config(search=SearchConfig(rounds=1, starts=64))
@@ -121,7 +118,7 @@ def test_what_edges_find_far_away_needs_no_classes(drive, checker, monkeypatch):
     """A scene with few objects matches less by its classes than by its edges."""
     frames, truth = drive
     # This mount is nearly that of a cloud in the camera's body frame.
-    monkeypatch.setattr(checker._alternatives, "mixed_up", lambda *_: None)
+    monkeypatch.setattr(checker._judge, "explain", lambda *_: None)
     features = [checker._calibrator.extract(frame) for frame in frames]
     asked: list[str] = []
     checked = se3.perturb(truth, [0, 16.0, 6.0], [0, 0, 0])
@@ -236,32 +233,12 @@ def test_a_mix_up_under_which_the_scene_is_symmetric_is_not_named(symmetric, che
     assert result.cause is None, result.reason
 
 
-def test_a_camera_model_that_a_guess_makes_impossible_is_left_out():
-    """The lens of an image four times the size cannot be rectified: its focal length would be negative."""
-    D = np.array([-0.37013, 0.164153, -0.000204, -0.000744, -0.038527])
-    barrel = replace(camera(640, 360, 303.2, 175.3, 333.0), D=D)
-    checker = Checker(barrel)
-    asked: list[str] = []
-
-    def as_taken(camera, numbers):
-        try:
-            FeatureExtractor(camera, checker.config)
-        except BadInputError as error:
-            asked.append(str(error))
-            raise
-        return []
-
-    inputs = CheckInputs(BODY, Tolerance(), as_taken=as_taken)
-    guesses = list(camera_guesses(barrel))
-    assert list(checker._alternatives.cameras(guesses, (BODY,), inputs)) == []
-    assert any("must be positive" in said for said in asked)
-
-
 def test_every_hypothesis_is_another_one_and_none_is_the_extrinsic_itself():
     T = se3.perturb(BODY, [1, 2, 3], [0.1, 0.2, 0.3])
-    made = hypotheses(T, camera(640, 480, 320.0, 240.0), frames={"base_link": se3.perturb(T, [0, 0, 0], [0, 1.7, 0])})
+    made = mix_ups(T, camera(640, 480, 320.0, 240.0), frames={"base_link": se3.perturb(T, [0, 0, 0], [0, 1.7, 0])})
     assert {guess.cause for guess in made} == {
-        *(Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.CLOUD_FRAME, Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
+        *(Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.QUATERNION_ORDER, Cause.CLOUD_FRAME),
+        *(Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE),
     }
     for k, guess in enumerate(made):
         assert guess.mirrored or not np.allclose(guess.T, T)
@@ -278,20 +255,20 @@ def test_the_place_of_the_scanner_is_that_which_most_scans_show():
 
 def test_a_mix_up_that_leads_back_to_the_extrinsic_says_nothing_that_an_error_of_it_does_not():
     T = se3.perturb(BODY, [2, 1, 0], [0.1, -0.2, 0.3])
-    made = hypotheses(T, camera(640, 480, 300.0, 240.0))
+    made = mix_ups(T, camera(640, 480, 300.0, 240.0))
     twice = next(own for own in made if "applied twice; leave one out, and invert" in own.message)
     assert se3.rotation_error_deg(T, twice.T) < 10, "a camera that looks ahead"
     for optimum, says in ((T, False), (se3.perturb(T, [0.3, 0, 0], [0, 0, 0.5]), False), (twice.T, True)):
-        assert says_more_than(Candidate(None, optimum, twice, 12.0), T) is says  # type: ignore[arg-type]
+        assert Candidate(None, optimum, twice).says_more_than(T) is says  # type: ignore[arg-type]
     mirrored = next(own for own in made if own.mirrored)
-    assert says_more_than(Candidate(None, T, mirrored, 12.0), T)  # type: ignore[arg-type]
+    assert Candidate(None, T, mirrored).says_more_than(T)  # type: ignore[arg-type]
 
 
 def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
     """Maps of its own for each of them would take gigabytes."""
     frames, truth = drive
     features = [checker._calibrator.extract(frame) for frame in frames]
-    tried = checker._alternatives.hypotheses(features, CheckInputs(truth, Tolerance()))
+    tried = checker._judge.tried(Question(features, truth), mix_ups(truth, frames[0].camera))
     assert len({own.hypothesis.cause for own in tried}) > 2
     assert len({id(own.score.atlas.levels[-1].image) for own in tried}) == 1
 

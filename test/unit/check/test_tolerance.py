@@ -10,7 +10,8 @@ from scipy.special import stdtr
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
-from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckVerdict, Tolerance
+from calib_ros.result import Cause
+from calib_ros_check.outcome import CauseFinding, CauseState, CheckVerdict, Tolerance
 from calib_ros_check.tolerance import deviation, judge, posterior_samples, reason_of, undecided
 
 TRUTH = se3.from_parts(se3.OPTICAL_FROM_BODY, [0.1, -0.3, -0.2])

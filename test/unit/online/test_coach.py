@@ -26,6 +26,7 @@ from calib_ros.result import (
     REFUSED,
     SUSPECT,
     TENTATIVE,
+    Cause,
     RefusalCode,
     Result,
 )
@@ -142,8 +143,8 @@ def test_a_camera_on_its_side_sees_poles_lie() -> None:
         (advice(BLINDED, covariance(), fault=SensorFault.LIDAR_BLIND), "clean or uncover the LiDAR"),
         (advice(BLINDED, covariance(), fault=SensorFault.IMAGE_FROZEN), "restart the camera"),
         (advice(REFUSED, refusal=RefusalCode.NOT_SIGNIFICANT), "drive where there are poles, buildings or parked cars"),
-        (advice(REFUSED, refusal=RefusalCode.WRONG_INTRINSICS), "calibrate the camera's intrinsics"),
-        (advice(REFUSED, refusal=RefusalCode.WRONG_TIMES), "mend the time stamps"),
+        (advice(REFUSED, refusal=RefusalCode.WRONG_INTRINSICS, cause=Cause.FOCAL_LENGTH), "calibrate the camera's intrinsics"),
+        (advice(REFUSED, refusal=RefusalCode.WRONG_TIMES, cause=Cause.TIME_OFFSET), "mend the time stamps"),
         (advice(REFUSED, covariance()), "keep driving: more keyframes decide"),
     ],
 )

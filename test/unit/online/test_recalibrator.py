@@ -17,7 +17,7 @@ from calib_ros.intrinsics import FOCAL
 from calib_ros.online.monitor import Assessment, Verdict
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.result import BLINDED, CONVERGED, INITIAL, MOVED, REFUSED, SUSPECT, Extrinsic, Result
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, MOVED, REFUSED, SUSPECT, Cause, Extrinsic, Result
 
 FRAMES = 4
 # A small search is enough for these tests.
@@ -131,6 +131,16 @@ def test_estimate_waits_for_min_keyframes_and_the_buffer_keeps_the_newest(drive,
 
 
 # --- what goes wrong ------------------------------------------------------------------------------------------------------
+
+
+def test_where_three_estimates_in_a_row_match_nothing_what_was_mixed_up_is_told(drive, truth, monkeypatch):
+    upside_down = [replace(frame, image=np.ascontiguousarray(frame.image[::-1, ::-1])) for frame in drive]
+    recalibrator, asked = taken_in(upside_down, truth), []
+    explained = recalibrator.calibrator.explained
+    monkeypatch.setattr(recalibrator.calibrator, "explained", lambda *given, **more: asked.append(1) or explained(*given, **more))
+    told = [recalibrator.estimate().result.cause for _ in range(4)]
+    assert (told, len(asked)) == ([None, None, Cause.ROTATED_IMAGE, Cause.ROTATED_IMAGE], 1)
+    assert recalibrator.advice().text == Cause.ROTATED_IMAGE.advice
 
 
 def test_refused_estimate_keeps_last_good_extrinsic(drive, start, truth):

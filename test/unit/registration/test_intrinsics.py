@@ -17,7 +17,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.estimate import refined_with_camera
 from calib_ros.registration.judgement.lens import LensEstimate, lens_unknowns
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros.result import CONVERGED, REFUSED, RefusalCode, Result
+from calib_ros.result import CONVERGED, REFUSED, Cause, RefusalCode, Result
 
 BOX = SearchBox(1.5, 0.15)
 REFINE = update(QUICK, {"camera": {"intrinsics": "refine"}})
@@ -137,9 +137,21 @@ def test_they_are_checked_where_it_is_wanted(scene):
     assert calibrated(scene, camera, None).refusal is RefusalCode.WRONG_INTRINSICS  # without a search, too
 
 
-def test_mirrored_images_are_named(scene):
-    mirrored = [replace(f, image=np.ascontiguousarray(f.image[:, ::-1])) for f in scene.frames]
-    assert Calibrator(scene.camera, QUICK).calibrate(mirrored, scene.truth, BOX).refusal is RefusalCode.MIRRORED_IMAGE
+@pytest.mark.parametrize(
+    ("flip", "wrong_transform", "size", "cause"),
+    [
+        ((1,), np.asarray, 1.0, Cause.MIRRORED_IMAGE),
+        ((0, 1), np.asarray, 1.0, Cause.ROTATED_IMAGE),
+        ((), se3.inverse, 1.0, Cause.INVERSE_TRANSFORM),
+        ((), np.asarray, 1.25, Cause.OTHER_CAMERA),
+    ],
+)
+def test_where_nothing_matches_what_was_mixed_up_is_named(scene, flip, wrong_transform, size, cause):
+    camera = replace(scene.camera, K=scene.camera.K * np.array([[size, 1, size], [1, size, size], [1, 1, 1]]))
+    frames = [replace(f, image=np.ascontiguousarray(np.flip(f.image, flip)), camera=camera) for f in scene.frames]
+    result = Calibrator(camera, QUICK).calibrate(frames, wrong_transform(scene.truth), BOX)
+    assert_not_used(result, result.initial)
+    assert result.cause is cause, result.reason
 
 
 # --- refined --------------------------------------------------------------------------------------------------------------

@@ -113,7 +113,7 @@ def test_what_edges_alone_are_sure_of_is_not_refused_there_for_want_of_evidence(
     answers = iter((sure, after))
     monkeypatch.setattr(calibrator, "estimate", lambda *_: next(answers))
     plain, classified = [object()], [object()]
-    found = calibrator.estimate_in_doubt(plain, lambda: (classified, ["with classes"]), T)
+    found = calibrator.again_in_doubt(calibrator.estimate(plain, T), plain, lambda: (classified, ["with classes"]), T)
     assert found.converged == (stays or refusal is None)
     assert (found.evidence is sure.evidence) == stays
     assert (found.reason == "with classes") == stays

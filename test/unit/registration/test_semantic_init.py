@@ -14,7 +14,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
-from calib_ros.registration.classes import Hypothesis
+from calib_ros.registration.classes import PoseHypothesis
 from calib_ros.registration.initial_guess import allowed, poses
 from calib_ros.registration.motion_guess.registration import best_registration, search_boxes
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
@@ -205,8 +205,8 @@ def test_different_cameras_are_refused(street_views) -> None:
         first_guess([view, replace(view, camera=other)])
 
 
-def hypothesis(x: float, score: float) -> Hypothesis:
-    return Hypothesis(se3.from_parts(np.eye(3), [x, 0, 0]), score, 0.0, "sweep", 0)
+def hypothesis(x: float, score: float) -> PoseHypothesis:
+    return PoseHypothesis(se3.from_parts(np.eye(3), [x, 0, 0]), score, 0.0, "sweep", 0)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from two_halves import TwoHalves
 from calib_ros import se3
 from calib_ros.cli.main import main
 from calib_ros.errors import BadInputError
+from calib_ros.result import Cause
 from calib_ros.rig.description import CAMERA, LIDAR, RigDescription, Sensor, prior_covariance
 from calib_ros.rig.edges import RigMeasurer
 from calib_ros.rig.graph import Edge, RigSolution, solve
@@ -23,7 +24,7 @@ from calib_ros.rig.report import RigReport
 from calib_ros_check.cli import rig_summary
 from calib_ros_check.fleet.history import row_of
 from calib_ros_check.fleet.recordings import Recording
-from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
+from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.rig.check import PairCheck, RigCheck, as_given, as_row, check_rig, judged
 from calib_ros_check.rig.page import write_rig_page
 from calib_ros_check.tolerance import judge, unknown

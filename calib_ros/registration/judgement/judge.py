@@ -1,0 +1,291 @@
+"""Which hypothesis explains frames that do not match as the sensors are given?
+
+All are tried from where the extrinsic is if they hold; the best matches are searched, and have to stand out from chance and from
+the sensors as they are given, at the odds of something so rare.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
+from calib_ros.camera import Camera
+from calib_ros.config import CameraConfig, Config
+from calib_ros.datasets.positions import spread_positions
+from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.intrinsics import FOCAL
+from calib_ros.registration.features import FrameFeatures, at_time_offset
+from calib_ros.registration.judgement.evidence import EVEN, Match, convinces, evidence, log_odds, rare_odds, shows_lens
+from calib_ros.registration.judgement.hypotheses import (
+    AsTaken,
+    Hypothesis,
+    distorts,
+    fisheyes,
+    mix_ups,
+    of_another_size,
+    other_lenses,
+    pictures,
+    rectified_otherwise,
+    resized,
+    turned_over,
+)
+from calib_ros.registration.judgement.lens import LensEstimate, estimate_lens, lens_unknowns
+from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, REACH, TOLERANCE_DEG, refined
+from calib_ros.registration.objective import ObjectiveMaker
+from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.chance import LOWEST_DECOY_Z, null_distribution, p_value
+from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.search.search import search, search_decoy
+from calib_ros.result import Cause
+
+NEAR = SearchBox(5.0, 0.5)  # where mounts slip and hands miss
+CONFIRMED = 3  # of the hypotheses with the best matches, how many are searched
+FEW_FRAMES = 3  # tell which camera may have taken the pictures
+SLACK = 5.0  # of `_distance`: a turned picture moves the centre of a lens by some per cent of its width
+ALIKE = 0.85  # of the best z-score; hypotheses that lead to the same extrinsic differ by the points that they keep in view
+SHOWN_SIGMAS = 2.0  # of what a size lacks to the one that was tried
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate(Match):
+    """A hypothesis at its optimum. decoy_z: z-score of the best optimum of a decoy; None = not searched."""
+
+    hypothesis: Hypothesis
+    decoy_z: float | None = None
+
+    @cached_property
+    def z_score(self) -> float:
+        """Of the match, against extrinsics around it."""
+        return null_distribution(self.score, self.T).z_score
+
+    @property
+    def surprise(self) -> float:
+        """How far its optimum lies from what the hypothesis predicts, see `_distance`."""
+        return _distance(self.T, self.hypothesis.T)
+
+    def says_more_than(self, T: Transform) -> bool:
+        """Whether the optimum is nearer to what was predicted than to the extrinsic T (4, 4) as it was given: else the latter is
+        just off. A picture that is another one has no extrinsic that could be compared."""
+        return not self.hypothesis.of_transform or self.surprise < _distance(self.T, T)
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What is asked about frames. T: T_camera_lidar (4, 4) as it is given. box: about T, in which it is to be searched; None = it
+    is right, or just off. as_taken: None = pictures cannot be rectified anew. frames: T_camera_F (4, 4) of frames F of the
+    vehicle, by name, in which the clouds may be. only_pictures, thorough: fewer hypotheses, and also those that take long."""
+
+    features: Sequence[FrameFeatures]
+    T: Transform
+    box: SearchBox | None = None
+    as_taken: AsTaken | None = None
+    frames: Mapping[str, Matrix] = field(default_factory=dict)
+    only_pictures: bool = False
+    thorough: bool = False
+    progress: Progress = SILENT
+
+    @property
+    def some(self) -> Sequence[int]:
+        """Numbers of a few frames."""
+        return spread_positions(FEW_FRAMES, len(self.features))
+
+    @property
+    def rarer(self) -> float:
+        """Factor of their z-scores to those of all: they grow with the root of the number of points."""
+        return math.sqrt(len(self.features) / len(self.some))
+
+
+class Judge:
+    """Tries what else than the mount may be wrong. objectives: make the scores. camera: as it is stated."""
+
+    def __init__(self, objectives: ObjectiveMaker, config: Config, camera: Camera) -> None:
+        self._objectives, self.config, self.camera = objectives, config, camera
+
+    def score(self, features: Sequence[FrameFeatures], T: Transform, atlas: Atlas | None = None) -> PointScore:
+        """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
+        another score of the same frames."""
+        return self._objectives(features, T, T, atlas=atlas).edges.score
+
+    def as_given(self, features: Sequence[FrameFeatures], T: Transform, optima: Sequence[Matrix]) -> Match | None:
+        """The best match of the sensors as they are given: the optimum near T (4, 4), as of every hypothesis, or one of the
+        optima that were met, beyond chance or not. None if all of them see too few points."""
+        matches: list[Match] = []
+        atlas: Atlas | None = None
+        for start in (T, *optima):
+            with suppress(TooFewFeaturesError):
+                score = self.score(features, start, atlas)
+                atlas = score.atlas
+                matches.append(Match(score, _optimum(score, start) if start is T else start))
+        return max(matches, key=evidence, default=None)
+
+    def explain(self, asked: Question, given: Match | None, deg: float, m: float) -> Candidate | None:
+        """The hypothesis that explains the frames, if one matches beyond chance, and convinces against the extrinsic being off.
+        given: see `as_given`. deg, m: the tolerance, within which an extrinsic is the same."""
+        count = 0
+        for guesses in self._hypotheses(asked):  # until one explains the frames
+            tried = self.tried(asked, guesses)
+            count += len(tried)
+            for best in tried[:CONFIRMED]:
+                if asked.box is None and not self._beyond_chance(best, count):
+                    break
+                for one in dict.fromkeys((simplest(best, tried), best)):
+                    own = self._confirmed(one, asked)
+                    if own is not None and self._stands(
+                        own, given, count, EVEN if is_only_off(own, deg, m) else rare_odds(count)
+                    ):
+                        return own
+        return None
+
+    def tried(self, asked: Question, guesses: Sequence[Hypothesis]) -> list[Candidate]:
+        """The hypotheses that leave enough points in view, and say more than that the extrinsic is off, the best match first."""
+        atlas: Atlas | None = None
+        ranked: list[tuple[float, Candidate]] = []
+        for k, guess in enumerate(guesses):
+            asked.progress(k / len(guesses))
+            with suppress(TooFewFeaturesError, BadInputError):
+                if guess.camera is not None and not any(guess.lens):
+                    own = self._by_few(guess, asked)
+                    ranked += [] if own is None else [(asked.rarer * own.z_score, own)]
+                    continue
+                score = self.score(asked.features, guess.T, atlas)
+                atlas = score.atlas  # one for all: each would take as much memory as the maps of all frames
+                seen = guess.seen_by(score)
+                own = Candidate(seen, _optimum(seen, guess.T), guess)
+                ranked.append((own.z_score, own))
+        return [own for _, own in sorted(ranked, key=lambda one: -one[0]) if own.says_more_than(asked.T)]
+
+    def by_camera(
+        self,
+        guess: Hypothesis,
+        asked: Question,
+        start: Transform | None = None,
+        numbers: Sequence[int] | None = None,
+        offset_s: float = 0.0,
+    ) -> Candidate | None:
+        """A hypothesis whose pictures are rectified anew; None where they cannot be. start: (4, 4), near its optimum. offset_s:
+        of the clocks, as found. numbers: of the frames, None = all. Raises BadInputError where no picture can be rectified so,
+        TooFewFeaturesError."""
+        if asked.as_taken is None or guess.camera is None:
+            return None
+        features = asked.as_taken(guess.camera, numbers)
+        if offset_s:
+            features = [at_time_offset(f, offset_s) for f in features]
+        start = guess.T if start is None else start
+        score = self.score(features, start)
+        return Candidate(score, _optimum(score, start), guess)
+
+    def _by_few(self, guess: Hypothesis, asked: Question) -> Candidate | None:
+        """The same by a few frames, searched where the extrinsic is not known: rectifying takes longer than a search."""
+        own = self.by_camera(guess, asked, numbers=asked.some)
+        return own if own is None or asked.box is None else self._searched(own, asked)
+
+    def lens(
+        self, score: PointScore, T: Transform, inflated: float = 1.0, turned: Transform | None = None
+    ) -> LensEstimate | None:
+        """What the scenes tell of the lens at an optimum T (4, 4); to a check no lens is exact. turned: see `estimate_lens`."""
+        known = self.config.camera if self.config.camera.focal_sigma else CameraConfig()
+        unknowns = lens_unknowns(known, self.camera, score.camera) if shows_lens(score) else ()
+        return estimate_lens(score, T, unlimited(T), unknowns, inflated, turned=turned)
+
+    def _hypotheses(self, asked: Question) -> Iterator[list[Hypothesis]]:
+        """What is tried, one group after the other: what was mixed up, and then another camera's pictures."""
+        T, working, distorted = asked.T, asked.features[0].camera, distorts(self.camera)
+        if asked.only_pictures:
+            yield list(pictures(T, working))
+            return
+        made = mix_ups(T, working, [f.points.pose for f in asked.features], asked.frames)
+        made += [turned_over(T, self.camera)] if distorted else []  # rectified upside down, a picture is bent
+        sizes = [] if working.is_sphere else list(resized(T, self.camera, working, asked.thorough))
+        made += [*rectified_otherwise(T, self.camera)] + ([] if asked.thorough and distorted else sizes)
+        yield made
+        if asked.thorough:
+            yield [*(sizes if distorted else ()), *other_lenses(T, self.camera), *fisheyes(T, self.camera)]
+
+    def _stands(self, one: Candidate, given: Match | None, tried: int, odds: float) -> bool:
+        """Does one of so many that were tried match beyond chance, and convince against the sensors as they are given, at these
+        odds in advance?"""
+        return self._beyond_chance(one, tried) and convinces(log_odds(one, given), odds)
+
+    def _confirmed(self, one: Candidate, asked: Question) -> Candidate | None:
+        """The same by all frames, at the best optimum that one round of a search near it finds, its lens refined; None where its
+        pictures cannot be had, or do not match."""
+        guess = one.hypothesis
+        if guess.camera is None:
+            one = self._searched(one, asked)
+        else:
+            with suppress(TooFewFeaturesError, BadInputError):
+                few = self._by_few(guess, asked) if any(guess.lens) else one
+                if few is None or p_value(asked.rarer * few.z_score, LOWEST_DECOY_Z) > self.config.refine.max_p_value:
+                    return None
+                anew = self.by_camera(guess, asked, few.T)
+                if anew is None:
+                    return None
+                one = anew
+        return self._with_lens(one) if guess.of_lens and shows_lens(one.score) else one
+
+    def _searched(self, one: Candidate, asked: Question) -> Candidate:
+        """The same at the best optimum that one round of a search near it finds: the sensors as given are searched as well."""
+        start = one.T if asked.box is None else one.hypothesis.T
+        box = replace(asked.box or NEAR, rounds=1)
+        found = search(one.score, start, box, self.config.search, unlimited(start), self.config.refine.max_p_value)
+        return replace(max(one, replace(one, T=found.T), key=evidence), decoy_z=found.decoy_z)
+
+    def _with_lens(self, one: Candidate) -> Candidate:
+        """A hypothesis about the lens, with what is left of it refined."""
+        score, camera = one.score, one.score.camera
+        lens = estimate_lens(score, one.T, unlimited(one.T), lens_unknowns(CameraConfig(), camera, camera))
+        if lens is None:
+            return one
+        seen, T = lens.seen(score)
+        other = replace(one, score=seen, T=refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0])
+        left = next((k for k, own in enumerate(lens.unknowns) if own.name == FOCAL), None)
+        share, hypothesis = one.hypothesis.lens[0], one.hypothesis
+        if share and left is not None and abs(lens.change[left]) > SHOWN_SIGMAS * lens.sigma[left]:
+            scale = (1 + share) * (1 + float(lens.change[left]))
+            if hypothesis.cause is Cause.OTHER_CAMERA:
+                hypothesis = replace(hypothesis, message=of_another_size(scale))
+        return max(one, replace(other, hypothesis=hypothesis), key=evidence)
+
+    def _beyond_chance(self, best: Candidate, tried: int) -> bool:
+        """Does the best match of so many that were tried exceed what a decoy reaches?"""
+        largest, decoy = self.config.refine.max_p_value, best.decoy_z
+        if p_value(best.z_score, None, tried) <= largest:
+            return True
+        if decoy is None and p_value(best.z_score, LOWEST_DECOY_Z, tried) <= largest:
+            decoy = search_decoy(best.score, best.T, NEAR, self.config.search, unlimited(best.T))
+        return decoy is not None and p_value(best.z_score, decoy, tried) <= largest
+
+
+def is_only_off(one: Candidate, deg: float, m: float) -> bool:
+    """Whether an optimum near what holds on most vehicles says no more than that the extrinsic is off."""
+    off = se3.error(one.hypothesis.T, one.T)
+    return one.hypothesis.usual and not (off[0] <= deg and off[1] <= m)
+
+
+def simplest(best: Candidate, tried: Sequence[Candidate]) -> Candidate:
+    """Of all hypotheses that match about as well as the best one, that which predicts its optimum best; else the simplest."""
+    alike = [own for own in tried if own.z_score >= ALIKE * best.z_score]
+    nearest = min(own.surprise for own in alike)
+    near = [own for own in alike if own.surprise <= nearest + SLACK]
+    return min(near, key=lambda own: list(Cause).index(own.hypothesis.cause))
+
+
+def _optimum(score: PointScore, start: Transform) -> Matrix:
+    """Of a score near a start (4, 4)."""
+    part = score.subset(POINTS, np.random.default_rng(0))
+    return refined(part, start, Limits(start, REACH), LEVELS, TOLERANCE_DEG)[0]
+
+
+def _distance(a: Matrix, b: Matrix) -> float:
+    """Between two extrinsics (4, 4), in units of half a degree and 10 cm."""
+    xi = se3.log(a @ se3.inverse(b))
+    return float(np.rad2deg(np.linalg.norm(xi[:3])) / 0.5 + np.linalg.norm(xi[3:]) / 0.1)
