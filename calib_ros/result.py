@@ -138,7 +138,9 @@ class Result:
         ``initial``, or one of the online recalibrator's: ``tentative``, ``suspect``, ``moved``, ``blinded``.
     reason : for people, one line: why it is refused, and what else there is to know.
     score : value of the objective at the optimum, also of a refused one. initial_score : at the start.
-    covariance : (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m.
+    covariance : (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m, for who projects with the camera as it is
+        stated: a principal point that is off looks like a rotation, and together with it projects alike.
+        covariance_with_intrinsics : the same for who does not, as a rig of several cameras.
     frames_used : number of frames of the estimate without the outlier frames.
     camera_frame, lidar_frame : names of the camera's optical frame and of the LiDAR's.
     elapsed_s : wall-clock time of the estimate. stamp : ISO 8601, UTC.
@@ -158,8 +160,7 @@ class Result:
     refined_camera : the intrinsics corrected together with the extrinsic, where camera.intrinsics is refine.
         `Calibrator.calibrate` states the extrinsic for it, `Calibrator.estimate` that for the camera that was given.
     origin* : where an initial extrinsic comes from.
-    shared_covariance* : (6, 6), part of `covariance` that estimates of the same sensors have in common: what the intrinsics and
-        the clocks leave open.
+    shared_covariance* : (6, 6), part of both that estimates of the same sensors have in common: what the clocks leave open.
     clock_direction* : (6,), left twist of the extrinsic per second that the points are measured later, rad/s and m/s.
     clock_sigma_s* : standard deviation, s, of an offset of the clocks that may be as large as motion.max_time_offset_s, as far as
         the scenes tell.
@@ -195,6 +196,7 @@ class Result:
     evidence: Evidence | None = None
     intrinsics: Mapping[str, IntrinsicEstimate] = field(default_factory=dict)
     origin: InitialSource | None = None
+    covariance_with_intrinsics: Covariance | None = None
     shared_covariance: Covariance | None = None
     clock_direction: Matrix | None = None
     clock_sigma_s: float | None = None
@@ -219,6 +221,7 @@ class Result:
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,
             "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "covariance_with_intrinsics": None if (whole := self.covariance_with_intrinsics) is None else whole.tolist(),
             "time_offset_s": self.time_offset_s,
             "time_offset_sigma_s": self.time_offset_sigma_s,
             "stamping": None if self.stamping is None else asdict(self.stamping),
@@ -279,7 +282,8 @@ def parse(text: str, what: str) -> Result:
     else:
         raise BadInputError(f"{what} needs T_camera_lidar (4x4), or translation_m and quaternion_xyzw")
     try:
-        covariance = None if data.get("covariance") is None else np.array(data["covariance"], float)
+        known = (data.get(name) for name in ("covariance", "covariance_with_intrinsics"))
+        covariance, whole = (None if C is None else np.array(C, float) for C in known)
         score = math.nan if data.get("score") is None else float(data["score"])
         offset, offset_sigma = (
             None if data.get(name) is None else float(data[name]) for name in ("time_offset_s", "time_offset_sigma_s")
@@ -291,7 +295,7 @@ def parse(text: str, what: str) -> Result:
         raise BadInputError(f"{what}: covariance, score, frames_used, elapsed_s and time_offset_s must be numbers") from None
     if not 0 <= frames < 2**32:  # what a message can hold
         raise BadInputError(f"{what}: frames_used = {frames} is no number of frames")
-    if covariance is not None and (covariance.shape != (6, 6) or not np.isfinite(covariance).all()):
+    if any(C is not None and (C.shape != (6, 6) or not np.isfinite(C).all()) for C in (covariance, whole)):
         raise BadInputError(f"{what}: covariance must be a finite 6x6 matrix or null")
     return Result(
         T,
@@ -304,6 +308,7 @@ def parse(text: str, what: str) -> Result:
         _text(data, "lidar_frame", what) or "lidar",
         elapsed,
         stamp=_text(data, "stamp", what),
+        covariance_with_intrinsics=whole,
         time_offset_s=offset,
         time_offset_sigma_s=offset_sigma,
         stamping=_stamping(data, what),

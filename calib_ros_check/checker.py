@@ -30,15 +30,7 @@ from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.covariance import covariance
 from calib_ros.registration.features import FrameFeatures, ScanEdges, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
-from calib_ros.registration.judgement.evidence import (
-    Match,
-    convinces,
-    freedom,
-    log_odds,
-    rare_odds,
-    shows_lens,
-    shows_noise,
-)
+from calib_ros.registration.judgement.evidence import Match, convinces, freedom, log_odds, rare_odds, shows_lens, shows_noise
 from calib_ros.registration.judgement.hypotheses import AsTaken, fisheyes
 from calib_ros.registration.judgement.judge import NEAR, Candidate, Question, is_only_off
 from calib_ros.registration.judgement.lens import LensEstimate, LensFault
@@ -94,14 +86,16 @@ class CheckInputs:
 
 @dataclass(frozen=True, eq=False)
 class Explanation(Match):
-    """What the scenes show. covariance: (6, 6) of a left twist; shared: the part of it that intrinsics and clocks leave open.
-    T_corrected: the extrinsic that was checked, with what was mixed up put right. result: of the estimate."""
+    """What the scenes show. covariance: (6, 6) of a left twist, with the camera as it is; shared: the part of it that other
+    scenes have in common; with_intrinsics: the whole. T_corrected: the extrinsic that was checked, with what was mixed up put
+    right. result: of the estimate."""
 
     covariance: Covariance
     T_corrected: Transform
     result: Result
     causes: tuple[CauseFinding, ...] = ()
     shared: Covariance | None = None
+    with_intrinsics: Covariance | None = None
 
 
 class Checker:
@@ -211,19 +205,18 @@ class Checker:
         if clocks.state is CauseState.FOUND:
             better = self._lens_instead(as_stamped, features, result, inputs)
             if better is not None:
-                features, result = as_stamped, better
-                clocks = NOT_THE_CLOCKS
+                features, result, clocks = as_stamped, better, NOT_THE_CLOCKS
         found, C = result.T_camera_lidar, result.covariance
         score = self._judge.score(features, found)
         turned = None if se3.rotation_error_deg(inputs.T, found) <= inputs.tolerance.deg else inputs.T
         lens, fault = self._lens(score, found, result, inputs, turned)
-        shared = result.shared_covariance
+        shared, whole = result.shared_covariance, result.covariance_with_intrinsics
         causes = lens_findings(lens, fault, NOT_JUDGED, self.camera, inputs.tolerance)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
         other = None if fault is not None else self._another_fisheye(score, found, inputs, offset)
         if other is not None:
-            found, score, C, shared = other.T, other.score, None, None
+            found, score, C, shared, whole = other.T, other.score, None, None, None
             causes = explained(other.hypothesis, self.camera)
             if clocks.state is CauseState.FOUND:
                 clocks = NOT_THE_CLOCKS
@@ -232,7 +225,7 @@ class Checker:
             if fault is not None or inputs.tolerance.covers(inputs.T, T):  # a usual lens explains it
                 score, found = seen, refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0]
                 shared = lens.left_open
-                C = covariance_of(score, found) + shared
+                C = whole = covariance_of(score, found) + shared
             elif clocks.state is not CauseState.FOUND:
                 own = self._possible_centre(lens, inputs)
                 causes = tuple(own if own is not None and own.cause is finding.cause else finding for finding in causes)
@@ -241,7 +234,7 @@ class Checker:
         why = AS_GIVEN if inputs.tolerance.covers(inputs.T, found) else OFF
         if any(own.state is CauseState.FOUND for own in causes):
             why = OTHER_FITS
-        return Explanation(score, found, C, inputs.T, result, (*causes, *not_mixed_up(why)), shared)
+        return Explanation(score, found, C, inputs.T, result, (*causes, *not_mixed_up(why)), shared, whole)
 
     def _lens(
         self, score: PointScore, T: Matrix, result: Result, inputs: CheckInputs, turned: Matrix | None = None
@@ -255,9 +248,9 @@ class Checker:
     def _another_fisheye(self, score: PointScore, found: Matrix, inputs: CheckInputs, offset_s: float) -> Candidate | None:
         """A fisheye with another focal length, or one that is said to be rectified, if it explains the frames better than the
         camera as it is given does at the optimum (4, 4) of a score."""
-        off = not inputs.tolerance.covers(inputs.T, found)
-        guesses = [*fisheyes(found, self.camera)] if shows_noise(score) and (off or score.camera.is_sphere) else []
-        asked, others = Question((), inputs.T, as_taken=inputs.as_taken), list[Candidate]()
+        asks = shows_noise(score) and (score.camera.is_sphere or not inputs.tolerance.covers(inputs.T, found))
+        guesses, others = [*fisheyes(found, self.camera)] if asks else [], list[Candidate]()
+        asked = Question((), inputs.T, as_taken=inputs.as_taken)
         for guess, T in product(guesses, (found, inputs.T)):
             with suppress(TooFewFeaturesError, BadInputError):
                 own = self._judge.by_camera(guess, asked, T, offset_s=offset_s)
@@ -292,6 +285,7 @@ class Checker:
             again = self._calibrator.estimate(features, result.optimum, None, inputs.progress)
             optimum = again.T_camera_lidar if again.converged else result.optimum
             result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
+            result = replace(result, covariance_with_intrinsics=again.covariance_with_intrinsics)
         return features, result, finding
 
     def _lens_instead(
@@ -316,6 +310,9 @@ class Checker:
         """The verdict about what was found."""
         tolerance = inputs.tolerance
         judgement = judge(found.T_corrected, found.T, found.covariance, tolerance, freedom(found.score), found.shared)
+        whole = found.covariance if found.with_intrinsics is None else found.with_intrinsics
+        if judgement.verdict is CheckVerdict.FAIL:  # what another lens may be to blame for is not the mount's
+            judgement = judge(found.T_corrected, found.T, whole, tolerance, freedom(found.score), found.shared)
         told = found.covariance if found.shared is None else found.covariance - found.shared  # by the scenes themselves
         if judgement.verdict is CheckVerdict.FAIL and not is_off(found, told, found.T_corrected, tolerance):
             judgement = undecided(judgement)
@@ -328,6 +325,7 @@ class Checker:
             T_checked=inputs.T,
             T_estimated=found.T,
             covariance=found.covariance,
+            covariance_with_intrinsics=whole,
             shared_covariance=found.shared,
             causes=complete(found.causes, self.camera),
             time_offset_s=result.time_offset_s,

@@ -88,10 +88,11 @@ class CheckResult:
     verdict: in all; fail where the extrinsic is off by more, or another cause was found. reason: one line for people, what was
     found, and what to do. T_checked, T_estimated: T_camera_lidar (4, 4) that was checked, and that the scenes show with any other
     cause mended; None where they show none. covariance: (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz) of the latter, rad
-    and m. shared_covariance: the part of it that intrinsics and clocks leave open, which other recordings of the same sensors
-    have in common. p_within: probability that the extrinsic is within the tolerance; NaN where nothing is known. rotation,
-    translation: in all, deg and m. axes: rx, ry, rz (deg) and tx, ty, tz (m), the rotation vector of R_checked R_true^T and
-    t_checked - t_true, in the camera's axes (x right, y down, z forward). causes: all other causes that were considered.
+    and m, with the camera as it is stated; covariance_with_intrinsics: with what these leave open. shared_covariance: the part
+    of both that other recordings of the same sensors have in common, as what the clocks leave open. p_within: probability that
+    the extrinsic is within the tolerance; NaN where nothing is known. rotation, translation: in all, deg and m. axes: rx, ry, rz
+    (deg) and tx, ty, tz (m), the rotation vector of R_checked R_true^T and t_checked - t_true, in the camera's axes (x right, y
+    down, z forward). causes: all other causes that were considered.
     time_offset_s, time_offset_sigma_s: of the clocks, as motion.time_offset_s; None where the frames do not show it. z_score,
     p_value: of the match that the estimate rests on, see `Evidence`; NaN without one. frames_used: that the estimate rests on, of
     frame_names. notes: what else there is to know, for people. elapsed_s, cpu_s: time of the check. data_stamp: of the newest
@@ -109,6 +110,7 @@ class CheckResult:
     translation: Deviation
     axes: tuple[Deviation, ...]
     causes: tuple[CauseFinding, ...] = ()
+    covariance_with_intrinsics: Covariance | None = None
     shared_covariance: Covariance | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None

@@ -40,15 +40,11 @@ class Stage:
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            object.__setattr__(self, f.name, checked(f"{stage_name(type(self))}.{f.name}", getattr(self, f.name), f))
+            name = f"{type(self).__name__.removesuffix('Config').lower()}.{f.name}"  # image.FIELD of ImageConfig
+            object.__setattr__(self, f.name, checked(name, getattr(self, f.name), f))
 
     def check_with(self, config: Any) -> None:
         """ConfigError for values that are in range, but contradict each other, or those of other stages of a Config."""
-
-
-def stage_name(stage: type) -> str:
-    """ImageConfig -> image."""
-    return stage.__name__.removesuffix("Config").lower()
 
 
 def checked(name: str, value: Any, f: dataclasses.Field[Any]) -> Any:

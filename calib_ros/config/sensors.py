@@ -67,8 +67,8 @@ class CameraConfig(Stage):
     # Calibrations of one camera on different days, as KITTI's, differ by 0.4 %.
     focal_sigma: float = option(
         0.005,
-        "standard deviation of the focal length, as a share of it, which enters the covariance; that of the principal point, as "
-        "a share of the image width, is 0.4 of it; 0 = exact",
+        "standard deviation of the focal length, as a share of it; that of the principal point, as a share of the image width, "
+        "is 0.4 of it; 0 = exact: the lens is not judged",
         low=0.0,
         high=0.1,
     )

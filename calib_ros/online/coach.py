@@ -97,7 +97,7 @@ def need(result: Result, config: Config) -> Need | None:
         deg, m = largest_sigmas(config.refine.tolerance_deg, config.refine.tolerance_m)
         covariance = result.optimum_covariance
     elif covariance is not None and result.shared_covariance is not None:
-        covariance = covariance - result.shared_covariance  # no scenes lower what intrinsics and clocks leave open
+        covariance = covariance - result.shared_covariance  # no scenes lower what the clocks leave open
     if covariance is None:
         return None
     # Units of what is wanted, so that rotations and shifts compare.

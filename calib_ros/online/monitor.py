@@ -293,7 +293,7 @@ def measure_shift(
     z_score = float(np.nanmedian(null.z_scores)) if np.isfinite(null.z_scores).any() else 0.0
     reached = score.at(-1).value(X)
     points = effective_points(score) / max(len(np.unique(score.frame)), 1)
-    significant = null.z_score_of(reached) > HIGHEST_DECOY_Z
+    significant = (reached - null.mean) / null.spread > HIGHEST_DECOY_Z
     evidence = shift_evidence(shift, together, freedom)
     of_all = (evidence, squared, axes, freedom)
     return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes), *of_all)
@@ -343,7 +343,8 @@ def clocks_that_explain(calibrator: Calibrator, keyframes: Sequence[FrameFeature
         score = calibrator.objectives.of_edges(keyframes, T).score
     except TooFewFeaturesError:
         return ""
-    scores = ClockOffset(0.0, twists).scores_at(score, T, TIME_OFFSETS_S)
+    offset = ClockOffset(0.0, twists)
+    scores = [offset.changed(score, T, float(seconds))[0].at(-1).value(T) for seconds in TIME_OFFSETS_S]
     best = int(np.argmax(scores))
     seconds = float(TIME_OFFSETS_S[best])
     if abs(seconds) < MIN_TIME_OFFSET_S or scores[best] < EXPLAINED_SHARE * reached:

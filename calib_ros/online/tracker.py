@@ -347,6 +347,9 @@ class Tracker:
         weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)  # more scenes would help there
         if estimate.shared_covariance is not None:
             covariance = covariance + estimate.shared_covariance
+        whole = estimate.covariance_with_intrinsics
+        if whole is not None and estimate.covariance is not None:
+            whole = covariance + whole - estimate.covariance
         hidden = f"the scenes do not show {', '.join(map(str, weak))} well; drive on" if weak else ""
         reason = "; ".join(filter(None, [hidden, estimate.reason]))
         known = self._offset.sigma_s
@@ -357,6 +360,7 @@ class Tracker:
             stamping=estimate.stamping or self._result.stamping,
             T_camera_lidar=self.filter.T,
             covariance=None if estimate.covariance is None else covariance,
+            covariance_with_intrinsics=whole,
             status=INSUFFICIENT if weak else CONVERGED,
             reason=reason,
         )

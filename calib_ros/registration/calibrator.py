@@ -250,12 +250,12 @@ class Calibrator:
             )
             lens = self._lens(objective, alignment.T, inflated)
             found = Estimate(initial, start, optimised, alignment, evidence, *pose, lens)
-            shared, clocks = found.nuisance(self.config, lens if self._given is None else None)
+            nuisance = found.nuisance(self.config, lens if self._given is None else None)
             # Accept, or say why not.
             refusal = acceptance.refusal(found, watch)
             if refusal is not None and refusal.code in SUSPECT_INTRINSICS and self.extract.source_camera.said_rectified:
                 notes = [MAYBE_RAW, *notes]
-            result = found.result(shared, clocks, refusal, self.config.motion, notes)
+            result = found.result(nuisance, refusal, self.config.motion, notes)
             if self.config.camera.intrinsics == REFINE and lens is not None:
                 result = replace(
                     result, refined_camera=lens.refined_camera(self.extract.source_camera, found.T, found.covariance)

@@ -61,35 +61,39 @@ class Estimate:
         """Of the features that the optimum is one of."""
         return self.optimised.objective
 
-    def nuisance(self, config: Config, lens: LensEstimate | None) -> tuple[Covariance, Effect | None]:
-        """What this lens and the clocks leave open of the optimum, however many such scenes there are: covariance (6, 6),
-        and the effect of an offset as large as motion.max_time_offset_s; None where the motion is not known."""
+    def nuisance(self, config: Config, lens: LensEstimate | None) -> tuple[Covariance, Covariance, Effect | None]:
+        """What the clocks and this lens leave open of the optimum, however many such scenes there are: covariances (6, 6) of
+        both, and the effect of an offset as large as motion.max_time_offset_s; None where the motion is not known."""
         T, covariance, constraints = self.T, self.covariance, self.objective.constraints
         score = self.objective.smooth_score(T)
         sigma_s, clocks = self.optimised.clocks(config.motion)
         active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
-        shared = np.zeros((6, 6))
+        nothing, by_lens = np.zeros((6, 6)), np.zeros((6, 6))
         if not limits.open_axes.any():
-            return shared, None
+            return nothing, by_lens, None
         if lens is not None:
             kept = [axis for direction in self.unobservable for axis in direction.axes]
-            shared += lens.added_covariance(constraints, covariance, kept)
+            by_lens = lens.added_covariance(constraints, covariance, kept)
         moving = with_known_motion(self.optimised.features, score)
         if moving is None:
-            return shared, None
+            return nothing, by_lens, None
         known, offset = clocks is not None, ClockOffset(sigma_s, moving[1])
         if clocks is None or active.any():  # else it is that of the same optimum
             clocks = offset.effect(moving[0], T, limits)
         effect = replace(clocks, information=0.0) if known else clocks  # these scenes count only once
-        shared += effect.constrained(constraints, covariance, sigma_s).covariance(sigma_s)
-        return shared, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s)
+        by_clocks = effect.constrained(constraints, covariance, sigma_s).covariance(sigma_s)
+        return by_clocks, by_lens, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s)
 
     def result(
-        self, shared: Covariance, clocks: Effect | None, refusal: Refusal | None, motion: MotionConfig, notes: Sequence[str]
+        self,
+        nuisance: tuple[Covariance, Covariance, Effect | None],
+        refusal: Refusal | None,
+        motion: MotionConfig,
+        notes: Sequence[str],
     ) -> Result:
-        """The Result, with the extrinsic that it started from where it is refused. shared, clocks: see nuisance. notes: for its
-        reason."""
+        """The Result, with the extrinsic that it started from where it is refused. nuisance: see there. notes: for its reason."""
+        shared, by_lens, clocks = nuisance
         objective, features, search = self.objective, self.optimised.features, self.optimised.search
         names = [f.name or str(k) for k, f in enumerate(features)]
         outliers = [names[k] for k in self.alignment.outliers]
@@ -126,6 +130,7 @@ class Estimate:
             starts=None if search is None else (search.agreed, search.optimised),
             intrinsics={} if self.lens is None else self.lens.in_files(),
             covariance=None if refusal else self.covariance + shared,
+            covariance_with_intrinsics=None if refusal else self.covariance + shared + by_lens,
             shared_covariance=None if refusal else shared,
             clock_direction=None if refusal or clocks is None else clocks.direction,
             clock_sigma_s=None if refusal or clocks is None else clocks.sigma(motion.max_time_offset_s),
@@ -206,7 +211,7 @@ def refined_with_camera(first: Result, given: Camera, whole: Callable[[Camera], 
     first: by the given camera. whole: the estimate by another camera, from the same start.
     """
     left = found = first.refined_camera
-    result, own, clocks = first, np.zeros((6, 6)), np.zeros((6, 6))
+    result, clocks = first, np.zeros((6, 6))
     if left is None or found is None:  # too little is seen to estimate anything
         return first
     for _ in range(CAMERA_ROUNDS):
@@ -214,7 +219,7 @@ def refined_with_camera(first: Result, given: Camera, whole: Callable[[Camera], 
         if result.refined_camera is None or result.covariance is None or not result.converged:
             return replace(result, refined_camera=None)
         clocks = np.zeros((6, 6)) if result.shared_covariance is None else result.shared_covariance
-        found, left, own = left, result.refined_camera, result.covariance - clocks
+        found, left = left, result.refined_camera
         if left.settled:
             break
     changes = {name: replace(change, value=change_between(given, found.camera, name)) for name, change in left.changes.items()}
@@ -222,11 +227,5 @@ def refined_with_camera(first: Result, given: Camera, whole: Callable[[Camera], 
     off = np.array([change.value for change in left.changes.values()])
     both = np.r_[left.directions @ off, off]
     joint = RefinedCamera(found.camera, result.T_camera_lidar, changes, left.covariance + np.outer(both, both))
-    extrinsic = joint.covariance[:6, :6]
-    return replace(
-        result,
-        covariance=extrinsic + clocks,
-        shared_covariance=clocks + extrinsic - own,
-        intrinsics=changes,
-        refined_camera=joint,
-    )
+    whole_covariance = joint.covariance[:6, :6] + clocks
+    return replace(result, covariance_with_intrinsics=whole_covariance, intrinsics=changes, refined_camera=joint)

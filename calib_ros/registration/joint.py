@@ -16,7 +16,7 @@ from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import ESTIMATE
 from calib_ros.registration.features import FrameFeatures, at_time_offset, other_objective
 from calib_ros.registration.nuisance.parameters import MIN_FRAMES, Effect
-from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, restamped, stamped_by_azimuth
+from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, restamped
 from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset, with_known_motion
 from calib_ros.registration.objective import Objective
 from calib_ros.registration.progress import Progress
@@ -50,8 +50,10 @@ class Optimised:
         """Standard deviation, s, of the clocks' offset; and its effect, if it is known."""
         if self.offset is None:
             return motion.time_offset_sigma_s, None
-        sigma = self.offset.sigma_s if self.offset.exists(motion) else self.offset.sigma_if_none(motion.time_offset_sigma_s)
-        return sigma, self.offset.effect
+        sigma, effect, prior_s = self.offset.sigma_s, self.offset.effect, motion.time_offset_sigma_s
+        if not self.offset.exists(motion):  # it is taken to be 0, and known to that
+            sigma = float(np.hypot(effect.sigma(prior_s), np.sqrt(self.offset.probability) * self.offset.seconds))
+        return sigma, effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +114,9 @@ class JointSearch:
             return Optimised(features, objective, T, search)
         limits, prior = objective.constraints.limits, objective.constraints.prior
         offset = estimate_time_offset(moving[0], T, limits, prior, moving[1], motion, search is not None)
-        stamping = None
-        if offset is not None and search is not None and stamped_by_azimuth(features, motion):
+        stamping, by_azimuth = None, any(f.twist is not None and f.timed_by_azimuth for f in features)
+        untold = by_azimuth and motion.stamping == "auto" and all(f.own is None for f in features)
+        if offset is not None and search is not None and untold:
             for other in CONVENTIONS:
                 if at_stamping(motion, other) == motion:
                     continue

@@ -157,11 +157,11 @@ class RigMeasurer:
         except CalibrationError as error:
             return Measurement(camera, lidar, "registration", None, str(error))
         result = replace(result, camera_frame=source.camera_frame, lidar_frame=source.lidar_frame)
-        if not result.converged or result.covariance is None:
+        if not result.converged or result.covariance_with_intrinsics is None:
             return Measurement(camera, lidar, "registration", None, result.reason or result.status, result)
         twists = [frame.twist for frame in frames if frame.twist is not None]
         edge = Edge(
-            camera, lidar, result.T_camera_lidar, result.covariance, "registration", result.time_offset_s,
+            camera, lidar, result.T_camera_lidar, result.covariance_with_intrinsics, "registration", result.time_offset_s,
             result.time_offset_sigma_s, np.asarray(np.mean(twists, axis=0)) if twists else None, result.frames_used,
         )  # fmt: skip
         return Measurement(camera, lidar, "registration", edge, result.reason, result)

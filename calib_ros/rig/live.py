@@ -54,10 +54,11 @@ class PairState:
         if extrinsic is None or self.status in (INITIAL, MOVED) or not (extrinsic.accepted or extrinsic.usable):
             return None
         r = extrinsic.result
-        if r.covariance is None:
+        C = r.covariance if r.covariance_with_intrinsics is None else r.covariance_with_intrinsics
+        if C is None:
             return None
         offset = (r.time_offset_s, r.time_offset_sigma_s)
-        return Edge(*self.pair, r.T_camera_lidar, r.covariance, self.kind, *offset, samples=r.frames_used)
+        return Edge(*self.pair, r.T_camera_lidar, C, self.kind, *offset, samples=r.frames_used)
 
     def says_as(self, other: PairState) -> bool:
         """Whether nothing has changed from another state of the pair."""

@@ -35,6 +35,7 @@ def result_from_message(msg: Any) -> Result:
         int(msg.frames_used),
         msg.transform.header.frame_id,
         msg.transform.child_frame_id,
+        covariance_with_intrinsics=covariance_from_ros(msg.covariance_with_intrinsics),
         cause=next((cause for cause in Cause if cause.value == msg.cause), None),
         time_offset_s=msg.time_offset if known else None,
         time_offset_sigma_s=msg.time_offset_sigma if known else None,

@@ -145,6 +145,7 @@ def extrinsic_message(
     msg = ExtrinsicMsg()
     msg.transform = transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp)
     msg.covariance = covariance_for_ros(result.covariance)
+    msg.covariance_with_intrinsics = covariance_for_ros(result.covariance_with_intrinsics)
     msg.score = float(result.score)
     msg.status, msg.reason = result.status, "; ".join(filter(None, [validity.reason, result.reason]))
     msg.cause = "" if result.cause is None else result.cause.value

@@ -231,9 +231,9 @@ def _check_pair(measurer: RigMeasurer, camera: str, lidar: str, known: RigSoluti
         return PairCheck(camera, lidar, kind, unknown(), str(error))
     judgement = Judgement(*(getattr(found, name) for name in ("verdict", "p_within", "rotation", "translation", "axes")))
     frame, edge = frames[len(frames) // 2], None
-    if found.T_estimated is not None and found.covariance is not None:
+    if found.T_estimated is not None and found.covariance_with_intrinsics is not None:
         offset = found.time_offset_s, found.time_offset_sigma_s
-        edge = Edge(camera, lidar, found.T_estimated, found.covariance, kind, *offset, samples=found.frames_used)
+        edge = Edge(camera, lidar, found.T_estimated, found.covariance_with_intrinsics, kind, *offset, samples=found.frames_used)
     return PairCheck(camera, lidar, kind, judgement, found.reason, edge, found, frame)
 
 

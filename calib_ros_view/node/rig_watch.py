@@ -224,6 +224,6 @@ class RigWatch:
             if (*pair, KIND) in ((own.target, own.source, own.kind) for own in edges):
                 fate, level = wrong, how
         edge = EdgeShown(*pair, KIND, fate, level, result.reason)
-        if result.covariance is None or result.status in (INITIAL, MOVED):
+        if result.covariance_with_intrinsics is None or result.status in (INITIAL, MOVED):
             return edge
-        return compared(edge, result.T_camera_lidar, result.covariance, rig.poses)
+        return compared(edge, result.T_camera_lidar, result.covariance_with_intrinsics, rig.poses)

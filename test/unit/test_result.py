@@ -99,9 +99,9 @@ def test_the_format_is_the_documented_one():
     data = json.loads(RESULT.dumps())
     assert list(data) == [
         *("T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance"),
-        *("time_offset_s", "time_offset_sigma_s", "stamping", "score", "status", "reason", "refusal", "cause", "refusal_figures"),
-        *("optimum", "evidence", "intrinsics", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp"),
-        "version",
+        *("covariance_with_intrinsics", "time_offset_s", "time_offset_sigma_s", "stamping", "score", "status", "reason"),
+        *("refusal", "cause", "refusal_figures", "optimum", "evidence", "intrinsics", "frames_used", "frames", "starts"),
+        *("elapsed_s", "reference_error", "stamp", "version"),
     ]
     assert np.array_equal(data["T_camera_lidar"], T)
     assert data["translation_m"] == T[:3, 3].tolist()

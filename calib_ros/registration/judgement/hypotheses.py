@@ -30,7 +30,8 @@ from calib_ros.result import Cause
 # Features of frames with these numbers, None = of all, had this camera taken them. Raises BadInputError if it cannot have.
 AsTaken = Callable[[Camera, Sequence[int] | None], Sequence[FrameFeatures]]
 OF_TRANSFORM = (Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.QUATERNION_ORDER, Cause.MILLIMETRES, Cause.CLOUD_FRAME)
-MIXED_UP = (*OF_TRANSFORM, Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
+OF_PICTURE = (Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
+MIXED_UP = (*OF_TRANSFORM, *OF_PICTURE)
 _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 # Turns of the picture about the optical axis, clockwise.
 _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 90 deg anticlockwise"}
@@ -72,14 +73,14 @@ class Hypothesis:
     usual: bool = False
 
     @property
-    def of_transform(self) -> bool:
-        """Whether only the extrinsic is another one."""
-        return not (self.mirrored or any(self.lens) or self.barrel or self.camera)
-
-    @property
     def of_lens(self) -> bool:
         """Whether another camera took the pictures, and none was mixed up."""
         return self.cause not in MIXED_UP
+
+    @property
+    def rank(self) -> int:
+        """The simpler, the lower."""
+        return list(Cause).index(self.cause)
 
     def seen_by(self, score: PointScore) -> PointScore:
         """The score of the picture as it is if the guess holds."""

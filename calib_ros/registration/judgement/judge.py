@@ -24,6 +24,7 @@ from calib_ros.intrinsics import FOCAL
 from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.judgement.evidence import EVEN, Match, convinces, evidence, log_odds, rare_odds, shows_lens
 from calib_ros.registration.judgement.hypotheses import (
+    OF_PICTURE,
     AsTaken,
     Hypothesis,
     distorts,
@@ -44,7 +45,7 @@ from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.chance import LOWEST_DECOY_Z, null_distribution, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
-from calib_ros.registration.search.search import search, search_decoy
+from calib_ros.registration.search.search import search_decoy, search_once
 from calib_ros.result import Cause
 
 NEAR = SearchBox(5.0, 0.5)  # where mounts slip and hands miss
@@ -57,10 +58,10 @@ SHOWN_SIGMAS = 2.0  # of what a size lacks to the one that was tried
 
 @dataclass(frozen=True, eq=False)
 class Candidate(Match):
-    """A hypothesis at its optimum. decoy_z: z-score of the best optimum of a decoy; None = not searched."""
+    """A hypothesis at its optimum. searched: all of the box that is asked about, not only near where it predicts one."""
 
     hypothesis: Hypothesis
-    decoy_z: float | None = None
+    searched: bool = False
 
     @cached_property
     def z_score(self) -> float:
@@ -75,7 +76,8 @@ class Candidate(Match):
     def says_more_than(self, T: Transform) -> bool:
         """Whether the optimum is nearer to what was predicted than to the extrinsic T (4, 4) as it was given: else the latter is
         just off. A picture that is another one has no extrinsic that could be compared."""
-        return not self.hypothesis.of_transform or self.surprise < _distance(self.T, T)
+        other = self.hypothesis.mirrored or any(self.hypothesis.lens) or self.hypothesis.of_lens
+        return other or self.surprise < _distance(self.T, T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,11 +121,9 @@ class Judge:
         """The best match of the sensors as they are given: the optimum near T (4, 4), as of every hypothesis, or one of the
         optima that were met, beyond chance or not. None if all of them see too few points."""
         matches: list[Match] = []
-        atlas: Atlas | None = None
         for start in (T, *optima):
             with suppress(TooFewFeaturesError):
-                score = self.score(features, start, atlas)
-                atlas = score.atlas
+                score = self.score(features, start, matches[-1].score.atlas if matches else None)
                 matches.append(Match(score, _optimum(score, start) if start is T else start))
         return max(matches, key=evidence, default=None)
 
@@ -139,11 +139,17 @@ class Judge:
                     break
                 for one in dict.fromkeys((simplest(best, tried), best)):
                     own = self._confirmed(one, asked)
-                    if own is not None and self._stands(
-                        own, given, count, EVEN if is_only_off(own, deg, m) else rare_odds(count)
-                    ):
-                        return own
+                    odds = rare_odds(count) if own is None or not is_only_off(own, deg, m) else EVEN
+                    if own is not None and self._beyond_chance(own, count) and convinces(log_odds(own, given), odds):
+                        return own if asked.box is None else self._simplest_as_good(own, tried, asked)
         return None
+
+    def _simplest_as_good(self, found: Candidate, tried: Sequence[Candidate], asked: Question) -> Candidate:
+        """What was found, or a simpler hypothesis that predicts about the same optimum as well: a rough start ranks none."""
+        simpler = (own for own in tried if own.hypothesis.rank < found.hypothesis.rank)
+        rivals = (own for own in simpler if _distance(own.hypothesis.T, found.T) <= found.surprise + SLACK)
+        others = [self._confirmed(own, asked) for own in rivals]
+        return simplest(found, [found, *(own for own in others if own is not None)])
 
     def tried(self, asked: Question, guesses: Sequence[Hypothesis]) -> list[Candidate]:
         """The hypotheses that leave enough points in view, and say more than that the extrinsic is off, the best match first."""
@@ -160,6 +166,8 @@ class Judge:
                 atlas = score.atlas  # one for all: each would take as much memory as the maps of all frames
                 seen = guess.seen_by(score)
                 own = Candidate(seen, _optimum(seen, guess.T), guess)
+                if asked.box is not None and guess.cause in OF_PICTURE:  # the likeliest: they come with every extrinsic
+                    own = self._searched(own, asked)
                 ranked.append((own.z_score, own))
         return [own for _, own in sorted(ranked, key=lambda one: -one[0]) if own.says_more_than(asked.T)]
 
@@ -210,17 +218,12 @@ class Judge:
         if asked.thorough:
             yield [*(sizes if distorted else ()), *other_lenses(T, self.camera), *fisheyes(T, self.camera)]
 
-    def _stands(self, one: Candidate, given: Match | None, tried: int, odds: float) -> bool:
-        """Does one of so many that were tried match beyond chance, and convince against the sensors as they are given, at these
-        odds in advance?"""
-        return self._beyond_chance(one, tried) and convinces(log_odds(one, given), odds)
-
     def _confirmed(self, one: Candidate, asked: Question) -> Candidate | None:
         """The same by all frames, at the best optimum that one round of a search near it finds, its lens refined; None where its
         pictures cannot be had, or do not match."""
         guess = one.hypothesis
         if guess.camera is None:
-            one = self._searched(one, asked)
+            one = one if one.searched else self._searched(one, asked)
         else:
             with suppress(TooFewFeaturesError, BadInputError):
                 few = self._by_few(guess, asked) if any(guess.lens) else one
@@ -235,9 +238,8 @@ class Judge:
     def _searched(self, one: Candidate, asked: Question) -> Candidate:
         """The same at the best optimum that one round of a search near it finds: the sensors as given are searched as well."""
         start = one.T if asked.box is None else one.hypothesis.T
-        box = replace(asked.box or NEAR, rounds=1)
-        found = search(one.score, start, box, self.config.search, unlimited(start), self.config.refine.max_p_value)
-        return replace(max(one, replace(one, T=found.T), key=evidence), decoy_z=found.decoy_z)
+        T = search_once(one.score, start, asked.box or NEAR, self.config.search, unlimited(start))
+        return replace(max(one, replace(one, T=T), key=evidence), searched=True)
 
     def _with_lens(self, one: Candidate) -> Candidate:
         """A hypothesis about the lens, with what is left of it refined."""
@@ -257,12 +259,13 @@ class Judge:
 
     def _beyond_chance(self, best: Candidate, tried: int) -> bool:
         """Does the best match of so many that were tried exceed what a decoy reaches?"""
-        largest, decoy = self.config.refine.max_p_value, best.decoy_z
+        largest = self.config.refine.max_p_value
         if p_value(best.z_score, None, tried) <= largest:
             return True
-        if decoy is None and p_value(best.z_score, LOWEST_DECOY_Z, tried) <= largest:
-            decoy = search_decoy(best.score, best.T, NEAR, self.config.search, unlimited(best.T))
-        return decoy is not None and p_value(best.z_score, decoy, tried) <= largest
+        if p_value(best.z_score, LOWEST_DECOY_Z, tried) > largest:
+            return False
+        decoy_z = search_decoy(best.score, best.T, NEAR, self.config.search, unlimited(best.T))
+        return p_value(best.z_score, decoy_z, tried) <= largest
 
 
 def is_only_off(one: Candidate, deg: float, m: float) -> bool:
@@ -276,7 +279,7 @@ def simplest(best: Candidate, tried: Sequence[Candidate]) -> Candidate:
     alike = [own for own in tried if own.z_score >= ALIKE * best.z_score]
     nearest = min(own.surprise for own in alike)
     near = [own for own in alike if own.surprise <= nearest + SLACK]
-    return min(near, key=lambda own: list(Cause).index(own.hypothesis.cause))
+    return min(near, key=lambda own: own.hypothesis.rank)
 
 
 def _optimum(score: PointScore, start: Transform) -> Matrix:

@@ -5,7 +5,6 @@ The profile is the score with each value at an extrinsic of its own (as the prof
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,10 +66,6 @@ class ClockOffset:
         direction = np.where(limits.open_axes, se3.log(ends[2] @ se3.inverse(ends[0])), 0.0) / (2 * STEP_S)
         fallen = max(values[1] - 0.5 * (values[0] + values[2]), 0.0)
         return Effect(direction, 2 * fallen / STEP_S**2 / noise_of(part, T, limits))
-
-    def scores_at(self, score: PointScore, T: Transform, values: Iterable[float]) -> list[float]:
-        """Score with each value, the extrinsic held at T (4, 4)."""
-        return [self.changed(score, T, float(x))[0].at(-1).value(T) for x in values]
 
 
 @dataclass(frozen=True, eq=False)

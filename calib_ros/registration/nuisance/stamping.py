@@ -6,7 +6,6 @@ agree. Which part of the scan is stamped is a time offset of half a scan period 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -54,12 +53,3 @@ def convention(stamping: Stamping, seconds: float, scan_period_s: float) -> tupl
         azimuth = azimuth + 180.0 if azimuth <= 0 else azimuth - 180.0
     found = f"motion.spin: {stamping.spin}, motion.stamp_at: {name}, motion.stamp_azimuth_deg: {azimuth:g}"
     return found, seconds - halves[name] * scan_period_s
-
-
-def stamped_by_azimuth(features: Sequence[FrameFeatures], config: MotionConfig) -> bool:
-    """Whether there is a convention to find out."""
-    return (
-        config.stamping == "auto"
-        and all(f.own is None for f in features)
-        and any(f.twist is not None and f.timed_by_azimuth for f in features)
-    )

@@ -103,10 +103,6 @@ class TimeOffset:
         log_ratio = (self.score - other.score) / max(self.noise, other.noise)
         return bool(log_ratio > np.log(alternatives))
 
-    def sigma_if_none(self, prior_s: float) -> float:
-        """Standard deviation of the offset, s, where it is taken to be 0 and known to `prior_s`."""
-        return float(np.hypot(self.effect.sigma(prior_s), np.sqrt(self.probability) * self.seconds))
-
 
 def estimate_time_offset(
     score: PointScore,

@@ -43,10 +43,6 @@ class NullDistribution:
     mean: float = 0.0
     spread: float = 1.0
 
-    def z_score_of(self, score: float) -> float:
-        """z-score of another score of the same frames, nearby."""
-        return (score - self.mean) / self.spread
-
     def outlier_frames(self) -> NDArray[np.intp]:
         """Frames that match no better than chance where the others match well: paired wrongly, or a covered lens."""
         z = self.z_scores

@@ -130,10 +130,17 @@ def search_decoy(
 ) -> float:
     """z-score of the best extrinsic that a round of the same search finds in a decoy, the mirrored maps: no true alignment."""
     decoy = score.mirrored()
+    return null_distribution(decoy, search_once(decoy, T, box, config, limits, user_prior)).z_score
+
+
+def search_once(
+    score: PointScore, T: Transform, box: SearchBox, config: SearchConfig, limits: Limits, user_prior: Prior | None = None
+) -> Matrix:
+    """The best extrinsic (4, 4) of one round, whether or not it stands out from chance."""
     with Workers(config.threads) as workers:
-        optima = Rounds(decoy, T, box, config, limits, user_prior, workers=workers)
+        optima = Rounds(score, T, box, config, limits, user_prior, workers=workers)
         optima.add_round()
-        return null_distribution(decoy, optima.best()[0]).z_score
+        return optima.best()[0]
 
 
 # Of seeding: starts are ranked by the first score, the best of them by the second, on the level, from which they are optimised.

@@ -68,7 +68,7 @@ def test_another_principal_point_is_a_turn_of_the_camera_that_is_stated(scene):
     assert se3.translation_error_m(result.T_camera_lidar, scene.truth) < 0.06
     off = se3.log(result.T_camera_lidar @ se3.inverse(scene.truth))
     assert np.linalg.norm(off[:2]) > np.deg2rad(0.5)  # which its whole covariance knows
-    assert off @ np.linalg.solve(result.covariance, off) < 22.5
+    assert off @ np.linalg.solve(result.covariance_with_intrinsics, off) < 22.5
 
 
 def test_of_images_that_are_said_to_be_rectified_the_refusal_says_how_to_take_them_as_raw(scene):
@@ -99,9 +99,10 @@ def test_a_focal_length_one_per_cent_off_is_an_unknown_and_no_reason_to_refuse(s
     assert exact.intrinsics == {}
     forward = scene.truth[:3, :3] @ [1.0, 0.0, 0.0]
     off = se3.log(result.T_camera_lidar @ se3.inverse(scene.truth))[3:] @ forward
-    told, without = (np.sqrt(forward @ r.covariance[3:, 3:] @ forward) for r in (result, exact))
+    told, alone = (np.sqrt(forward @ C[3:, 3:] @ forward) for C in (result.covariance_with_intrinsics, result.covariance))
     assert abs(off) < 3 * told
-    assert told > 1.5 * without  # by how much the camera looks nearer or farther away
+    assert told > 1.5 * alone  # by how much the camera looks nearer or farther away
+    assert np.allclose(result.covariance, exact.covariance)
 
 
 def shown(name: str, value: float, sigma: float, shift_m: float) -> LensEstimate:
@@ -171,7 +172,9 @@ def test_a_wrong_camera_is_corrected_with_the_extrinsic(scene, focal, corner, bo
     assert found.changes[FOCAL].observable
     assert found.changes[FOCAL].sigma < 0.003
     assert np.allclose(found.T_camera_lidar, result.T_camera_lidar)
-    assert np.allclose(result.covariance, found.covariance[:6, :6])  # the vehicle stands: the clocks leave nothing open
+    assert np.allclose(
+        result.covariance_with_intrinsics, found.covariance[:6, :6]
+    )  # the vehicle stands: the clocks leave nothing open
     assert np.linalg.eigvalsh(found.covariance / np.outer(*[np.sqrt(np.diag(found.covariance))] * 2)).min() > 0
     assert dict(result.intrinsics) == dict(found.changes)
 
@@ -240,7 +243,7 @@ def test_rounds_end_where_nothing_is_left_and_the_covariance_is_about_the_camera
     assert result.refined_camera.changes[FOCAL].value == pytest.approx(0.02)  # of the camera that was used last
     sigma = np.sqrt(result.refined_camera.covariance[6, 6])
     assert sigma == pytest.approx(np.hypot(0.001, 0.0005))
-    assert np.sqrt(result.covariance[5, 5]) == pytest.approx(np.hypot(0.001, 0.01 * np.hypot(1, 0.5)))
+    assert np.sqrt(result.covariance_with_intrinsics[5, 5]) == pytest.approx(np.hypot(0.001, 0.01 * np.hypot(1, 0.5)))
     refused = replace(result, status=REFUSED, covariance=None)
     assert refined_with_camera(result, LENSES[0], lambda camera: refused).refined_camera is None
 

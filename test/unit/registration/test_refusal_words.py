@@ -18,12 +18,7 @@ LENSES = [
     (CENTRE[0], 0.00042, False, "about 0.42 px further to the right"),
     (ASPECT, -0.03, False, "with fy about 3.0% shorter against fx"),
     (RADIAL, 0.1, True, "as if the images were rectified already (3.6 standard deviations); set image_is_rectified"),
-    (
-        RADIAL,
-        -0.05,
-        False,
-        "that camera_info does not state, which moves the corners of the image by -5.0%",
-    ),
+    (RADIAL, -0.05, False, "that camera_info does not state, which moves the corners of the image by -5.0%"),
 ]
 
 
@@ -31,10 +26,7 @@ LENSES = [
     ("said", "text"),
     [
         (wrong_times(-0.6, 0.0), "the clocks set 600 ms apart, which the scenes do not confirm: images"),
-        (
-            mirrored_image(3.0, 8.4),
-            "the images are mirrored left to right: they match so (z-score 8.4), and not as they come (3.0)",
-        ),
+        (mirrored_image(3.0, 8.4), "left to right: they match so (z-score 8.4), and not as they come (3.0)"),
         (low_score(math.nan), "the image shows nothing where the LiDAR sees edges; check"),
         (left_open("time_offset_s", 0.0, math.inf, 0.13, 0.25, 0.05), "the scenes do not show time_offset_s, and leave open"),
         *((wrong_intrinsics(main, LENS | {main: value}, CAMERA, gone, 3.6), text) for main, value, gone, text in LENSES),
