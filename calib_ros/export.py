@@ -211,7 +211,11 @@ def with_edges(data: bytes, path: str, edges: Edges, joint: str | None = None) -
             data = _with_origin(data, path, name, edges)
         ours = [between[name] for name in names]
     else:
-        text, root = _yaml(data, path)
+        try:
+            text = data.decode()
+            root = io.compose(text)
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            raise BadInputError(f"{path} is no valid YAML{io.what_is_wrong(error)}; correct it") from None
         ours = [(parent, child) for parent, child in edges if _value_of(_value_of(root, parent), child) is not None]
         ours = ours if joint is None else ours[:1]
         data = _with_entries(text, path, root, {edge: edges[edge] for edge in ours})
@@ -313,15 +317,6 @@ def _with_entries(text: str, path: str, root: yaml.Node | None, edges: Edges) ->
     for begin, end, value in sorted(places, reverse=True):
         text = text[:begin] + _number(value) + text[end:]
     return text.encode()
-
-
-def _yaml(data: bytes, path: str) -> tuple[str, yaml.Node | None]:
-    """Text and root of a YAML file."""
-    try:
-        text = data.decode()
-        return text, io.compose(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise BadInputError(f"{path} is no valid YAML{io.what_is_wrong(error)}; correct it") from None
 
 
 def _value_of(node: yaml.Node | None, name: str) -> yaml.Node | None:

@@ -59,18 +59,15 @@ def depth_levels(depth: ArrayLike, max_range: float) -> Image:
 
 @dataclass(frozen=True)
 class OverlayLayout:
-    """Layout in px. size: (width, height) of the whole. panels: upper left corners (x, y). rows: of the header."""
+    """Layout in px. size: (width, height) of the whole. panels: upper left corners (x, y). margin: of text from
+    the border. rows: of the header."""
 
     size: tuple[int, int]
     panels: tuple[tuple[int, int], ...]
     font: float
     line: int
+    margin: int
     rows: int
-
-    @property
-    def margin(self) -> int:
-        """Distance of text from the border, px."""
-        return self.line // 3
 
 
 def layout(width: int, height: int, panels: int) -> OverlayLayout:
@@ -83,7 +80,7 @@ def layout(width: int, height: int, panels: int) -> OverlayLayout:
     top, title = rows * line + line // 2, line if panels == 2 else 0
     step = (width + GAP, 0) if beside else (0, height + title)
     corners = tuple((i * step[0], top + title + i * step[1]) for i in range(panels))
-    return OverlayLayout((canvas, corners[-1][1] + height + 2 * line), corners, font, line, rows)
+    return OverlayLayout((canvas, corners[-1][1] + height + 2 * line), corners, font, line, line // 3, rows)
 
 
 def text_width(text: str, font: float) -> int:

@@ -44,7 +44,8 @@ class ConstraintOptions:
         for axis, half, option in given:
             before, by = limits.get(axis, (half, option))
             if before != half:
-                raise BadInputError(f"--bound {axis}={half:g} contradicts {_as_option(by, axis, before)}")
+                said = {"--fix": f"--fix {axis}", "--bound": f"--bound {axis}={before:g}"}.get(by, by)
+                raise BadInputError(f"--bound {axis}={half:g} contradicts {said}")
             if half > _FREE[axis]:
                 raise BadInputError(f"--bound {axis}={half:g} is out of range [0, {_FREE[axis]:g}]")
             limits[axis] = (half, option)
@@ -93,10 +94,6 @@ class ConstraintOptions:
         if wrong and (len(wrong) == 3 or len(set(values)) > 1):
             verb = "is fixed" if len(wrong) == 1 else "are fixed"
             raise BadInputError(f"{option}: {', '.join(wrong)} {verb}, so {what} there must be 0")
-
-
-def _as_option(option: str, axis: str, half: float) -> str:
-    return {"--fix": f"--fix {axis}", "--bound": f"--bound {axis}={half:g}"}.get(option, option)
 
 
 def configuration(

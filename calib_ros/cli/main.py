@@ -91,7 +91,9 @@ def _info(args: argparse.Namespace) -> int:
 def _calibrate(args: argparse.Namespace) -> int:
     from calib_ros.cli.calibrate import advice, calibrate
     from calib_ros.cli.inputs import configuration, constraint_options, initial_of, open_named_source
-    from calib_ros.cli.output import check_camera_info, check_json, print_or_save, save_camera_info, summary
+    from calib_ros.cli.output import check_camera_info, check_json, note, print_or_save, summary
+    from calib_ros.intrinsics import camera_info_yaml
+    from calib_ros.io import write_atomically
 
     constraints = constraint_options(args)
     constraints.check_search(args.search_deg, args.search_m)
@@ -105,8 +107,10 @@ def _calibrate(args: argparse.Namespace) -> int:
         *(args.search_deg, args.search_m, args.overlay),
     )
     print_or_save(result, summary(result, advice(result, source, config, args.initial)), args.json)
-    if args.camera_info is not None:
-        save_camera_info(result, args.camera_info)
+    if args.camera_info is not None and result.converged and result.refined_camera is not None:
+        write_atomically(args.camera_info, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())
+    elif args.camera_info is not None:
+        note(f"{args.camera_info} is not written: the estimate is {result.status}")
     return OK if result.converged else NOT_CONVERGED
 
 

@@ -18,8 +18,8 @@ from calib_ros.config.sensors import REFINE
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera, camera_info_yaml
-from calib_ros.io import check_output, write_atomically
+from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
+from calib_ros.io import check_output
 from calib_ros.lidar.deskew import used_twist
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
@@ -181,14 +181,6 @@ def check_camera_info(path: str | None, camera: CameraConfig) -> None:
     if camera.intrinsics != REFINE:
         raise BadInputError("--camera-info writes refined intrinsics: give --intrinsics refine as well, or leave it out")
     check_output(path, "--camera-info")
-
-
-def save_camera_info(result: Result, path: str) -> None:
-    """Write the refined intrinsics of a result that is to be used; say so where there are none."""
-    if result.converged and result.refined_camera is not None:
-        write_atomically(path, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())
-    else:
-        note(f"{path} is not written: the estimate is {result.status}")
 
 
 def print_or_save(result: Savable, text: str, path: str | None) -> None:

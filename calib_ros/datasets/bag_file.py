@@ -65,7 +65,9 @@ class BagFile:
         self.close = finalize(self, stack.close)
         try:
             with self._readable():
-                _check_metadata(path / METADATA)
+                described = (path / METADATA).read_bytes() if (path / METADATA).is_file() else b""
+                if YAML_MERGE.search(described) or len(YAML_ALIAS.findall(described)) > MAX_ALIASES:
+                    raise ValueError(f"{METADATA} refers to parts of itself")  # a few lines expand to millions: rosbags hangs
                 self._readers, self.remarks = _opened(path, files, incomplete, stack)
                 connections = [connection for reader in self._readers for connection in reader.connections]
                 self.topics = _topics(connections)
@@ -218,13 +220,6 @@ def _storage_of(file: Path) -> str:
 
 def _reason(error: Exception, otherwise: str = "") -> str:
     return " ".join(str(error).split()) or otherwise or type(error).__name__
-
-
-def _check_metadata(path: Path) -> None:
-    """ValueError for a file with YAML aliases or merges: a few lines of them expand to millions, over which rosbags hangs."""
-    text = path.read_bytes() if path.is_file() else b""
-    if YAML_MERGE.search(text) or len(YAML_ALIAS.findall(text)) > MAX_ALIASES:
-        raise ValueError("metadata.yaml refers to parts of itself")
 
 
 def _topics(connections: Collection[Any]) -> dict[str, Topic]:

@@ -56,7 +56,7 @@ class KittiSource:
         root = find_drive(Path(path))
         if root is None:
             raise BadInputError(f"{path} is not a KITTI folder; looked for {EXPECTED_FOLDERS}")
-        of_360 = _kind(root) == KITTI_360
+        of_360 = layout_name(root) == KITTI_360
         camera = (0 if of_360 else 2) if camera is None else camera
         self._layout = layout_of(root, camera)
         self.path = root
@@ -125,13 +125,16 @@ class KittiSource:
     def describe(self) -> dict[str, str]:
         """What the folder holds: label -> text."""
         frames, images, scans = len(self), len(self._images), len(self._scans)
+        motion = "scans are compensated already" if self._layout.compensated else "unknown: no stamps of image and scan"
+        if self._layout.motion is not None:
+            motion = "from oxts" if self._layout.motion.has_oxts else "no oxts; can be estimated from consecutive scans"
         return {
             "kind": f"KITTI {self._layout.kind}",
             "path": str(self.path),
             "frames": f"{frames}, numbers {self.numbers[0]} to {self.numbers[-1]}; left out: "
             f"{images - frames} pictures without scan, {scans - frames} scans without picture",
             "stamps": self._layout.stamps_from,
-            "motion": self._layout.motion_from,
+            "motion": motion,
             "cameras": ", ".join(
                 f"{number}{' (chosen)' if number == self._camera_number else ''}" for number in self._layout.images
             ),
@@ -142,14 +145,13 @@ class KittiSource:
         }
 
 
-def is_drive(path: Path) -> bool:
-    """Whether a folder is a drive, complete or not."""
-    return bool(_kind(path))
-
-
-def drives_in(path: Path) -> list[Path]:
-    """The drive at a path, or those up to three folders below it, by name."""
-    return [path] if _kind(path) else _drives_below(path, 3)
+def drives_in(path: Path, depth: int = 3) -> list[Path]:
+    """The drive at a path, or those up to so many folders below it, by name."""
+    if layout_name(path):
+        return [path]
+    children = sorted(path.iterdir()) if depth and path.is_dir() else []
+    inside = [child for child in children if layout_name(child) or _PARENT_FOLDER.fullmatch(child.name)]
+    return [drive for child in inside for drive in drives_in(child, depth - 1)]
 
 
 def find_drive(path: Path) -> Path | None:
@@ -179,19 +181,10 @@ class DriveLayout:
     motion: ScanMotion | None = None
     compensated: bool = False
 
-    @property
-    def motion_from(self) -> str:
-        """Where the motion during a scan comes from, as text."""
-        if self.compensated:
-            return "scans are compensated already"
-        if self.motion is None:
-            return "unknown: no stamps of image and scan"
-        return "from oxts" if self.motion.has_oxts else "no oxts; can be estimated from consecutive scans"
-
 
 def layout_of(root: Path, camera: int) -> DriveLayout:
     """The layout of a drive for one of its cameras (0, 1 grey; 2, 3 colour). BadInputError if something is missing."""
-    kind = _kind(root)
+    kind = layout_name(root)
     pattern, scans = {
         "raw": ("image_0{}/data", "velodyne_points/data"),
         KITTI_360: ("image_0{}/data_rect", f"../../data_3d_raw/{root.absolute().name}/velodyne_points/data"),
@@ -208,7 +201,7 @@ def layout_of(root: Path, camera: int) -> DriveLayout:
     return builder(root, camera, images, root / scans)
 
 
-def _kind(root: Path) -> str:
+def layout_name(root: Path) -> str:
     """Layout of a folder by its content, even if incomplete; "" if it is not KITTI."""
     if any((root / f"image_0{n}" / "data_rect").is_dir() for n in range(2)):
         return KITTI_360
@@ -217,18 +210,6 @@ def _kind(root: Path) -> str:
     if (root / "velodyne").is_dir() or any((root / f"image_{n}").is_dir() for n in range(4)):
         return "object" if (root / "calib").is_dir() else "odometry"
     return ""
-
-
-def _drives_below(path: Path, depth: int) -> list[Path]:
-    if not depth or not path.is_dir():
-        return []
-    drives: list[Path] = []
-    for child in sorted(path.iterdir()):
-        if child.is_dir() and _kind(child):
-            drives.append(child)
-        elif _PARENT_FOLDER.fullmatch(child.name):
-            drives += _drives_below(child, depth - 1)
-    return drives
 
 
 def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:

@@ -12,7 +12,7 @@ ADVICE = "give all, a list like 0,4,8 or a range like 0:100:5"
 def frame_positions(text: str, count: int) -> list[int]:
     """'all', '0,4,8' or '0:100:5' (0-based, end excluded, as Python slices) -> positions in a source of `count` frames.
     BadInputError for other text, positions out of range or named twice, or an empty selection."""
-    selection = _selection(text)
+    selection = selected(text)
     positions: Sequence[int] = range(count)[selection] if isinstance(selection, slice) else selection
     wrong = [i for i in positions if not 0 <= i < count]
     if wrong:
@@ -22,12 +22,8 @@ def frame_positions(text: str, count: int) -> list[int]:
     return list(positions)
 
 
-def check_positions(text: str) -> None:
-    """BadInputError for a text that selects frames of no source, however many it has."""
-    _selection(text)
-
-
-def _selection(text: str) -> slice | list[int]:
+def selected(text: str) -> slice | list[int]:
+    """What a text says, whatever the source. BadInputError where it selects frames of none."""
     try:
         if text == "all":
             return slice(None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,13 +43,7 @@ class Timed(Sequence[tuple[int, Any]]):
     def __len__(self) -> int:
         return len(self.stamps)
 
-    @overload
-    def __getitem__(self, index: int) -> tuple[int, Any]: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[tuple[int, Any]]: ...
-
-    def __getitem__(self, index: int | slice) -> tuple[int, Any] | list[tuple[int, Any]]:
+    def __getitem__(self, index: int | slice) -> Any:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
         index = range(len(self))[index]

@@ -201,8 +201,8 @@ class RigMeasurer:
     def _with_motion(self, frame: Frame, camera: str, lidar: str, source: Source) -> Frame:
         if not needs_ego_motion(frame, self.config_of(camera).motion):
             return frame
-        stamp = None if frame.cloud_stamp is None else frame.cloud_stamp + _ahead(source)
-        return replace(frame, twist=self.scans[lidar].twist_at(stamp))
+        own = np.flatnonzero(self.scans[lidar].stamps == frame.moment_of_cloud + _ahead(source))
+        return replace(frame, twist=self.scans[lidar].twist(int(own[0])) if len(own) else None)
 
 
 def _ahead(source: Source) -> int:

@@ -189,7 +189,10 @@ def _solved(factors: Sequence[Edge], names: Sequence[str], reference: str) -> tu
     """The least-squares estimate: poses, their covariance, and chi^2."""
     columns = {name: slice(6 * k, 6 * k + 6) for k, name in enumerate(names)}
     roots = [root_information(f.covariance) for f in factors]
-    poses = _along_edges(factors, reference, names)
+    poses = {reference: np.eye(4)}  # by the most certain factors from there on: nearer than priors to where the estimate ends
+    for before, name, edge in _tree(factors, reference):
+        poses[name] = poses[before] @ (edge.T if edge.target == before else se3.inverse(edge.T))
+    poses = {name: poses[name] for name in (reference, *names)}
     for _ in range(ITERATIONS):
         r, J = _linear(factors, roots, poses, columns)
         step = np.linalg.lstsq(J, r, rcond=None)[0]
@@ -216,14 +219,6 @@ def _linear(
         rs.append(W @ se3.log(factor.T @ se3.inverse(P)))
         Js.append(W @ A)
     return np.concatenate(rs), np.concatenate(Js)
-
-
-def _along_edges(factors: Sequence[Edge], reference: str, names: Sequence[str]) -> dict[str, Transform]:
-    """Poses by the most certain factors from the reference on: nearer than priors to where the estimate ends."""
-    out = {reference: np.eye(4)}
-    for before, name, edge in _tree(factors, reference):
-        out[name] = out[before] @ (edge.T if edge.target == before else se3.inverse(edge.T))
-    return {name: out[name] for name in (reference, *names)}
 
 
 def _tree(edges: Sequence[Edge], reference: str) -> list[tuple[str, str, Edge]]:

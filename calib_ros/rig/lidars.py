@@ -98,11 +98,6 @@ class LidarScans:
         found = [twist for twist in (self._motion(k - 1), self._motion(k)) if twist is not None]
         return np.asarray(np.mean(found, axis=0)) if found else None
 
-    def twist_at(self, stamp: int | None) -> Matrix | None:
-        """The same of the scan with this stamp, ns."""
-        k = self.nearest(stamp) if stamp is not None and len(self) else -1
-        return self.twist(k) if k >= 0 and self.stamps[k] == stamp else None
-
     def still(self, k: int) -> tuple[Matrix, Matrix | None]:
         """Points (n, 3) of scan k, thinned, as they are at its stamp, and the velocity there."""
         cloud, twist = self.scans[k][1], self.twist(k)

@@ -60,10 +60,6 @@ class PairState:
         offset = (r.time_offset_s, r.time_offset_sigma_s)
         return Edge(*self.pair, r.T_camera_lidar, C, self.kind, *offset, samples=r.frames_used)
 
-    def says_as(self, other: PairState) -> bool:
-        """Whether nothing has changed from another state of the pair."""
-        return (self.extrinsic, self.usable, bool(self.unchecked)) == (other.extrinsic, other.usable, bool(other.unchecked))
-
 
 @dataclass(frozen=True, eq=False)
 class SensorState:
@@ -165,7 +161,10 @@ class LiveRig:
             return ()
         if self._lost - lost and self._before is not None:
             self._compare(pairs, edges)
-        who = suspects(self._lost, [p.pair for p in pairs if p.usable and p.pair not in self._lost])
+        # A sensor that all lost pairs have in common, else all those without a pair that fits.
+        fitting = {name for p in pairs if p.usable and p.pair not in self._lost for name in p.pair}
+        names = sorted({name for pair in self._lost for name in pair} - fitting)
+        who = tuple([name for name in names if all(name in pair for pair in self._lost)] or names)
         if lost and not self._named:
             self._told = f"{' or '.join(who)} moved; by how much is being estimated"
         return self._named or who
@@ -183,12 +182,3 @@ class LiveRig:
         if len(likely) == 1 and likely[0].kind == KNOCKED:
             self._named = likely[0].sensors
             self._sizes |= dict.fromkeys(self._named, likely[0].size)
-
-
-def suspects(lost: set[Pair], fitting: Sequence[Pair]) -> tuple[str, ...]:
-    """The sensors that may have moved where these pairs have lost their extrinsics and the others fit: one that all lost pairs
-    have in common, else all those without a pair that fits."""
-    right = {name for pair in fitting for name in pair}
-    names = sorted({name for pair in lost for name in pair} - right)
-    common = [name for name in names if all(name in pair for pair in lost)]
-    return tuple(common or names)

@@ -47,11 +47,6 @@ class RigHypothesis:
     size: tuple[float, float]
     others: tuple[str, ...] = ()
 
-    @property
-    def is_hidden(self) -> bool:
-        """Whether a usual knock would turn these by less than three standard deviations of what the new edges tell."""
-        return self.kind == MOVED and bool(np.rad2deg(np.sqrt(np.diag(self.covariance)[:3].max())) > KNOCK_DEG / 3)
-
     def __str__(self) -> str:
         if self.kind == NOTHING:
             return "nothing has changed"
@@ -68,7 +63,7 @@ def hypotheses(before: RigSolution, edges: Sequence[Edge]) -> list[RigHypothesis
     names = sorted(model.seen)
     Candidate = tuple[str, tuple[str, ...], Matrix, Matrix, float]  # with B, the prior covariance of x, and log prior
     found: list[Candidate] = [(NOTHING, (), np.zeros((len(model.y), 0)), np.zeros((0, 0)), np.log(1 - CHANGED))]
-    clocks = model.has_clocks
+    clocks = bool(model.offsets) or any(edge.twist is not None for edge in edges)  # whether a jump of one would show
     for m in range(1, len(names) // 2 + 1):
         # Parts of equal size halve, and each pair of halves is named by both.
         groups = combinations(names, m) if len(names) <= MOST or m == 1 else ()
@@ -97,11 +92,13 @@ def verdict(found: Sequence[RigHypothesis]) -> tuple[tuple[RigHypothesis, ...], 
         if sum(h.posterior for h in likely) > SURE:
             break
     text = str(likely[0])
+    # A usual knock would turn these by less than three standard deviations of what the new edges tell.
+    hidden = [h for h in found if h.kind == MOVED and np.rad2deg(np.sqrt(np.diag(h.covariance)[:3].max())) > KNOCK_DEG / 3]
     if len(likely) > 1:
         text = f"cannot tell between: {'; '.join(map(str, likely))}"
     elif likely[0].kind == MOVED:
         text += f" against {', '.join(likely[0].others)}"
-    elif likely[0].kind == NOTHING and (hidden := [h for h in found if h.is_hidden]):
+    elif likely[0].kind == NOTHING and hidden:
         groups = "; ".join(" with ".join(h.sensors) for h in hidden)
         text += f", as far as it shows: the new edges would hardly show that these moved against the others: {groups}"
     if likely[0].p_value < SIGNIFICANCE:
@@ -123,13 +120,13 @@ class _Model:
             rows.append(se3.log(edge.T @ se3.inverse(P)))
             A.append(J)
             noise.append(edge.covariance)
-        self._offsets: list[tuple[Edge, int]] = []  # edges whose clocks are known, with their rows
+        self.offsets: list[tuple[Edge, int]] = []  # edges whose clocks are known, with their rows
         for edge in edges:
             old = known.get((edge.target, edge.source))
             offsets = [] if old is None else [e.time_offset_s for e in (edge, old) if e.time_offset_s is not None]
             sigmas = [] if old is None else [e.time_sigma_s for e in (edge, old) if e.time_sigma_s is not None]
             if len(offsets) == len(sigmas) == 2:
-                self._offsets.append((edge, 6 * len(edges) + len(self._offsets)))
+                self.offsets.append((edge, 6 * len(edges) + len(self.offsets)))
                 rows.append(np.array([offsets[0] - offsets[1]]))
                 A.append(np.zeros((1, n)))
                 noise.append(np.array([[sigmas[0] ** 2 + sigmas[1] ** 2]]))
@@ -143,11 +140,6 @@ class _Model:
         self.covariance += whole @ before.covariance @ whole.T
         self._root = np.linalg.inv(np.linalg.cholesky(self.covariance))
 
-    @property
-    def has_clocks(self) -> bool:
-        """Whether a jump of a clock would show."""
-        return bool(self._offsets) or any(edge.twist is not None for edge in self.edges)
-
     def moved(self, group: Sequence[str]) -> Matrix:
         """B (n, 6) of a group that moves rigidly by a left twist in the reference's frame."""
         B = np.zeros((len(self.y), 6))
@@ -160,7 +152,7 @@ class _Model:
     def jumped(self, name: str) -> Matrix:
         """B (n, 1) of a clock that is later by a second: known offsets follow, and elsewhere the transform takes it."""
         B = np.zeros((len(self.y), 1))
-        known = {id(edge): row for edge, row in self._offsets}
+        known = {id(edge): row for edge, row in self.offsets}
         for k, edge in enumerate(self.edges):
             sign = (edge.source == name) - (edge.target == name)
             if sign and id(edge) in known:

@@ -24,19 +24,17 @@ def every(node: Node, seconds: float, call: Callable[[], None]) -> Timer:
 
 
 class Beside(SingleThreadedExecutor):
-    """Spun now and then, from a timer of the node that its nodes belong to and on the same thread."""
+    """Spun every SPIN_S, from a timer of the node that its nodes belong to and on the same thread."""
 
     _found = False
-    _timer: Timer | None = None
 
-    def spin_from(self, node: Node) -> None:
-        """Spin whenever that node does, every SPIN_S."""
-        self._timer = every(node, SPIN_S, self.spin_ready)
+    def __init__(self, node: Node) -> None:
+        super().__init__(context=node.context)
+        self._node, self._timer = node, every(node, SPIN_S, self.spin_ready)
 
-    def destroy(self, node: Node) -> None:
-        """End, and destroy its nodes; node: that it is spun from."""
-        if self._timer is not None:
-            node.destroy_timer(self._timer)
+    def destroy(self) -> None:
+        """End, and destroy its nodes."""
+        self._node.destroy_timer(self._timer)
         nodes = self.get_nodes()
         self.shutdown(timeout_sec=SPIN_S)
         for own in nodes:

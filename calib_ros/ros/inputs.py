@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TwistStamped
@@ -30,6 +30,7 @@ from calib_ros.messages import decode_camera_info, stamp_ns
 from calib_ros.online.common import Common
 from calib_ros.online.pairing.health import MISSING_SHARE
 from calib_ros.online.pipeline import Pipeline
+from calib_ros.rig.description import CAMERA
 from calib_ros.rig.edges import SEEN, seen_share
 from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message
 from calib_ros.ros.diagnostics import Health
@@ -119,20 +120,11 @@ class Listener:
 Decoded = Callable[[Serialized], Any]  # message -> what it holds
 
 
-def decoded_once(decode: Decoded, kept: int) -> Decoded:
-    """The same for several who ask; of so many of the newest messages."""
+def decoded_once(kind: str) -> Decoded:
+    """What messages of a camera or a LiDAR hold, the same for several who ask while they are among the newest."""
+    decode, kept = (pixels_from_message, IMAGES_KEPT) if kind == CAMERA else (cloud_from_message, CLOUDS_KEPT)
     recent = Recent(kept)
     return lambda message: recent(message, lambda: decode(message))
-
-
-def decoded_clouds() -> Decoded:
-    """Of a LiDAR."""
-    return decoded_once(cloud_from_message, CLOUDS_KEPT)
-
-
-def decoded_images() -> Decoded:
-    """Of a camera."""
-    return decoded_once(pixels_from_message, IMAGES_KEPT)
 
 
 @dataclass(eq=False)
@@ -145,8 +137,8 @@ class PairInputs:
     """
 
     shared: SharedTopics
-    image: Decoded
-    cloud: Decoded
+    image: Decoded = pixels_from_message
+    cloud: Decoded = cloud_from_message
     common: Common | None = None
     camera: str = ""
     lidar: str = ""
@@ -172,17 +164,8 @@ class PairInputs:
         return Frame(pixels, points, camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
 
 
-def of_one_pair(node: Node) -> PairInputs:
-    """Of a node of its own, that nobody shares anything with."""
-    return PairInputs(SharedTopics(node), pixels_from_message, cloud_from_message)
-
-
-class MotionSource(NamedTuple):
-    """A topic that tells the vehicle's motion. decode: message -> speed, m/s, and turn rate, deg/s; None = unknown."""
-
-    topic: str
-    kind: type[Any]
-    decode: Callable[[Any], tuple[float | None, float | None]]
+# A type of messages that tell the vehicle's motion, and what takes speed, m/s, and turn rate, deg/s, from them; None = unknown.
+MotionSource = tuple[type[Any], Callable[[Any], tuple[float | None, float | None]]]
 
 
 class SensorSubscriptions(NodeService):
@@ -222,13 +205,14 @@ class SensorSubscriptions(NodeService):
             subscribe([serialized(CameraInfo)], camera_info, self._on_camera_info, latched=True),
         )
         if self._motion is not None:
-            motion = self._motion
+            motion, decode = self._motion
 
             def on_motion(msg: Any) -> None:
                 with self._health.guard():
-                    pipeline.speed_gate.add_measurement(stamp_ns(msg.header.stamp), *motion.decode(msg))
+                    pipeline.speed_gate.add_measurement(stamp_ns(msg.header.stamp), *decode(msg))
 
-            self._motion_subscription = shared.node.create_subscription(motion.kind, motion.topic, on_motion, MOTION_QOS)
+            topic = parameters["motion_source"]
+            self._motion_subscription = shared.node.create_subscription(motion, topic, on_motion, MOTION_QOS)
 
     def pause(self) -> None:
         """Receive nothing any more, until start() is called again."""
@@ -302,18 +286,16 @@ def motion_source(name: str) -> MotionSource | None:
     if name == "none":
         return None
     if name == "imu":
-        return MotionSource(
-            name, Imu, lambda msg: (None, None if msg.angular_velocity_covariance[0] == -1 else _turn_deg_s(msg.angular_velocity))
-        )
+        return Imu, lambda msg: (None, None if msg.angular_velocity_covariance[0] == -1 else _turn_deg_s(msg.angular_velocity))
     if name == "twist":
-        return MotionSource(name, TwistStamped, lambda msg: (_length(msg.twist.linear), _turn_deg_s(msg.twist.angular)))
+        return TwistStamped, lambda msg: (_length(msg.twist.linear), _turn_deg_s(msg.twist.angular))
     try:
         from nav_msgs.msg import Odometry
     except ImportError:
         raise MissingDependencyError(
             "motion_source: odom needs nav_msgs; install it (apt: ros-<distro>-nav-msgs) or set motion_source to twist or imu"
         ) from None
-    return MotionSource(name, Odometry, lambda msg: (_length(msg.twist.twist.linear), _turn_deg_s(msg.twist.twist.angular)))
+    return Odometry, lambda msg: (_length(msg.twist.twist.linear), _turn_deg_s(msg.twist.twist.angular))
 
 
 def _length(vector: Any) -> float:

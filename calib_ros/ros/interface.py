@@ -28,6 +28,9 @@ class Interface:
     writes them, one after the other. listener: node whose remapping holds for topics. cures: see `StaticTf`.
     """
 
+    again: Callable[[], None]  # publishes every publish_period_s
+    end_threads: Callable[[], bool]  # all but those of the parts; True if they ended
+
     def __init__(self, node: Node, declared: Parameters, listener: Node, cures: tuple[str, str] = CURES) -> None:
         self.node, self.parameters, self.health = node, declared, Health(node.get_logger())
         self.given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
@@ -48,7 +51,7 @@ class Interface:
         except Exception:
             self.deactivate()
             raise
-        ticks = (1.0, self.check), (self.parameters["publish_period_s"], self.publish_again)
+        ticks = (1.0, self.check), (self.parameters["publish_period_s"], self.again)
         self._timers = [every(self.node, period_s, self._guarded(call)) for period_s, call in ticks]
 
     def deactivate(self) -> None:
@@ -65,7 +68,7 @@ class Interface:
     def stop(self) -> bool:
         """End all threads, an estimate under way included; files under way are finished. True if they ended."""
         if self._ended is None:
-            self._ended = self._end_threads()
+            self._ended = self.end_threads()
             for part in self.parts:
                 part.stop()
             self.files.shutdown(wait=True)
@@ -88,14 +91,6 @@ class Interface:
         """Every second."""
         for part in self.parts:
             part.check()
-
-    def publish_again(self) -> None:
-        """Every publish_period_s."""
-        raise NotImplementedError
-
-    def _end_threads(self) -> bool:
-        """All but those of the parts; True if they ended."""
-        raise NotImplementedError
 
     def _guarded(self, call: Callable[[], None]) -> Callable[[], None]:
         def tick() -> None:

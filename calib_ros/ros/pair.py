@@ -18,7 +18,7 @@ from calib_ros.ros.capture import Capture
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.distributions import remark
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic
-from calib_ros.ros.inputs import PairInputs, SensorSubscriptions, motion_source, of_one_pair
+from calib_ros.ros.inputs import PairInputs, SensorSubscriptions, SharedTopics, motion_source
 from calib_ros.ros.interface import Interface
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, ProcessedPublisher
@@ -32,7 +32,7 @@ class PairInterface(Interface):
     """Of a pair, as docs/vehicle.md lists it. inputs: what a pair shares with others of a rig; None = it is alone."""
 
     def __init__(self, node: Node, inputs: PairInputs | None = None) -> None:
-        declared, self._inputs = parameters.declare(node), inputs or of_one_pair(node)
+        declared, self._inputs = parameters.declare(node), inputs or PairInputs(SharedTopics(node))
         # What may be missing is asked for before anything is made that would have to be taken back.
         motion = motion_source(declared["motion_source"])
         super().__init__(node, declared, self._inputs.shared.node)
@@ -60,6 +60,7 @@ class PairInterface(Interface):
         of_others = [make(node, self.pipeline, self.health) for make in node_services(node.get_logger().warning).values()]
         self.parts += [self.sensors, self.extrinsic, self.initial, self.capture, self.overlay, processed, services, *of_others]
         self.parts.append(DiagnosticsPublisher(self))
+        self.again, self.end_threads = self.extrinsic.again, self.pipeline.stop
         node.add_on_set_parameters_callback(self._on_parameters)
 
     def reset(self) -> None:
@@ -88,13 +89,6 @@ class PairInterface(Interface):
         if self._inputs.common is None:  # else the rig receives them
             self.pipeline.load.count_messages()
         super().check()
-
-    def publish_again(self) -> None:
-        """See `Interface`."""
-        self.extrinsic.again()
-
-    def _end_threads(self) -> bool:
-        return self.pipeline.stop()
 
     def _frame_ids(self, image: Any, cloud: Any) -> tuple[str, str]:
         names = []

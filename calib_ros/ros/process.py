@@ -101,16 +101,11 @@ def _run(name: str, kind: str, args: list[str] | None) -> int:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-        ignore_signals()
+        for number in SIGNALS:  # the interpreter puts all handlers but this one back to their defaults
+            signal.signal(number, signal.SIG_IGN)
         if not ended:
             end_at_once()
     return 0
-
-
-def ignore_signals() -> None:
-    """Of a process that is about to end: the interpreter puts all handlers but this one back to their defaults."""
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
 
 
 def end_at_once() -> None:

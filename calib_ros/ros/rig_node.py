@@ -30,7 +30,7 @@ from calib_ros.online.pacing import LoadBudget
 from calib_ros.online.worker import Worker
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import MOVED, SUSPECT
-from calib_ros.rig.description import CAMERA, RigDescription, read_rig
+from calib_ros.rig.description import RigDescription, read_rig
 from calib_ros.rig.edges import box_of
 from calib_ros.rig.graph import solve
 from calib_ros.rig.lidars import MOTION_KIND
@@ -40,7 +40,7 @@ from calib_ros.ros.answers import ROUNDS, after_answers, serve
 from calib_ros.ros.conversions import transform_message
 from calib_ros.ros.dds import LATCHED
 from calib_ros.ros.executor import Beside
-from calib_ros.ros.inputs import PairInputs, SharedTopics, decoded_clouds, decoded_images
+from calib_ros.ros.inputs import PairInputs, SharedTopics, decoded_once
 from calib_ros.ros.interface import Interface
 from calib_ros.ros.pair import PairInterface
 from calib_ros.ros.parameters import Parameters
@@ -82,11 +82,10 @@ class RigInterface(Interface):
         self._live = LiveRig(self.description, declared.config.refine)
         common, shared = Common(declared.config.online), SharedTopics(node)
         self.load = LoadBudget(declared.config.online, purse=common.purse)  # of receiving messages
-        decoded = {s.name: decoded_images() if s.kind == CAMERA else decoded_clouds() for s in self.description.sensors}
+        decoded = {sensor.name: decoded_once(sensor.kind) for sensor in self.description.sensors}
         self.pairs: dict[Pair, PairInterface] = {}
         self._views: list[PairInputs] = []  # of pairs that are estimated only if they share a view
-        self._beside = Beside(context=node.context)
-        self._beside.spin_from(node)
+        self._beside = Beside(node)
         try:
             for camera, lidar in self.description.camera_pairs:
                 topics = self._topics(camera, lidar)
@@ -102,7 +101,7 @@ class RigInterface(Interface):
                     self._views.append(inputs)
         except BaseException:  # of one pair: the others must not go on
             self._destroy_pairs()
-            self._beside.destroy(node)
+            self._beside.destroy()
             self.tf.destroy()
             raise
         topics_of = {name: self._topics(name, name)[1] for name in self.description.lidars}
@@ -141,7 +140,8 @@ class RigInterface(Interface):
             self._active = False
             self._forget()
 
-    def _end_threads(self) -> bool:
+    def end_threads(self) -> bool:
+        """See `Interface`."""
         with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
             ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
         return all([*ended, *(lidars.end() for lidars in self.lidars), self._solver.stop()])
@@ -163,7 +163,7 @@ class RigInterface(Interface):
 
     def destroy_nodes(self) -> None:
         """See `Interface`."""
-        self._beside.destroy(self.node)
+        self._beside.destroy()
 
     # ---- what the pairs start from --------------------------------------------------------------------------------------
 
@@ -222,8 +222,8 @@ class RigInterface(Interface):
         for view in [own for own in self._views if own.T is None]:  # whose priors TF tells
             if {view.camera, view.lidar} <= priors.keys() | {self.description.reference}:
                 view.T = solve([], priors, self.description.reference).between(view.camera, view.lidar)[0]
-        changed = len(states) != len(self._told) or not all(map(PairState.says_as, states, self._told))
-        if changed or self.state is None or len(priors) + 1 != len(self.state.sensors):
+        told, before = ([(own.extrinsic, own.usable, bool(own.unchecked)) for own in of] for of in (states, self._told))
+        if told != before or self.state is None or len(priors) + 1 != len(self.state.sensors):
             self._told = states
             self._solver.put((self._live, states, priors))
         self._diagnostics_pub.publish(self._diagnostics(priors))
@@ -306,7 +306,7 @@ class RigInterface(Interface):
 
     # ---- messages -------------------------------------------------------------------------------------------------------
 
-    def publish_again(self) -> None:
+    def again(self) -> None:
         """See `Interface`."""
         with self._lock:
             if self.state is not None:

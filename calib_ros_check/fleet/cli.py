@@ -10,7 +10,7 @@ from typing import Any
 
 from calib_ros.cli.inputs import configuration
 from calib_ros.cli.output import note, progress_bar
-from calib_ros.datasets.positions import check_positions
+from calib_ros.datasets.positions import selected
 from calib_ros.errors import BadInputError
 from calib_ros.result import VERSION
 from calib_ros_check.fleet.check import check_fleet
@@ -29,7 +29,7 @@ def check_many(args: argparse.Namespace, options: CheckOptions) -> int:
         if getattr(args, option) is not None:
             raise BadInputError(f"--{option} is for one recording; the page and the tables of a fleet are written into --out")
     if args.frames:
-        check_positions(args.frames)
+        selected(args.frames)
     return _checked(args, options, "checking", vehicle_pattern=args.vehicle_pattern, false_alarms=args.false_alarms)
 
 

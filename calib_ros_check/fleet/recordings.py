@@ -11,7 +11,7 @@ from pathlib import Path
 
 from calib_ros.datasets.capture import is_capture
 from calib_ros.datasets.folder import is_folder_dataset
-from calib_ros.datasets.kitti import drives_in, is_drive
+from calib_ros.datasets.kitti import drives_in, layout_name
 from calib_ros.datasets.once import is_once
 from calib_ros.datasets.open import is_nuscenes, is_single
 from calib_ros.errors import BadInputError
@@ -108,7 +108,7 @@ def _look(folder: Path, found: list[Path], seen: set[str]) -> None:
     named = len(stores) == 1 and stores[0].stem.startswith(folder.name)
     whole = (folder / "metadata.yaml").exists() or named
     single = is_capture(folder) or is_folder_dataset(folder) or is_nuscenes(folder) or is_once(folder)
-    if not children or whole or is_drive(folder) or single:
+    if not children or whole or layout_name(folder) or single:
         found.append(folder)
         return
     found += [*stores, *(child for child in children if child.suffix in OTHERS and child.is_file())]

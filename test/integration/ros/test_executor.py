@@ -17,10 +17,10 @@ pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 
 def test_timers_and_services_of_all_nodes_are_served() -> None:
     rclpy.init()
-    executor, beside, threads = SingleThreadedExecutor(), Beside(), list[int]()
+    executor, threads = SingleThreadedExecutor(), list[int]()
     main, left, right = (rclpy.create_node(name) for name in ("main", "left", "right"))
+    beside = Beside(main)
     beside.spin_ready()  # of no nodes
-    main.create_timer(0.1, beside.spin_ready)
     executor.add_node(main)
     for node in (left, right):
         beside.add_node(node)
