@@ -51,7 +51,11 @@ def calibrate(
         check_output(overlay, "--overlay")
     if initial == "nominal" and not any(config.constraints.limit_m):
         note("the translation is fixed at nominal, which is 0: give a known one by --initial FILE")
-    chosen = _read(source, positions, config)
+    moving_source, chosen = WithMotion(source, config.motion, note, config.lidar.accumulate_s), []
+    with progress_bar("reading  ") as step:
+        for k, i in enumerate(positions):
+            chosen.append(moving_source[i])
+            step(k + 1, len(positions))
     calibrator = Calibrator(chosen[0].camera, config)
     # The models of the package wait until there is doubt; a wrong file of the user is to be told at once.
     if initial in BY_CLASSES or not calibrator.classes_in_doubt_only or not config.semantics.of_package:
@@ -86,16 +90,6 @@ def advice(result: Result, source: Source, config: Config, initial: str = "") ->
     if lacking is None:
         return ""
     return words(lacking, FeatureExtractor(source.camera, config).camera, result.T_camera_lidar, "add frames that show")
-
-
-def _read(source: Source, positions: list[int], config: Config) -> list[Frame]:
-    moving = WithMotion(source, config.motion, note, config.lidar.accumulate_s)
-    chosen = []
-    with progress_bar("reading  ") as step:
-        for k, i in enumerate(positions):
-            chosen.append(moving[i])
-            step(k + 1, len(positions))
-    return chosen
 
 
 def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:

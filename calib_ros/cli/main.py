@@ -115,9 +115,38 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 
 def _rig(args: argparse.Namespace) -> int:
-    from calib_ros.cli.rig import run
+    from calib_ros.cli.inputs import configuration
+    from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
+    from calib_ros.datasets.rig import open_rig
+    from calib_ros.io import check_output, write_atomically
+    from calib_ros.rig.description import read_rig
+    from calib_ros.rig.edges import RigMeasurer
+    from calib_ros.rig.report import RigReport, check_out, load
 
-    return OK if run(args) else NOT_CONVERGED
+    description = read_rig(args.rig)
+    before = None if args.before is None else load(args.before)
+    if before is not None and set(before.poses) != {sensor.name for sensor in description.sensors}:
+        names = ", ".join(before.poses)
+        raise BadInputError(f"--before {args.before} is of other sensors ({names}) than {args.rig}; give a result of this rig")
+    config = configuration(args.config, args.seed)
+    check_json(args.json)
+    if args.report is not None:
+        check_output(args.report, "--report")
+    for path in args.out:
+        check_out(path)
+        check_output(path, "--out")
+    rig = open_rig(args.source, description)
+    with progress_bar("measuring") as step:
+        measurer = RigMeasurer(rig, description, config, args.frames, lambda text, share: step(share))
+        measured = measurer.measure()
+    report = RigReport.of(measurer, measured, before)
+    print_or_save(report, report.text(), args.json)
+    if args.report is not None:
+        write_atomically(args.report, report.html().encode())
+    for path in args.out:
+        if remark := report.write(path):
+            note(f"calib-ros: {remark}")
+    return OK if report.converged else NOT_CONVERGED
 
 
 def _convert(args: argparse.Namespace) -> int:

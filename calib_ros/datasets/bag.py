@@ -64,7 +64,8 @@ class BagSource:
     windows : instead of the whole bag, read only so many short windows of time, evenly spread over it; its frames are then those
         of the windows, and `middles` has the position of one in each, between two others. For a bag that has an index.
 
-    `camera` and `reference` are those of the first frame; `vehicle_frames` are T_camera_F (4, 4) of further frames F, by name.
+    `camera` and `reference` are those of the first frame; `vehicle_frames` are T_camera_F (4, 4) of further frames F, by name;
+    `cloud_ahead_ns` is what is taken out of the clouds' stamps, since their clock is ahead of the images'.
     Raises BadInputError for no or several candidates for a topic, no pairs, a damaged bag or message.
     """
 
@@ -114,6 +115,7 @@ class BagSource:
             self._pair()
         self.windows = 0 if found is None else len(found)
         self.camera_frame, self.lidar_frame = self._index.camera_frame, self._index.lidar_frame
+        self.cloud_ahead_ns = self._index.clock_difference
         if not len(self):
             raise BadInputError(self._no_pairs())
         self.middles = spread_positions(windows, len(self)) if found is None else found
@@ -232,11 +234,6 @@ class BagSource:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @property
-    def cloud_ahead_ns(self) -> int:
-        """What is taken out of the clouds' stamps, since their clock is ahead of the images'."""
-        return self._index.clock_difference
-
     def __len__(self) -> int:
         return len(self._pairs[0])
 
@@ -275,6 +272,10 @@ class BagSource:
     def describe(self) -> dict[str, str]:
         """What the bag holds: label -> text."""
         pairs, images, clouds = len(self), len(self._index.image), len(self._index.cloud)
+        ahead = self.cloud_ahead_ns / NANOSECONDS
+        stamps = "of the headers" + (f", of clouds {-ahead:+.2f} s" if ahead else "")
+        if not self._index.use_headers:
+            stamps = "of the recording" + ("" if self._clock == RECORDING else " (headers have none)")
         roles = {self.image_topic: " as image", self.points_topic: " as points", self.camera_info_topic: " as camera_info"}
         return {
             "kind": "ROS 1 bag" if self._bag.storage == "ROS 1" else "ROS 2 bag",
@@ -287,19 +288,13 @@ class BagSource:
             ),
             "frames": f"{pairs} pairs; without partner: {images - pairs} of {images} images, {clouds - pairs} of {clouds} clouds"
             + (f"; {self.windows} windows of the recording" if self.windows else ""),
-            "stamps": self._stamps_in_words(),
+            "stamps": stamps,
             "pairing": f"scans sweep the view {self._sweep_offset / 1e6:+.0f} ms from their stamps",
             "camera": describe_camera(self.camera) + (RECTIFIED if self.rectified else ""),
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,
             "reference": "none" if self.reference is None else "from /tf_static",
         }
-
-    def _stamps_in_words(self) -> str:
-        if not self._index.use_headers:
-            return "of the recording" + ("" if self._clock == RECORDING else " (headers have none)")
-        ahead = self._index.clock_difference / NANOSECONDS
-        return "of the headers" + (f", of clouds {-ahead:+.2f} s" if ahead else "")
 
 
 def cloud_of(message: Any, kind: str) -> PointCloud:

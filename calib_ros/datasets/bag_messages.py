@@ -157,10 +157,10 @@ def _of_ros1(reader: Ros1Reader, topics: Collection[str], whole: Collection[str]
         fields = typestore().fielddefs[layout_of(connection)][1]
         is_whole = connection.topic in whole or not fields or fields[0][0] != "header"
         data = read_bytes(file, size if is_whole else min(size, HEAD))
-        yield connection.topic, entry.time, _cdr_of_ros1(data, connection) if is_whole else _header_as_cdr(data)
-
-
-def _header_as_cdr(data: bytes) -> bytes:
-    """The std_msgs/Header that begins a message of ROS 1: without its number, and with a frame's name that ends by a zero."""
-    seconds, nanoseconds, length = struct.unpack_from("<III", data, 4)
-    return b"\0\1\0\0" + struct.pack("<III", seconds, nanoseconds, length + 1) + data[16 : 16 + length] + b"\0"
+        if is_whole:
+            yield connection.topic, entry.time, _cdr_of_ros1(data, connection)
+            continue
+        # In ROS 2 the header has no number, and the name of a frame ends by a zero.
+        seconds, nanoseconds, length = struct.unpack_from("<III", data, 4)
+        header = struct.pack("<III", seconds, nanoseconds, length + 1) + data[16 : 16 + length]
+        yield connection.topic, entry.time, b"\0\1\0\0" + header + b"\0"

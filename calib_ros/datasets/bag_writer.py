@@ -74,13 +74,6 @@ def write_rig_bag(
     if described.exists():
         raise BadInputError(f"{described} exists already and is not overwritten; remove it or give another path")
     _write(_of_rig(rig, progress), path, storage)
-    text = yaml.safe_dump(description_of(rig), sort_keys=False, default_flow_style=None, width=200)
-    write_atomically(described, text.encode())
-    return path, described
-
-
-def description_of(rig: RecordedRig) -> dict[str, Any]:
-    """The description, as in rig.yaml, of the bag that a rig is written to."""
     sensors: dict[str, Any] = {}
     for name in (*rig.lidars, *rig.cameras):
         is_camera = name in rig.cameras
@@ -91,7 +84,10 @@ def description_of(rig: RecordedRig) -> dict[str, Any]:
             T = rig.prior(name)
             parts = {"translation_m": T[:3, 3], "quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3])}
             sensors[name]["prior"] = {key: [round(float(v), SHOWN_DIGITS) for v in values] for key, values in parts.items()}
-    return {"reference": rig.reference_sensor, "sensors": sensors}
+    description = {"reference": rig.reference_sensor, "sensors": sensors}
+    text = yaml.safe_dump(description, sort_keys=False, default_flow_style=None, width=200)
+    write_atomically(described, text.encode())
+    return path, described
 
 
 def _write(messages: Iterable[Message], path: Path, storage: str) -> Path:

@@ -47,25 +47,20 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         _refuse(options, text)
         named: Source = opened_by_name(text) if camera is None else opened_by_name(text, camera)
         return named
-    if is_nuscenes(path):
-        _refuse(options, text)
-        return NuScenesSource(path, camera)
-    if not path.exists():
+    if not path.exists() and not is_nuscenes(path):
         by_name = "".join(f", or '{name}'" for name in installed(SOURCES))
         raise BadInputError(f"{text} does not exist; give a folder or a bag{by_name}")
     # Readers of bags are imported where needed: rosbags alone takes a third of a second.
-    if is_bag(path) or is_capture(path):
+    if not is_nuscenes(path) and (is_bag(path) or is_capture(path)):
         from calib_ros.datasets.bag import BagSource
 
         known = list(signature(BagSource).parameters)[1:]
         _refuse({name: options[name] for name in options.keys() - known}, text)
         return CaptureSource(path, **options) if is_capture(path) else BagSource(path, **options)
-    if is_folder_dataset(path):
-        _refuse(options, text)
-        return FolderSource(path, camera)
-    if is_once(path):
-        _refuse(options, text)
-        return OnceSource(path, camera)
+    for fits, reader in ((is_nuscenes, NuScenesSource), (is_folder_dataset, FolderSource), (is_once, OnceSource)):
+        if fits(path):
+            _refuse(options, text)
+            return reader(path, camera)
     if any(path.glob("lidar/*.pkl*")):
         raise BadInputError(
             f"{text}: PandaSet's scans are pickles, which run code where they are read; write x, y, z, i of pandas.read_pickle, "

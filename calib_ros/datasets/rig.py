@@ -67,7 +67,15 @@ class ChosenSensors(ByDescription):
     def __init__(self, rig: RigSource, description: RigDescription) -> None:
         super().__init__(rig.name, description)
         self.rig = rig
-        self._own = {sensor.name: _own_name(sensor, rig) for sensor in description.sensors}
+        self._own: dict[str, str] = {}
+        for sensor in description.sensors:
+            names = rig.cameras if sensor.kind == CAMERA else rig.lidars
+            found = [name for name in (sensor.topic, sensor.name) if name in names]
+            if not found:
+                raise BadInputError(
+                    f"{rig.name} has no {sensor.kind} {sensor.name}; name by topic one that it has: {', '.join(names) or 'none'}"
+                )
+            self._own[sensor.name] = found[0]
 
     def camera(self, name: str) -> Camera:
         """As of any rig."""
@@ -89,16 +97,6 @@ class ChosenSensors(ByDescription):
     def scans(self, lidar: str) -> Timed:
         """As of any rig."""
         return self.rig.scans(self._own[lidar])
-
-
-def _own_name(sensor: Sensor, rig: RigSource) -> str:
-    names = rig.cameras if sensor.kind == CAMERA else rig.lidars
-    found = [name for name in (sensor.topic, sensor.name) if name in names]
-    if not found:
-        raise BadInputError(
-            f"{rig.name} has no {sensor.kind} {sensor.name}; name by topic one that it has: {', '.join(names) or 'none'}"
-        )
-    return found[0]
 
 
 class OneLidarRig(ByDescription):

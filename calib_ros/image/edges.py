@@ -155,7 +155,7 @@ def blurred_levels(
     """Edge maps (H, W) of any number of channels -> levels, coarse to fine.
 
     The blur is an angle: it grows with the focal length (px). Coarse levels are stored smaller, at about half their blur.
-    local_contrast: divide every level by its local mean (see `_normalised`).
+    local_contrast: divide every level by its local mean.
     """
     levels = []
     for sigma in sigmas:
@@ -175,23 +175,18 @@ def _blurred(edge: Map, sigma: float, scale: int, local_contrast: bool) -> NDArr
         sigma = float(np.sqrt(sigma**2 - (scale**2 - 1) / 12)) / scale  # the box filter of the shrinking is part of the blur
     edge = np.asarray(cv2.GaussianBlur(edge, (0, 0), sigma), np.float32)
     if local_contrast:
-        edge = _normalised(edge, sigma)
+        # (a - b) / (b + OFFSET mean b) for an edge map a and its local mean b. Without it a coarse level measures how many edges
+        # there are: a cloud over the busiest part scores more than the truth.
+        wide = _wide_blur(edge, float(np.sqrt(LOCAL_MEAN**2 - 1)) * sigma)
+        offset = np.float32(LOCAL_OFFSET * cv2.mean(wide)[0] + 1e-6)
+        np.subtract(edge, wide, out=edge)
+        wide += offset
+        edge /= wide
     mean, deviation = cv2.meanStdDev(edge)
     if deviation[0, 0] < 1e-6:  # a uniform image has no edges
         return np.zeros(edge.shape, np.int16)
     units = 1 / (deviation[0, 0] * UNIT)
     return np.asarray(cv2.addWeighted(edge, units, edge, 0, -mean[0, 0] * units, dtype=cv2.CV_16S), np.int16)
-
-
-def _normalised(edge: Map, sigma: float) -> Map:
-    """(a - b) / (b + OFFSET mean b): an edge map a, blurred by sigma, relative to its local mean b."""
-    # Without it a coarse level measures how many edges there are: a cloud over the busiest part scores more than the truth.
-    wide = _wide_blur(edge, float(np.sqrt(LOCAL_MEAN**2 - 1)) * sigma)
-    offset = np.float32(LOCAL_OFFSET * cv2.mean(wide)[0] + 1e-6)
-    np.subtract(edge, wide, out=edge)
-    wide += offset
-    edge /= wide
-    return edge
 
 
 def _wide_blur(values: Map, sigma: float) -> Map:

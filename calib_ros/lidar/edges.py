@@ -161,12 +161,12 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
         lost = np.isnan(above)
         above[lost] = far[lost]
         steps = steps + lost
-    expected = _extrapolated(R, _below(R), steps)
+    expected = _extrapolated(R, _above(R, -1), steps)
     jump = above - expected
     with np.errstate(invalid="ignore"):
         mask = _measured(scan, config) & (jump > np.maximum(JUMP_MIN, TOP_JUMP_RATIO * expected))
         mask &= ~(continued - R < np.maximum(JUMP_MIN, TOP_JUMP_RATIO * R))
-    return _cells(mask & ~np.isnan(_below(R)), EdgeKind.TOP, 0, _jump_strength(jump))
+    return _cells(mask & ~np.isnan(_above(R, -1)), EdgeKind.TOP, 0, _jump_strength(jump))
 
 
 def _sky_side_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> list[EdgeCells]:
@@ -193,7 +193,7 @@ def _sky_top_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> EdgeC
     for rows in range(1, CLEAR_RINGS + 1):
         above = np.isnan(_above(scan.range, rows))
         clear &= above & np.roll(above, 1, 1) & np.roll(above, -1, 1)
-    mask = _measured(scan, config) & clear & ~np.isnan(_below(scan.range))
+    mask = _measured(scan, config) & clear & ~np.isnan(_above(scan.range, -1))
     mask[: CLEAR_RINGS - 1] = False  # nothing is measured above the top rings
     return _cells(mask & ~empty & ~fading, EdgeKind.SKY_TOP, 0)
 
@@ -201,14 +201,14 @@ def _sky_top_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> EdgeC
 def _grazed(scan: RangeImage) -> Mask:
     """Cells whose surface, from the cell below to them, is seen at less than GRAZING; False where the cell below is empty."""
     # Ground that is seen so flat returns too little from some distance on: where it ends on an open road, there is no edge.
-    below = _below(scan.range)
+    below = _above(scan.range, -1)
     step = np.diff(scan.elevation, append=scan.elevation[-1:])[:, None].astype(np.float32)  # to the ring below
     # Of the triangle of scanner, cell and cell below: the angle at the cell.
     across, along = below * np.abs(np.sin(step)), scan.range - below * np.cos(step)
     with np.errstate(invalid="ignore"):
         flat = (across < np.tan(GRAZING) * along) & (along > LEAST_ALONG)
     # A surface, not the jump from one thing to another above it: it goes on below, if anything is measured there.
-    goes_on = np.isnan(_below(below))
+    goes_on = np.isnan(_above(below, -1))
     goes_on[:-1] |= flat[1:]
     return np.asarray(flat & goes_on)
 
@@ -296,14 +296,9 @@ def _extrapolated(R: NDArray[np.float32], before: NDArray[np.float32], steps: ND
 
 
 def _above(values: NDArray[np.float32], rows: int) -> NDArray[np.float32]:
-    out = np.full_like(values, np.nan)
-    out[rows:] = values[: len(values) - rows]
-    return out
-
-
-def _below(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    out = np.full_like(values, np.nan)
-    out[:-1] = values[1:]
+    """Of each cell the value so many rows above, -1 = below; NaN beyond the ends."""
+    out = np.roll(values, rows, 0)
+    out[slice(rows) if rows > 0 else slice(rows, None)] = np.nan
     return out
 
 

@@ -231,7 +231,15 @@ def _project(cloud: PointCloud, azimuth: Angles, elevation: Angles, distance: An
     centre = np.asarray(top - (np.arange(rows) + 0.5) * step, np.float64)
     measured = np.where(index >= 0, distance[index], np.nan).astype(np.float32)
     samples = Samples(azimuth, elevation, distance, order, start)
-    ranges = _range_at_centre(measured, index, samples, centre, step)
+    # Ranges at the centres of cells are extrapolated on the plane through neighbours, on which the inverse range is linear:
+    # on a road, points at different heights of one cell lie metres apart, and that is not an edge.
+    q = 1 / measured.astype(np.float64)
+    up = np.where(index >= 0, elevation[index], np.nan)
+    left = np.where(index >= 0, azimuth[index], np.nan)
+    off_left = (np.arange(columns) + 0.5)[None] * step - np.pi - left
+    q_centre = q + _slope(q, up, 0, step) * (centre[:, None] - up) + _slope(q, left, 1, step) * off_left
+    with np.errstate(invalid="ignore"):
+        ranges = np.asarray(1 / np.clip(q_centre, 0.5 * q, 2 * q), np.float32)
     index[isolated_returns(ranges)] = -1
     _fill(ranges)
     cones = np.stack([np.zeros(rows), np.tan(centre)], axis=1)
@@ -271,19 +279,6 @@ def _cells_hit(azimuth: Angles, elevation: Angles, size: float) -> int:
     row, column = ((elevation + np.pi / 2) / size).astype(np.int64), ((azimuth + np.pi) / size).astype(np.int64)
     cells = np.sort((row * columns + column).astype(np.uint32))  # np.unique hashes, which takes fifty times as long
     return int(np.count_nonzero(cells[1:] != cells[:-1])) + 1
-
-
-def _range_at_centre(raw: Ranges, index: NDArray[np.int32], samples: Samples, middle: NDArray[np.float64], step: float) -> Ranges:
-    """Ranges at the cell centres, extrapolated on the plane through neighbouring cells: on it the inverse range is linear."""
-    # On a road, points at different heights of one cell lie metres apart, and that is not an edge.
-    q = 1 / raw.astype(np.float64)
-    up = np.where(index >= 0, samples.elevation[index], np.nan)
-    left = np.where(index >= 0, samples.azimuth[index], np.nan)
-    off_up = middle[:, None] - up
-    off_left = (np.arange(raw.shape[1]) + 0.5)[None] * step - np.pi - left
-    out = q + _slope(q, up, 0, step) * off_up + _slope(q, left, 1, step) * off_left
-    with np.errstate(invalid="ignore"):
-        return np.asarray(1 / np.clip(out, 0.5 * q, 2 * q), np.float32)
 
 
 def _slope(q: NDArray[np.float64], angle: NDArray[np.float64], axis: int, step: float) -> NDArray[np.float64]:

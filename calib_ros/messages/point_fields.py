@@ -148,7 +148,9 @@ def seconds_from_stamp(values: NDArray[Any], stamp: int) -> tuple[NDArray[np.flo
         return np.zeros(len(counts), np.float32), ""
     number = int if integers else float  # Python's int cannot overflow in the differences below
     first, last = number(counts[valid].min()), number(counts[valid].max())
-    unit = _time_unit(last - first, INTEGER_TIME_UNITS if integers else FLOAT_TIME_UNITS)
+    span, units, (shortest, longest) = last - first, INTEGER_TIME_UNITS if integers else FLOAT_TIME_UNITS, SCAN_NS
+    shorter = units[0] if span * units[0] < shortest else None
+    unit = next((unit for unit in units if shortest <= span * unit <= longest), shorter)
     if unit is None:
         return None, "the times of the points span more than a scan can last in any unit; check the LiDAR driver"
     if max(abs(first), abs(last)) * unit <= RELATIVE_NS:
@@ -170,14 +172,6 @@ def seconds_from_stamp(values: NDArray[Any], stamp: int) -> tuple[NDArray[np.flo
     seconds = ((counts - origin) * (unit * 1e-9)).astype(np.float32)
     seconds[~valid] = 0
     return seconds, ""
-
-
-def _time_unit(span: float, units: tuple[int, ...]) -> int | None:
-    shortest, longest = SCAN_NS
-    for unit in units:
-        if shortest <= span * unit <= longest:
-            return unit
-    return units[0] if span * units[0] < shortest else None
 
 
 def _columns(msg: Any, width: int, height: int) -> dict[str, NDArray[Any]]:

@@ -69,7 +69,9 @@ def hypotheses(before: RigSolution, edges: Sequence[Edge]) -> list[RigHypothesis
         groups = combinations(names, m) if len(names) <= MOST or m == 1 else ()
         # Every number of sensors is as likely as the next lower one divided by their number: what moves is mostly one sensor.
         prior = np.log(CHANGED * (0.5 if clocks else 1.0) * 0.5 ** (m - 1) / comb(len(names), m))
-        found += [(MOVED, group, model.moved(group), model.knock(group), prior) for group in groups]
+        for group in groups:
+            knock = prior_covariance(se3.from_parts(np.eye(3), model.centre(group)), KNOCK_DEG, KNOCK_M)
+            found.append((MOVED, group, model.moved(group), knock, prior))
     if clocks:
         prior = np.log(CHANGED * 0.5 / len(names))
         found += [(CLOCK, (name,), model.jumped(name), np.array([[JUMP_S**2]]), prior) for name in names]
@@ -160,10 +162,6 @@ class _Model:
             elif sign and edge.twist is not None:
                 B[6 * k : 6 * k + 6, 0] = sign * se3.adjoint(edge.T) @ edge.twist
         return B
-
-    def knock(self, group: Sequence[str]) -> Covariance:
-        """Prior covariance (6, 6) of how a group moves, about its middle."""
-        return prior_covariance(se3.from_parts(np.eye(3), self.centre(group)), KNOCK_DEG, KNOCK_M)
 
     def centre(self, group: Sequence[str]) -> Matrix:
         """Middle (3,) of a group, m in the reference's frame."""

@@ -163,7 +163,12 @@ class Capture(NodeService):
             raise BadInputError(f"nothing captured of {kind}: there is no keyframe, or one takes all that captures may")
         size = MOST_BYTES - rest + sum(map(_size, frames))
         with suppress(OSError):  # said by who writes there
-            _make_room(Path(parameters["capture_dir"]), KEPT - 1, MOST_BYTES - size)
+            inside = Path(parameters["capture_dir"]).iterdir()
+            boxes = sorted(path for path in inside if BLACK_BOX.fullmatch(path.name) and path.is_dir() and not path.is_symlink())
+            sizes = [sum(file.stat().st_size for file in box.rglob("*") if file.is_file()) for box in boxes]
+            while boxes and (len(boxes) >= KEPT or sum(sizes) > MOST_BYTES - size):
+                shutil.rmtree(boxes.pop(0), ignore_errors=True)
+                del sizes[0]
         return _write(parameters, f"event_{{}}_{kind}", frames, result, files)
 
     def _kept(self) -> list[RawKeyframe]:
@@ -212,17 +217,6 @@ def _write(parameters: Parameters, name: str, frames: list[RawKeyframe], result:
             f"nothing captured: {folder} cannot be written ({error.strerror or error}); check the folder and its free space"
         ) from None
     return f"{len(frames)} keyframes saved to {target}"
-
-
-def _make_room(folder: Path, keep: int, most: int) -> None:
-    """Delete the black box's oldest captures until no more than `keep` are left, of no more than `most` bytes together."""
-    boxes = sorted(
-        path for path in folder.iterdir() if BLACK_BOX.fullmatch(path.name) and path.is_dir() and not path.is_symlink()
-    )
-    sizes = [sum(file.stat().st_size for file in box.rglob("*") if file.is_file()) for box in boxes]
-    while boxes and (len(boxes) > keep or sum(sizes) > most):
-        shutil.rmtree(boxes.pop(0), ignore_errors=True)
-        del sizes[0]
 
 
 def _types() -> Any:

@@ -23,7 +23,7 @@ from calib_ros import se3
 from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image
 from calib_ros.messages.point_fields import LIVOX_FIELDS, LIVOX_OFFSETS, LIVOX_STRIDE, livox_scan
-from calib_ros.messages.wire import WireHeader, wire_header
+from calib_ros.messages.wire import WireHeader
 from calib_ros.online.coach import Advice
 from calib_ros.result import Consumer, Extrinsic
 
@@ -51,11 +51,6 @@ class Serialized:
     header: Header
     data: bytes
     restore: Callable[[bytes], Any]
-
-    @classmethod
-    def of(cls, data: bytes, restore: Callable[[bytes], Any]) -> Serialized:
-        """From the bytes of a message that begins with a header."""
-        return cls(header_message(wire_header(data)), data, restore)
 
     def message(self) -> Any:
         """The message, decoded anew."""

@@ -85,14 +85,12 @@ class Health(NodeService):
 
     def add(self, event: Any) -> None:
         """Log what the pipeline tells a person."""
-        if isinstance(event, ExtrinsicUpdated):
-            self._add_extrinsic(event.extrinsic)
-        elif isinstance(event, Problem):
+        if isinstance(event, Problem):
             (self.note if event.solved else self.error)(event.message, event.kind)
-
-    def _add_extrinsic(self, extrinsic: Extrinsic) -> None:
-        before, self.extrinsic = self.extrinsic, extrinsic
-        result = extrinsic.result
+        if not isinstance(event, ExtrinsicUpdated):
+            return
+        before, extrinsic = self.extrinsic, event.extrinsic
+        self.extrinsic, result = extrinsic, extrinsic.result
         accepted = extrinsic.accepted > 0 and (before is None or extrinsic.accepted != before.accepted)
         if accepted:
             self._estimated_at = time.monotonic()
@@ -245,13 +243,8 @@ class Diagnostics:
         # With the monitor's last assessment, which is not published while the extrinsic is right.
         state = self._health.extrinsic if recalibrator is None else recalibrator.current
         if state is None:
-            return {
-                "estimates accepted": "0",
-                "age of the last estimate, s": "none",
-                "status": "none",
-                "cause": "none",
-                "drift": "none",
-            }
+            unknown = ("age of the last estimate, s", "status", "cause", "drift")
+            return {"estimates accepted": "0", **dict.fromkeys(unknown, "none")}
         result = state.result
         values = {
             "estimates accepted": str(state.accepted),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -66,7 +67,13 @@ class InitialExtrinsic(NodeService):
     def before_messages(self) -> Result:
         """The initial extrinsic before any message has named the sensors, as far as the parameters allow it; without TF."""
         parameters = self._parameters()
-        return self._from_file() or parameters.initial() or Result(nominal(parameters["nominal_yaw_deg"]), INITIAL)
+        if os.path.exists(parameters["state_file"]):
+            with suppress(BadInputError):  # reported when the sensors are known and the start is chosen
+                saved = read_state(parameters["state_file"]).result
+                names = (parameters["camera_frame"], saved.camera_frame), (parameters["lidar_frame"], saved.lidar_frame)
+                if all(wanted in ("", found) for wanted, found in names):
+                    return replace(saved, status=INITIAL, reason="from the saved state", origin=InitialSource.SAVED_STATE)
+        return parameters.initial() or Result(nominal(parameters["nominal_yaw_deg"]), INITIAL)
 
     def check(self) -> None:
         """Start anew if TF has come for an extrinsic that started as nominal, and no estimate has been accepted since."""
@@ -104,18 +111,3 @@ class InitialExtrinsic(NodeService):
             self._error(str(error), "state file written")
             return False, str(error)
         return True, f"saved to {path}"
-
-    def _from_file(self) -> Result | None:
-        """The saved extrinsic, unless the parameters name other frames."""
-        parameters = self._parameters()
-        path = parameters["state_file"]
-        if not path or not os.path.exists(path):
-            return None
-        try:
-            saved = read_state(path).result
-        except BadInputError:
-            return None  # reported when the sensors are known and the start is chosen
-        names = ((parameters["camera_frame"], saved.camera_frame), (parameters["lidar_frame"], saved.lidar_frame))
-        if any(wanted and wanted != found for wanted, found in names):
-            return None
-        return replace(saved, status=INITIAL, reason="from the saved state", origin=InitialSource.SAVED_STATE)

@@ -126,19 +126,15 @@ class DiagnosticsPublisher(NodeService):
         self._status = ""
         self._published_at = 0.0  # for a change of status, by time.monotonic()
         self._noted = ""  # the newest line
-        self._active = False
-        self._diagnostics = self._made()
-
-    def _made(self) -> Diagnostics:
-        return Diagnostics(self._node.get_fully_qualified_name(), self._own.health, self._own.pipeline)
+        self._diagnostics: Diagnostics | None = None  # while the node is active
 
     def start(self) -> None:
         """Rates count from now on."""
-        self._diagnostics, self._active = self._made(), True
+        self._diagnostics = Diagnostics(self._node.get_fully_qualified_name(), self._own.health, self._own.pipeline)
 
     def pause(self) -> None:
         """See `NodeService`."""
-        self._active = False
+        self._diagnostics = None
 
     def destroy(self) -> None:
         """See `NodeService`."""
@@ -155,34 +151,32 @@ class DiagnosticsPublisher(NodeService):
         """At once, but not for a status that flickers: the next second is soon enough then."""
         with self._own.health.guard():
             now = time.monotonic()
-            if self._active and now - self._published_at >= DIAGNOSED_AGAIN_S:
+            if self._diagnostics is not None and now - self._published_at >= DIAGNOSED_AGAIN_S:
                 self._published_at = now
-                self._publish()
+                self._publish(self._diagnostics)
 
     def check(self) -> None:
         """See `NodeService`."""
-        self._diagnostics.count()
-        self._publish()
+        if self._diagnostics is not None:
+            self._diagnostics.count()
+            self._publish(self._diagnostics)
 
-    def _publish(self) -> None:
+    def _publish(self, diagnostics: Diagnostics) -> None:
         own = self._own
         extra = {"reliable topics": " ".join(s.topic for s in own.sensors.adaptive if s.reliable) or "none"}
         extra["raw keyframes kept"] = str(len(own.capture))
         if own.parameters["consumers"]:
             extra["usable for"] = " ".join(own.extrinsic.served) or "none"
-        message = self._diagnostics.message(self._node.get_clock().now().to_msg(), extra)
+        message = diagnostics.message(self._node.get_clock().now().to_msg(), extra)
         message.status += [status for part in own.parts if (status := part.status()) is not None]
+        # The vehicle and both sensors, as far as they are known.
+        given, recalibrator = own.parameters, own.pipeline.recalibrator
+        frames = [given["camera_frame"], given["lidar_frame"]]
+        if recalibrator is not None:
+            frames = [recalibrator.tracker.initial.camera_frame, recalibrator.tracker.initial.lidar_frame]
         for status in message.status:
-            status.hardware_id = self._hardware_id()
+            status.hardware_id = " ".join(filter(None, [given["vehicle"], *frames]))
         self._publisher.publish(message)
         if (health := message.status[0].message) != self._noted:
             self._noted = health
             own.capture.black_box.note(health, "health")
-
-    def _hardware_id(self) -> str:
-        """The vehicle and both sensors, as far as they are known."""
-        given, recalibrator = self._own.parameters, self._own.pipeline.recalibrator
-        frames = [given["camera_frame"], given["lidar_frame"]]
-        if recalibrator is not None:
-            frames = [recalibrator.tracker.initial.camera_frame, recalibrator.tracker.initial.lidar_frame]
-        return " ".join(filter(None, [given["vehicle"], *frames]))

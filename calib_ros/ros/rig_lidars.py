@@ -36,7 +36,7 @@ class LidarsOfRig(NodeService):
     """Registers the scans of two LiDARs, those that cameras look at as well, on a thread of its own and within the load budget.
 
     names: target and source, their topics and decoders by name. start: T_target_source (4, 4) to begin with, None = unknown yet.
-    To be used on the executor's thread.
+    worker: its thread. To be used on the executor's thread.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class LidarsOfRig(NodeService):
         self._beat: int | None = None  # the same of those that were looked at
         self.urgent = False  # a displacement is suspected, whatever this pair has seen
         self._listeners: dict[str, Listener] = {}
-        self._worker: Worker[Moment] = Worker("calib_lidars", self._register, self._failed)
+        self.worker: Worker[Moment] = Worker("calib_lidars", self._register, self._failed)
 
     def start(self) -> None:
         """Receive scans."""
@@ -81,19 +81,11 @@ class LidarsOfRig(NodeService):
         config = self._parameters().config
         self.pair = LidarPair(*self.names, config.motion.time_offset_sigma_s, config.refine)
 
-    def end(self) -> bool:
-        """End the thread; True if it ended."""
-        return self._worker.stop()
-
-    def silent(self) -> str:
-        """Which of both has sent nothing for max_data_age_s, for a person; "" if both have."""
-        most = self._parameters()["max_data_age_s"]
-        told = [(name, own) for name, own in self._listeners.items() if own.silent_s > most]
-        return ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told)
-
     def state(self) -> PairState:
         """What it says of itself now."""
-        extrinsic, silent = self.pair.extrinsic, self.silent()
+        extrinsic, most = self.pair.extrinsic, self._parameters()["max_data_age_s"]
+        told = [(name, own) for name, own in self._listeners.items() if own.silent_s > most]
+        silent = ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told)
         return PairState(*self.names, extrinsic, extrinsic.usable and not silent, silent, self.pair.kind)
 
     def check(self) -> None:
@@ -118,16 +110,16 @@ class LidarsOfRig(NodeService):
             if at is None:
                 return
             moment[one] = [recent[at - 1], recent[at]]
-        if self._worker.busy or not self.load.allows_estimate(True):
+        if self.worker.busy or not self.load.allows_estimate(True):
             return
         self._beat = reached
         stamps = [scans[1][0] for scans in moment.values()]
         if max(stamps) - min(stamps) <= MAX_GAP_S * NANOSECONDS and self._start() is not None:
-            self._worker.put(moment)
+            self.worker.put(moment)
 
     def _register(self, moment: Moment) -> None:
         pair, T, motion = self.pair, self._start(), self._parameters().config.motion
-        with self._common.estimates.mine(self._worker.check_cancelled), self.load.counting(Work.ESTIMATES):
+        with self._common.estimates.mine(self.worker.check_cancelled), self.load.counting(Work.ESTIMATES):
             self.load.start_estimate()
             scans = [
                 LidarScans([(s, self._decoded[name](m)) for s, m in own], motion, estimate=self._common.scans(name).motion)

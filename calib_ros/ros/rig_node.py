@@ -144,7 +144,7 @@ class RigInterface(Interface):
         """See `Interface`."""
         with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
             ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
-        return all([*ended, *(lidars.end() for lidars in self.lidars), self._solver.stop()])
+        return all([*ended, *(lidars.worker.stop() for lidars in self.lidars), self._solver.stop()])
 
     def destroy(self) -> bool:
         """See `Interface`."""

@@ -19,7 +19,8 @@ from calib_ros.messages import stamp_ns
 from calib_ros.messages.compressed_points import COMPRESSED_POINTS
 from calib_ros.messages.point_fields import LIVOX
 from calib_ros.messages.video import VIDEO
-from calib_ros.ros.conversions import Serialized, cloud_of_livox
+from calib_ros.messages.wire import wire_header
+from calib_ros.ros.conversions import Serialized, cloud_of_livox, header_message
 from calib_ros.ros.dds import profile_for_sender
 from calib_ros.ros.distributions import SubscriptionEventCallbacks, UnsupportedEventTypeError, where_nobody_publishes
 
@@ -188,7 +189,7 @@ class AdaptiveSubscription:
 
     def _receive(self, subscription: int, restore: Callable[[bytes], Any], data: bytes) -> None:
         with self._guard():
-            msg = Serialized.of(data, restore)
+            msg = Serialized(header_message(wire_header(data)), data, restore)
             stamp = stamp_ns(msg.header.stamp)
             # Received through the other subscription already. Through the same one it is another message: time may stand still,
             # or not be stamped at all.

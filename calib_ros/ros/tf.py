@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -36,14 +37,6 @@ CURES = (
 )
 
 
-def _tf_message() -> Any:
-    try:
-        from tf2_msgs.msg import TFMessage
-    except ImportError:
-        return None
-    return TFMessage
-
-
 class StaticTf(NodeService):
     """Reads the static tree for an initial extrinsic, and publishes the extrinsic to it while publish_tf says so.
 
@@ -57,7 +50,11 @@ class StaticTf(NodeService):
         self._node, self._parameters, self._error, self._cures = node, parameters, error, cures
         self._tree = StaticTransforms()  # of everybody but this node
         self._since = time.monotonic()
-        self._type = _tf_message()
+        self._type: Any = None
+        with suppress(ImportError):
+            from tf2_msgs.msg import TFMessage
+
+            self._type = TFMessage
         self._publisher: Any = None
         self._own: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
         self._wanted: tuple[Result, int] | None = None  # the newest that was to be published, with its stamp

@@ -109,7 +109,7 @@ class RigPeer(NodeAndPeer):
                 pairs, stream = self.cameras if name == self.lidar else (), "clouds"
                 for own in self.calibration.lidars:
                     self.until(lambda o=own, n=name, s=stamp: o._recent[n] and o._recent[n][-1][0] == s, f"a scan of {name}")
-                    assert own._worker.wait_idle(LIMIT_S)
+                    assert own.worker.wait_idle(LIMIT_S)
             else:
                 image = value[0] if isinstance(value, tuple) else value
                 frame = Frame(image, NO_CLOUD, self.rig.camera(name), stamp)

@@ -143,7 +143,7 @@ def test_clocks_of_clouds_may_count_from_elsewhere(street, tmp_path):
     later = 10**18
 
     def received(message: Any) -> Serialized:
-        return Serialized.of(serialize_message(message), partial(deserialize_message, message_type=type(message)))
+        return Serialized(message.header, serialize_message(message), partial(deserialize_message, message_type=type(message)))
 
     kept = [
         RawKeyframe(

@@ -288,13 +288,13 @@ def test_without_the_library_lidars_keep_their_priors_and_one_line_says_so(two, 
     for name, recent in own._recent.items():
         for stamp, message in list(recent) * 2:
             alone._add(name, stamp, message)
-            assert alone._worker.wait_idle(240)
+            assert alone.worker.wait_idle(240)
     assert own._health.errors == errors + 1
     assert "lidar_right and lidar_left are not registered to each other" in own._health.last_error[0]
     assert "pip install small_gicp" in own._health.last_error[0]
     assert (alone.state().status, alone.state().edge()) == ("initial", None)
     assert "pip install small_gicp" in alone.state().reason
-    assert alone.end()
+    assert alone.worker.stop()
 
 
 def test_a_reset_forgets_what_the_lidars_told_of_each_other(two) -> None:
