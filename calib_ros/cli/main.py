@@ -7,7 +7,6 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TextIO
 
 from calib_ros.cli.arguments import BAD_INPUT, parser
 from calib_ros.errors import BadInputError, CalibrationError
@@ -67,17 +66,10 @@ def _run(given: Sequence[str]) -> int:
     return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
 
 
-def _print_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def _print_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object, **__: object) -> None:
     """Print our notes to the user, such as a renamed parameter, in one line; other warnings as Python writes them."""
     ours = category is FutureWarning and "calib_ros" in filename
-    print(f"calib-ros: {message}" if ours else warnings.formatwarning(message, category, filename, lineno, line), file=sys.stderr)
+    print(f"calib-ros: {message}" if ours else warnings.formatwarning(message, category, filename, lineno), file=sys.stderr)
 
 
 def _info(args: argparse.Namespace) -> int:

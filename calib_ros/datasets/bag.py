@@ -120,7 +120,7 @@ class BagSource:
             raise BadInputError(self._no_pairs())
         self.middles = spread_positions(windows, len(self)) if found is None else found
         first = int(self._pairs[0][0])
-        self.vehicle_frames = self._index.vehicle_frames()
+        self.vehicle_frames = self._index.tree.others(self.camera_frame, self.lidar_frame)
         self.camera = self._index.camera_at(int(self._index.image.stamps[first]))
         self.reference = self._index.reference_at(int(self._index.image.recorded[first]))
 

@@ -109,11 +109,11 @@ class BagIndex:
         self.clock_difference = self.clouds_ahead if of_clocks else 0
         self.cloud.stamps = self.cloud.stamps - self.clock_difference
         # T_camera_lidar with its recording time, ns, whenever a static transform has changed it.
-        self._tree = StaticTransforms()
+        self.tree = StaticTransforms()
         self._references: list[tuple[int, Matrix]] = []
         for recorded, message in self._transforms:
-            self._tree.add(message)
-            T = self._tree.lookup(self.camera_frame, self.lidar_frame)
+            self.tree.add(message)
+            T = self.tree.lookup(self.camera_frame, self.lidar_frame)
             if T is not None and not (self._references and np.array_equal(T, self._references[-1][1])):
                 self._references.append((recorded, T))
 
@@ -127,11 +127,6 @@ class BagIndex:
         recorded, header = int(index.recorded[position]), int(index.headers[position])
         kept = (self._kept or {}).get((index.topic, recorded, header))
         return self._bag.find(index.topic, recorded, header) if kept is None else self._bag.decode(index.topic, kept)
-
-    def vehicle_frames(self) -> dict[str, Matrix]:
-        """T_camera_F (4, 4) of all frames F but camera and LiDAR that the static transforms connect to the camera, by name."""
-        own = (self.camera_frame, self.lidar_frame)
-        return {name: T for name, T in self._tree.frames(self.camera_frame).items() if name not in own}
 
     def camera_at(self, stamp: int) -> Camera:
         """The camera of the CameraInfo nearest to an image's stamp."""

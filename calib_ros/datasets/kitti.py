@@ -59,6 +59,7 @@ class KittiSource:
         of_360 = layout_name(root) == KITTI_360
         camera = (0 if of_360 else 2) if camera is None else camera
         self._layout = layout_of(root, camera)
+        self.cameras = list(map(str, self._layout.images))
         self.path = root
         self.name = root.resolve().name
         self.camera_frame = f"image_0{camera}" if of_360 else CAMERA_FRAMES[camera]
@@ -78,11 +79,6 @@ class KittiSource:
         P, self.reference = self._layout.calibrate(first)
         height, width = read_image(self._images[first]).shape[:2]
         self.camera = Camera(P[:, :3], width, height)
-
-    @property
-    def cameras(self) -> list[str]:
-        """Numbers of the cameras that the folder has."""
-        return [str(number) for number in self._layout.images]
 
     def calibration_at(self, index: int) -> tuple[Matrix, Matrix]:
         """Camera matrix (3, 3) and T_camera_lidar (4, 4) of a frame, whose picture and scan are not read."""

@@ -161,22 +161,19 @@ def lidar_twist(values: Matrix, T_velo_imu: Transform) -> Matrix:
 
 
 class ScanMotion:
-    """Point times and LiDAR velocity of a raw drive's scans. root: the drive. date: the folder of its calibrations."""
+    """Point times and LiDAR velocity of a raw drive's scans. root: the drive. date: the folder of its calibrations. has_oxts:
+    whether the drive has velocities."""
 
     def __init__(self, root: Path, date: Path) -> None:
         self._start = Timestamps.if_present(root / "velodyne_points" / "timestamps_start.txt")
         self._end = Timestamps.if_present(root / "velodyne_points" / "timestamps_end.txt")
         self._oxts, calibration = root / "oxts" / "data", date / "calib_imu_to_velo.txt"
+        self.has_oxts = self._oxts.is_dir()
         self._T_velo_imu = se3.from_parts(np.eye(3), NOMINAL_LEVER_ARM)
         if calibration.is_file():
             file = CalibrationFile(calibration)
             parts = se3.from_parts(file.matrix("R", 3, 3), file.matrix("T", 3, 1)[:, 0])
             self._T_velo_imu = se3.as_transform(parts, f"the calibration {calibration}")
-
-    @property
-    def has_oxts(self) -> bool:
-        """Whether the drive has velocities."""
-        return self._oxts.is_dir()
 
     def twist(self, number: int) -> Matrix | None:
         """(rx, ry, rz, tx, ty, tz) of the LiDAR in its frame, rad/s and m/s; None without a file. BadInputError if damaged."""

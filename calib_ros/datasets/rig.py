@@ -170,7 +170,14 @@ class FolderRig(ByDescription):
                     f"{folder / IMAGES} of camera {name} is missing; name by sensors.{name}.topic a folder that is there: "
                     f"{', '.join(has) or '.'}"
                 )
-        self._folders |= {name: self._lidar_folder(name) for name in self.lidars}
+        with_clouds = [folder for folder in self._folders.values() if (folder / CLOUDS).is_dir()]
+        for name in self.lidars:
+            folder, given = folder_of(path, self.sensors[name]), self.sensors[name].topic
+            if not (folder / CLOUDS).is_dir() and (given or not with_clouds or len(self.lidars) > 1):
+                raise BadInputError(
+                    f"{folder / CLOUDS} of LiDAR {name} is missing; name by sensors.{name}.topic a folder with {CLOUDS}/"
+                )
+            self._folders[name] = folder if (folder / CLOUDS).is_dir() else with_clouds[0]
 
     def camera(self, name: str) -> Camera:
         """As of any rig."""
@@ -214,17 +221,6 @@ class FolderRig(ByDescription):
             return source.scan(index)[1]
 
         return Timed(stamps, read)
-
-    def _lidar_folder(self, name: str) -> Path:
-        folder, given = folder_of(self.path, self.sensors[name]), self.sensors[name].topic
-        if (folder / CLOUDS).is_dir():
-            return folder
-        found = [self._folders[camera] for camera in self.cameras if (self._folders[camera] / CLOUDS).is_dir()]
-        if given or not found or len(self.lidars) > 1:
-            raise BadInputError(
-                f"{folder / CLOUDS} of LiDAR {name} is missing; name by sensors.{name}.topic a folder with {CLOUDS}/"
-            )
-        return found[0]
 
     def _lidar_of(self, name: str) -> str | None:
         """The LiDAR that a sensor's reference is to."""

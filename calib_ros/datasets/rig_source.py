@@ -24,21 +24,10 @@ class RigSource(Protocol):
     """The recording of a rig: every pair of a camera and a LiDAR is a Source of its own. What several of them need is read once,
     as long as it is among the newest. BadInputError or KeyError for names that are none of its sensors."""
 
-    @property
-    def name(self) -> str:
-        """For display."""
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
-
-    @property
-    def lidars(self) -> tuple[str, ...]:
-        """Names of the LiDARs."""
-
-    @property
-    def reference_sensor(self) -> str:
-        """The sensor that `reference` is relative to."""
+    name: str  # for display
+    cameras: tuple[str, ...]  # names
+    lidars: tuple[str, ...]
+    reference_sensor: str  # that `reference` is relative to
 
     def camera(self, name: str) -> Camera:
         """The intrinsics of a camera."""

@@ -42,9 +42,9 @@ class StaticTransforms:
         found = self._reached(target, without)
         return found[source][0] if source in found else None
 
-    def frames(self, target: str) -> dict[str, Matrix]:
-        """T_target_frame (4, 4) of all frames that are connected to `target`, by name."""
-        return {frame: T for frame, (T, _) in self._reached(target).items()}
+    def others(self, target: str, source: str) -> dict[str, Matrix]:
+        """T_target_frame (4, 4) of all frames that are connected to `target` but these two, by name."""
+        return {frame: T for frame, (T, _) in self._reached(target).items() if frame not in (target, source)}
 
     def path(self, target: str, source: str) -> list[tuple[str, str]]:
         """The edges (parent, child) between two frames, from the target on; none if they are not connected."""

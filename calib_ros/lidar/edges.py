@@ -361,7 +361,9 @@ def between_points(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
     last, outermost = np.full(len(row), -np.inf), index.copy()
     offsets, far = [], []
     for k, cell in enumerate(cells):
-        points, valid = samples.inside(cell, MAX_CELL_POINTS)
+        at = samples.start[cell][:, None] + np.arange(MAX_CELL_POINTS)  # nearest first
+        valid = at < samples.start[cell + 1][:, None]
+        points = samples.order[np.minimum(at, len(samples.order) - 1)]
         offset = along[points] - centre[:, None]
         offset = np.where(np.abs(offset) > np.pi, offset - np.sign(offset) * 2 * np.pi, offset)
         close = samples.distance[points] < near[:, None]

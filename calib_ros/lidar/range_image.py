@@ -199,19 +199,14 @@ def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of a scan: azimuth, elevation (n,) rad, distance (n,) m; order, start: the points of each cell, nearest first."""
+    """Points of a scan: azimuth, elevation (n,) rad, distance (n,) m; order, start: the points of each cell, row *
+    columns + column, nearest first."""
 
     azimuth: Angles
     elevation: Angles
     distance: Angles
     order: NDArray[np.intp]
     start: NDArray[np.intp]
-
-    def inside(self, cell: NDArray[np.intp], most: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Points (m, most) of cells (m,), given as row * columns + column, and the mask (m, most) of entries that are points."""
-        at = self.start[cell][:, None] + np.arange(most)
-        valid = at < self.start[cell + 1][:, None]
-        return self.order[np.minimum(at, len(self.order) - 1)], valid
 
 
 def _project(cloud: PointCloud, azimuth: Angles, elevation: Angles, distance: Angles, pose: ScannerPose) -> RangeImage:

@@ -12,13 +12,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
-from calib_ros.frame import NANOSECONDS, PointCloud
+from calib_ros.frame import PointCloud
 from calib_ros.messages.wire import WireHeader, payload, shown, stamp_ns, wire_header
 
 REQUIRED = ("x", "y", "z")  # m in the LiDAR frame
@@ -50,15 +50,6 @@ LIVOX_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectiv
 LIVOX_OFFSETS, LIVOX_SIZE, LIVOX_STRIDE = (0, 4, 8, 12, 16, 17, 18), 19, 20
 
 
-class LivoxScan(NamedTuple):
-    """A CustomMsg: its header, and `width` points of LIVOX_STRIDE bytes each with LIVOX_FIELDS at LIVOX_OFFSETS."""
-
-    header: WireHeader
-    big_endian: bool
-    width: int
-    points: bytes
-
-
 def decode_cloud(msg: Any) -> PointCloud:
     """sensor_msgs/PointCloud2 -> PointCloud; NaN points are kept, organised clouds are read row by row.
 
@@ -73,8 +64,9 @@ def decode_cloud(msg: Any) -> PointCloud:
     return cloud_of_columns(_columns(msg, width, height), stamp_ns(msg.header.stamp))
 
 
-def livox_scan(data: bytes) -> LivoxScan:
-    """CDR bytes of a CustomMsg -> its parts. Raises BadInputError for a truncated message."""
+def livox_scan(data: bytes) -> tuple[WireHeader, bool, bytes]:
+    """CDR bytes of a CustomMsg -> its header, whether it is big-endian, and points of LIVOX_STRIDE bytes each with LIVOX_FIELDS
+    at LIVOX_OFFSETS. Raises BadInputError for a truncated message."""
     try:
         header, order = wire_header(data), "<" if data[1] & 1 else ">"
         (length,) = struct.unpack_from(order + "I", data, 12)
@@ -85,19 +77,16 @@ def livox_scan(data: bytes) -> LivoxScan:
     begin, size = 4 + at + 20, count * LIVOX_STRIDE
     if begin + max(size - (LIVOX_STRIDE - LIVOX_SIZE), 0) > len(data):
         raise BadInputError(f"CustomMsg: {len(data)} bytes are too few for {count} points; the message is truncated")
-    points = bytes(data[begin : begin + size]).ljust(size, b"\0")
-    return LivoxScan(header, order == ">", count, points)
+    return header, order == ">", bytes(data[begin : begin + size]).ljust(size, b"\0")
 
 
 def decode_livox(data: bytes) -> PointCloud:
     """CDR bytes of a CustomMsg -> PointCloud with times, lines and reflectivity. Raises BadInputError for a truncated message."""
-    scan = livox_scan(data)
-    kinds = [">"[: scan.big_endian] + kind for kind in LIVOX_FIELDS.values()]
+    header, big_endian, whole = livox_scan(data)
+    kinds = [">"[:big_endian] + kind for kind in LIVOX_FIELDS.values()]
     layout = np.dtype({"names": list(LIVOX_FIELDS), "formats": kinds, "offsets": LIVOX_OFFSETS, "itemsize": LIVOX_STRIDE})
-    points = np.frombuffer(scan.points, layout)
-    return cloud_of_columns(
-        {name: points[name] for name in LIVOX_FIELDS}, scan.header.seconds * NANOSECONDS + scan.header.nanoseconds
-    )
+    points = np.frombuffer(whole, layout)
+    return cloud_of_columns({name: points[name] for name in LIVOX_FIELDS}, header.stamp)
 
 
 def cloud_of_columns(columns: Mapping[str, NDArray[Any]], stamp: int = 0) -> PointCloud:

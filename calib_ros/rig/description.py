@@ -99,19 +99,15 @@ class _Reader:
         if own is not None and not np.allclose(own, np.eye(4)):
             raise self.wrong(f"sensors.{rig.reference}.prior", "is of the reference itself; leave it out")
         for key in ("topic", "frame"):
-            self._unique(sensors, key)
+            seen: dict[tuple[str, str], str] = {}
+            for sensor in sensors:
+                value = getattr(sensor, key), sensor.kind if key == "topic" else ""  # a folder may hold images and clouds
+                if value[0] and value in seen:
+                    raise self.wrong(f"sensors.{sensor.name}.{key}", f"is {value[0]}, as of {seen[value]}; give each its own")
+                seen[value] = sensor.name
         if top.get("pairs") is None:
             return rig
         return RigDescription(sensors, rig.reference, self.pairs(top["pairs"], rig))
-
-    def _unique(self, sensors: tuple[Sensor, ...], key: str) -> None:
-        seen: dict[tuple[str, str], str] = {}
-        for sensor in sensors:
-            value = getattr(sensor, key)
-            own = value, sensor.kind if key == "topic" else ""  # a folder may hold images and clouds
-            if value and own in seen:
-                raise self.wrong(f"sensors.{sensor.name}.{key}", f"is {value}, as of {seen[own]}; give each its own")
-            seen[own] = sensor.name
 
     def sensor(self, name: str, value: Any) -> Sensor:
         key = f"sensors.{name}"

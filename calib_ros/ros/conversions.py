@@ -64,16 +64,14 @@ def header_message(header: WireHeader) -> Header:
 
 def cloud_of_livox(data: bytes) -> PointCloud2:
     """CDR bytes of Livox's CustomMsg -> the same points as a PointCloud2. BadInputError for a truncated message."""
-    scan = livox_scan(data)
-    msg = PointCloud2(
-        height=1, width=scan.width, point_step=LIVOX_STRIDE, row_step=len(scan.points), is_bigendian=scan.big_endian
-    )
-    msg.header = header_message(scan.header)
+    header, big_endian, points = livox_scan(data)
+    msg = PointCloud2(height=1, width=len(points) // LIVOX_STRIDE, point_step=LIVOX_STRIDE, row_step=len(points))
+    msg.header, msg.is_bigendian = header_message(header), big_endian
     msg.fields = [
         PointField(name=name, offset=offset, datatype=LIVOX_DATATYPES[kind], count=1)
         for (name, kind), offset in zip(LIVOX_FIELDS.items(), LIVOX_OFFSETS, strict=True)
     ]
-    msg.data = array.array("B", scan.points)
+    msg.data = array.array("B", points)
     return msg
 
 

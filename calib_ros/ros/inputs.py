@@ -199,8 +199,8 @@ class SensorSubscriptions(NodeService):
         image, points, camera_info = self._inputs.topics
         kind = CompressedImage if parameters["image_transport"] == "compressed" else Image
         self.adaptive = (
-            subscribe([serialized(kind)], image, self._forwarding_to(pipeline.add_image)),
-            subscribe([serialized(PointCloud2), *livox_forms()], points, self._forwarding_to(pipeline.add_cloud)),
+            subscribe([serialized(kind)], image, partial(self._forward, pipeline.add_image)),
+            subscribe([serialized(PointCloud2), *livox_forms()], points, partial(self._forward, pipeline.add_cloud)),
             # A camera's driver may publish once, latched, what never changes.
             subscribe([serialized(CameraInfo)], camera_info, self._on_camera_info, latched=True),
         )
@@ -243,14 +243,11 @@ class SensorSubscriptions(NodeService):
         told = zip((self._inputs.camera, self._inputs.lidar), self.adaptive, strict=False)
         return ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told if name and own.silent_s > SILENT_S)
 
-    def _forwarding_to(self, add: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
-        def on_message(stamp: int, message: Any) -> None:
-            try:
-                add(stamp, message)
-            finally:
-                self._on_received(message.header)
-
-        return on_message
+    def _forward(self, add: Callable[[int, Any], None], stamp: int, message: Any) -> None:
+        try:
+            add(stamp, message)
+        finally:
+            self._on_received(message.header)
 
     def _losses(self) -> dict[str, str]:
         """Topic -> how many of its messages get lost, and what to do, for a person; of images and clouds, where many do.

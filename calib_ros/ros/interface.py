@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -52,7 +53,7 @@ class Interface:
             self.deactivate()
             raise
         ticks = (1.0, self.check), (self.parameters["publish_period_s"], self.again)
-        self._timers = [every(self.node, period_s, self._guarded(call)) for period_s, call in ticks]
+        self._timers = [every(self.node, period_s, partial(self._guarded, call)) for period_s, call in ticks]
 
     def deactivate(self) -> None:
         """Receive nothing, end estimates under way, and say as the last message that nothing is usable any more.
@@ -92,27 +93,20 @@ class Interface:
         for part in self.parts:
             part.check()
 
-    def _guarded(self, call: Callable[[], None]) -> Callable[[], None]:
-        def tick() -> None:
-            with self.health.guard():
-                call()
-
-        return tick
+    def _guarded(self, call: Callable[[], None]) -> None:
+        with self.health.guard():
+            call()
 
     def _on_parameters(self, changed: list[Parameter]) -> SetParametersResult:
         """What costs more to change than constants of the stages waits for the next check()."""
         try:
-            new = parameters.changed(self.parameters, changed, self._image_size())
+            new = parameters.changed(self.parameters, changed)
             if new["publish_tf"] and self.tf.missing:
                 raise MissingDependencyError(self.tf.missing)
             self._take(new, changed)
         except CalibrationError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
-
-    def _image_size(self) -> tuple[int, int] | None:
-        """Of the camera, px, where it is known."""
-        return None
 
     def _take(self, new: Parameters, changed: list[Parameter]) -> None:
         """Use other parameters from now on. Raises a CalibrationError for what cannot work."""

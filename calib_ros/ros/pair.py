@@ -11,6 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calib_ros.extensions import NodeService, node_services
+from calib_ros.image.mask import check_mask
 from calib_ros.online.events import Event, ExtrinsicUpdated, Inputs
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros import parameters
@@ -44,7 +45,7 @@ class PairInterface(Interface):
             self._frame_ids,
             lambda *sensors: self.initial.choose(*sensors),
             self._inputs.cloud,
-            self.tf.other_frames,
+            self.tf.tree.others,
         )
         self.pipeline = Pipeline(declared.config, asked, self._on_event, self._inputs.common, self._inputs.lidar)
         self.pipeline.pause(INACTIVE)
@@ -107,11 +108,10 @@ class PairInterface(Interface):
             for part in self.parts:
                 part.add(event)
 
-    def _image_size(self) -> tuple[int, int] | None:
-        camera = self.pipeline.camera
-        return None if camera is None else (camera.width, camera.height)
-
     def _take(self, new: Parameters, changed: list[Parameter]) -> None:
+        if new.config.image != self.parameters.config.image:
+            camera = self.pipeline.camera
+            check_mask(new.config.image, None if camera is None else (camera.width, camera.height))
         self.parameters = new
         self.pipeline.configure(new.config)
 

@@ -248,9 +248,8 @@ def replaced(name: str, config: Config, given: Iterable[str]) -> list[str]:
     return [f"the preset {name} is changed by the parameters given: {', '.join(other)}"] if name and other else []
 
 
-def changed(parameters: Parameters, given: list[Parameter], image_size: tuple[int, int] | None) -> Parameters:
-    """All parameters after a change at run time, which is checked as a whole. image_size: of the camera, px, where it is known.
-    Raises a CalibrationError."""
+def changed(parameters: Parameters, given: list[Parameter]) -> Parameters:
+    """All parameters after a change at run time, which is checked as a whole, but for the mask. Raises a CalibrationError."""
     new: dict[str, dict[str, Any]] = {}
     known, settings = stages(), dict(parameters.settings)
     unknown = misspelt({p.name: p.value for p in given}, parameters.to_dict())
@@ -264,8 +263,6 @@ def changed(parameters: Parameters, given: list[Parameter], image_size: tuple[in
             settings[p.name] = checked(p.name, _plain(p.value), SETTINGS[p.name])
     config = update(parameters.config, new) if new else parameters.config
     Parameters(settings, config).check()
-    if config.image != parameters.config.image:
-        check_mask(config.image, image_size)
     return Parameters(settings, config)
 
 

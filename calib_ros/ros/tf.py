@@ -41,14 +41,15 @@ class StaticTf(NodeService):
     """Reads the static tree for an initial extrinsic, and publishes the extrinsic to it while publish_tf says so.
 
     parameters: gives the current ones. error: takes one line for a person, and its kind for the log. cures: what to do about a
-    loop, and about a second parent. MissingDependencyError if publish_tf is asked for without tf2_msgs.
+    loop, and about a second parent. tree: of everybody but this node. MissingDependencyError if publish_tf is
+    asked for without tf2_msgs.
     """
 
     def __init__(
         self, node: Node, parameters: Callable[[], Parameters], error: Callable[[str, str], None], cures: tuple[str, str] = CURES
     ) -> None:
         self._node, self._parameters, self._error, self._cures = node, parameters, error, cures
-        self._tree = StaticTransforms()  # of everybody but this node
+        self.tree = StaticTransforms()
         self._since = time.monotonic()
         self._type: Any = None
         with suppress(ImportError):
@@ -99,19 +100,14 @@ class StaticTf(NodeService):
         """T_camera_lidar (4, 4) or None, and whether it is worth asking again. What this node published does not count."""
         if not self._use_tree:
             return None, False
-        T = self._tree.lookup(camera_frame, lidar_frame)
+        T = self.tree.lookup(camera_frame, lidar_frame)
         return T, T is None and time.monotonic() - self._since < WAIT_S
-
-    def other_frames(self, camera_frame: str, lidar_frame: str) -> dict[str, Matrix]:
-        """T_camera_F (4, 4) of all frames F but these two that others have connected to the camera, by name."""
-        own = (camera_frame, lidar_frame)
-        return {name: T for name, T in self._tree.frames(camera_frame).items() if name not in own}
 
     def edges(self, result: Result) -> dict[tuple[str, str], Transform]:
         """(parent, child) -> T_parent_child (4, 4) by which the tree gives an extrinsic, of all edges between the sensors, from
         the camera on; none if the tree does not connect them."""
         T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
-        return {edge: self._edge_between(T, camera, lidar, *edge) for edge in self._tree.path(camera, lidar)}
+        return {edge: self._edge_between(T, camera, lidar, *edge) for edge in self.tree.path(camera, lidar)}
 
     def add(self, event: Any) -> None:
         """Publish a new extrinsic as the edge of the tree that the parameters name; what cannot carry it is reported instead."""
@@ -181,7 +177,7 @@ class StaticTf(NodeService):
     def _receive(self, msg: Any) -> None:
         with self._lock:
             others = [item for item in msg.transforms if not any(_same(item, own) for own in self._own)]
-        self._tree.add(self._type(transforms=others))
+        self.tree.add(self._type(transforms=others))
 
     def _withdraw(self, why: str) -> None:
         """Nothing is published any more: tf2 would take the tree apart, or a wrong edge stay in it."""
@@ -205,12 +201,12 @@ class StaticTf(NodeService):
 
     def _conflict(self, parent: str, child: str) -> str:
         """Why an edge must not be published, "" if it may: a frame has one parent."""
-        other = self._tree.parent(child)
+        other = self.tree.parent(child)
         above: str | None = parent
         seen: set[str] = set()
         while above is not None and above != child and above not in seen:
             seen.add(above)
-            above = self._tree.parent(above)
+            above = self.tree.parent(above)
         if above == child:
             return (
                 f"publish_tf: {child} is above {parent} in /tf_static already, an edge {parent} -> {child} would close a loop: "
@@ -229,7 +225,7 @@ class StaticTf(NodeService):
             T_a_parent, T_child_b = self._fixed(a, parent, child), self._fixed(child, b, child)
             if T_a_parent is not None and T_child_b is not None:
                 return np.asarray(se3.inverse(T_a_parent) @ T @ se3.inverse(T_child_b))
-        edges = ", ".join(f"{p} -> {c}" for p, c in self._tree.path(camera, lidar)) or "none, they are not connected"
+        edges = ", ".join(f"{p} -> {c}" for p, c in self.tree.path(camera, lidar)) or "none, they are not connected"
         raise BadInputError(
             f"publish_tf: tf_parent {parent} and tf_child {child} are no edge between {camera} and {lidar} in /tf_static; "
             f"its edges there: {edges}"
@@ -237,7 +233,7 @@ class StaticTf(NodeService):
 
     def _fixed(self, target: str, source: str, without: str) -> Matrix | None:
         """T_target_source (4, 4) without the edge above a child."""
-        return np.eye(4) if target == source else self._tree.lookup(target, source, without)
+        return np.eye(4) if target == source else self.tree.lookup(target, source, without)
 
 
 def _same(a: TransformStamped, b: TransformStamped) -> bool:

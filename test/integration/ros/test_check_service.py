@@ -132,7 +132,7 @@ def test_a_cause_is_named_while_the_node_goes_on(checked, monkeypatch):
     publisher = peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
     base = transform_message(se3.perturb(np.eye(4), [0, 0, 30], [0, 1, 0]), "camera", "base_link", 0)
     publisher.publish(TFMessage(transforms=[base]))
-    peer.until(lambda: peer.calibration.tf.other_frames("camera", "velodyne"), "the other frame of the vehicle")
+    peer.until(lambda: peer.calibration.tf.tree.others("camera", "velodyne"), "the other frame of the vehicle")
     recalibrator = peer.recalibrator
     keyframes, published = recalibrator.keyframes_seen, len(peer.extrinsics)
     under_way = checked.ask(se3.inverse(checked.reference))

@@ -40,7 +40,7 @@ def publish_tree(peer: Peer, reference: np.ndarray, wanted: Edges = TREE) -> dic
         T_base_lidar = edges[TREE[0]] @ edges[TREE[1]]
         edges[TREE[3]] = se3.inverse(edges[TREE[2]]) @ T_base_lidar @ se3.inverse(reference)
     peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED).publish(message(edges))
-    peer.until(lambda: peer.calibration.tf._tree.parent("camera") == wanted[-1][0], "the tree")
+    peer.until(lambda: peer.calibration.tf.tree.parent("camera") == wanted[-1][0], "the tree")
     return edges
 
 
