@@ -65,19 +65,14 @@ class CaptureSource:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What the node said, and what there is to know about the bag, for people."""
-        by = (
-            ""
-            if len(self.middles) == len(self)
-            else f", by the {len(self.middles)} of {len(self)} keyframes since it was disputed"
-        )
+        some = f", by the {len(self.middles)} of {len(self)} keyframes since it was disputed"
+        by = some if len(self.middles) < len(self) else ""
         remarks = [f"checked is {RESULT}, the extrinsic that the node used{by}"]
         if self._occasion:
             remarks.append(f"the node said {self._occasion.get('status')}: {self._occasion.get('reason')}")
-        said = [event for event in self._events if event.get("event") == "status"][-STATUSES:]
-        if said:
-            remarks.append(
-                "status: " + ", ".join(f"{event.get('status')} {str(event.get('time'))[11:19]}" for event in said) + " UTC"
-            )
+        statuses = [event for event in self._events if event.get("event") == "status"][-STATUSES:]
+        if said := ", ".join(f"{event.get('status')} {str(event.get('time'))[11:19]}" for event in statuses):
+            remarks.append(f"status: {said} UTC")
         return (*remarks, *self._bag.remarks)
 
     def __len__(self) -> int:

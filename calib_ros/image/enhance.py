@@ -33,17 +33,12 @@ def equalize(image: Image, method: str = "clahe") -> Image:
     if image.ndim == 3:
         return np.dstack([equalize(np.ascontiguousarray(image[:, :, k]), method) for k in range(image.shape[2])])
     if method == "global":
-        return equalize_global(image)
+        # Eq. 3.1 to 3.4; cv2.equalizeHist leaves the darkest level out of the distribution, so that it always becomes black.
+        share = np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size
+        return np.asarray(np.rint(255 * share).astype(np.uint8)[image])
     limit = CLAHE_CLIP if method == "clahe" else NO_LIMIT
     clahe = cv2.createCLAHE(limit, (CLAHE_TILES, CLAHE_TILES))
     return np.asarray(clahe.apply(image), np.uint8)
-
-
-def equalize_global(gray: Image) -> Image:
-    """Histogram equalisation of the whole image, eq. 3.1 to 3.4, grey (H, W) uint8. cv2.equalizeHist leaves the darkest level out
-    of the distribution, so that it always becomes black."""
-    share = np.cumsum(np.bincount(gray.ravel(), minlength=256)) / gray.size
-    return np.asarray(np.rint(255 * share).astype(np.uint8)[gray])
 
 
 def smooth(gray: Image, method: str = "bilateral") -> Image:

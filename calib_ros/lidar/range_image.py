@@ -142,10 +142,8 @@ def isolated_returns(ranges: Ranges) -> Mask:
     for aside in (-2, 2):
         diagonal |= _near(R, ranges[row, (column + aside) % columns], own)
     left, right = ranges[row, (column + 1) % columns], ranges[row, (column - 1) % columns]
-    middle, step = (
-        0.5 * (1 / left + 1 / right),
-        np.abs(1 / left - 1 / right),
-    )  # inverse ranges: linear on a plane, in small angles
+    # Inverse ranges: linear on a plane, in small angles.
+    middle, step = 0.5 * (1 / left + 1 / right), np.abs(1 / left - 1 / right)
     with np.errstate(invalid="ignore"):
         mixed = ((left - R) * (right - R) < 0) & ~(np.abs(1 / R - middle) < 0.2 * step)
     alone[row, column] = ~upright & (mixed | ~diagonal)

@@ -53,9 +53,8 @@ class SweepOffset:
             self._offset = 0.0
         elif len(times) >= MIN_POINTS:
             self._blind, known = 0, self._offset
-            middle = float(
-                np.partition(times, (len(times) - 1) // 2)[(len(times) - 1) // 2]
-            )  # a time that occurs: no mean of two
+            k = (len(times) - 1) // 2  # of a time that occurs: no mean of two
+            middle = float(np.partition(times, k)[k])
             if known is None or np.abs(times - middle).mean() < CLOSER * np.abs(times - known).mean():
                 self._offset = middle
         elif self._offset is None:

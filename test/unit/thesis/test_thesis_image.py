@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 from calib_ros.errors import BadInputError
-from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, to_gray
+from calib_ros.image.enhance import equalize, prepare, smooth, to_gray
 from calib_ros_thesis.config import ThesisConfig
 from calib_ros_thesis.image import OPERATORS, blend, edges, gradient_edges, gradients, magnitude, smoothed
 
@@ -38,12 +38,12 @@ def test_a_4x4_picture_is_equalised_as_computed_by_hand():
     gray = np.array([[10, 10, 10, 10], [10, 10, 20, 20], [20, 20, 20, 30], [30, 30, 30, 200]], np.uint8)
     # H = 6, 5, 4, 1; CDF = 6, 11, 15, 16; 255 * CDF / 16 = 95.625, 175.3125, 239.0625, 255.
     expected = [[96, 96, 96, 96], [96, 96, 175, 175], [175, 175, 175, 239], [239, 239, 239, 255]]
-    assert equalize_global(gray).tolist() == expected
+    assert equalize(gray, "global").tolist() == expected
     assert equalize(gray, "global").tolist() == expected
     # The darkest level is part of the distribution: 255 * 2 / 4 = 127.5, rounded to even; cv2.equalizeHist leaves it at 0.
-    assert equalize_global(np.array([[0, 0], [255, 255]], np.uint8)).tolist() == [[128, 128], [255, 255]]
+    assert equalize(np.array([[0, 0], [255, 255]], np.uint8), "global").tolist() == [[128, 128], [255, 255]]
     for value in (0, 7, 255):
-        assert (equalize_global(np.full((3, 5), value, np.uint8)) == 255).all()  # CDF is 1
+        assert (equalize(np.full((3, 5), value, np.uint8), "global") == 255).all()  # CDF is 1
 
 
 @pytest.mark.parametrize(("method", "limit"), [("clahe", 3.5), ("adaptive", 0.0)])
