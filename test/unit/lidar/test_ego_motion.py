@@ -173,21 +173,6 @@ class TestEstimate:
         assert recalibrator.ingest(drive[2])
         assert np.array_equal(recalibrator.newest().twist, drive.twist(2))
 
-    def test_the_scan_before_is_taken_where_its_frame_was_dropped(self, drive):
-        bare, asked = Bare(drive), []
-
-        def scan_before(since):
-            asked.append(since)
-            return (bare[2].cloud_stamp, bare[2].cloud) if since < bare[2].cloud_stamp else None
-
-        motion = EgoMotion(AUTO)
-        motion.add(bare[0])
-        motion.add(bare[3])
-        assert motion.with_twist(bare[3], scan_before).twist[3] == pytest.approx(SPEED, rel=0.03)
-        motion.add(bare[4])
-        assert motion.with_twist(bare[4], scan_before).twist[3] == pytest.approx(SPEED, rel=0.03)
-        assert asked == [bare[0].cloud_stamp, bare[3].cloud_stamp]
-
     def test_keyframes_of_unknown_motion_are_left_out_while_the_vehicle_moves(self, drive):
         bare = Bare(drive)
         recalibrator = Recalibrator(drive.camera, drive.reference)
