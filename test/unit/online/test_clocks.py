@@ -171,13 +171,6 @@ def test_an_offset_that_estimates_agree_on_is_followed_with_the_extrinsic():
     assert tracker.current.result.time_offset_s == 0.05
 
 
-def test_a_driver_that_stamps_at_the_other_end_of_the_scan(scene):
-    period = 0.1
-    result = recalibrated(scene, late_s=-period).current.result
-    assert result.time_offset_s == pytest.approx(-period, abs=0.003)
-    assert scene.is_near(result.T_camera_lidar, 0.15, 0.03)
-
-
 @pytest.mark.parametrize(
     "changed",
     [
