@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_recorder import as_livox
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from ros_processes import Observer, end, initial, node_process, play, played
@@ -82,18 +81,6 @@ def test_bag_played_into_the_node(street_bag, drive, tmp_path):
             return np.allclose(saved, current, atol=1e-9)
 
         client.until(is_saved, "that the current extrinsic is saved")
-        end(node)
-
-
-@pytest.mark.slow
-def test_a_bag_of_livox_played_into_the_node(street_bag, drive, tmp_path):
-    """Clouds of Livox's own type are paired and give an extrinsic."""
-    pytest.importorskip("livox_ros_driver2.msg", reason="livox_ros_driver2 is not installed")
-    bag = as_livox(street_bag, tmp_path / "livox")
-    with node_process(*initial(off(drive.reference)), tracker__confirmations=0, **SMALL_SEARCH) as node, Observer() as client:
-        with playing(bag):
-            client.until(lambda: client.count("pairs") >= 8, "pairs")
-            assert_found(client, drive.reference)
         end(node)
 
 

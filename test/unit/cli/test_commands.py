@@ -215,6 +215,10 @@ def test_not_converged_is_exit_code_1(bag: Path, quick: list[str], tmp_path: Pat
         (["models", "{bag}", "--image-classes", "source", "--out", "{bad_yaml}/x"], "cannot be made (Not a directory)"),
         (["models", "{bag}", "--config", "{tmp}/none.yaml"], "none.yaml"),
         (["models", "{bag}", "--config", "{misspelt}"], "image_class"),
+        (["rig", "{tmp}/nowhere", "--rig", "{rig}"], "nowhere does not exist"),
+        (["rig", "synthetic:rig=two_lidars_three_cameras", "--rig", "{tmp}/nothing.yaml"], "nothing.yaml"),
+        (["rig", "synthetic:rig=two_lidars_three_cameras", "--rig", "{rig}", "--out", "x.txt"], "the ending tells the format"),
+        (["rig", "synthetic:rig=two_lidars_three_cameras,frames=2", "--rig", "{rig}", "--frames", "7"], "position 7 is outside"),
         (["dance"], "dance"),
     ],
 )  # fmt: skip
@@ -225,11 +229,13 @@ def test_bad_input_is_one_line_and_exit_code_2(
     (tmp_path / "bad.yaml").write_text("search:\n  rotation_deg: [1\n")
     (tmp_path / "range.yaml").write_text("search: {rotation_deg: 500.0}\n")
     (tmp_path / "misspelt.yaml").write_text("semantics: {image_class: source}\n")
+    (tmp_path / "rig.yaml").write_text("reference: lidar_left\nsensors: {lidar_left: {kind: lidar}, front: {kind: camera}}\n")
     save_state(tmp_path / "state.json", Result(nominal(), CONVERGED), Camera(np.diag([70.0, 70, 1]), 96, 64))
     (tmp_path / "flipped.json").write_text((tmp_path / "state.json").read_text().replace('"lidar"', '"lidbr"'))
     names = {"tmp": tmp_path, "bag": bag, "out_of_range": tmp_path / "range.yaml"}
     names |= {name: tmp_path / f"{name}.json" for name in ("state", "flipped")}
     names |= {"bad_json": tmp_path / "bad.json", "bad_yaml": tmp_path / "bad.yaml", "misspelt": tmp_path / "misspelt.yaml"}
+    names["rig"] = tmp_path / "rig.yaml"
     arguments = [argument.format(**names) for argument in arguments]
     try:
         code: object = main.main(arguments)

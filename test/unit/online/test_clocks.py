@@ -32,11 +32,11 @@ def scene() -> Scene:
     return Scene(seed=3)
 
 
-def recalibrated(scene: Scene, late_s: float = LATE_S, config: Config = CONFIG) -> Recalibrator:
+def recalibrated(scene: Scene, config: Config = CONFIG) -> Recalibrator:
     """After one estimate from keyframes whose images are stamped late."""
     recalibrator = Recalibrator(scene.camera, scene.truth, config)
     for frame, twist in zip(scene.frames, TWISTS, strict=True):
-        xyz = moved(frame.cloud.xyz, twist, np.full(len(frame.cloud), -late_s)).astype(np.float32)
+        xyz = moved(frame.cloud.xyz, twist, np.full(len(frame.cloud), -LATE_S)).astype(np.float32)
         cloud = replace(frame.cloud, xyz=xyz, time=None)
         recalibrator.ingest(replace(frame, cloud=cloud, cloud_stamp=frame.stamp, twist=twist, compensated=True))
     assert recalibrator.ready()
