@@ -6,9 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,17 +40,6 @@ def assert_found(client: Observer, reference: np.ndarray) -> None:
     """At the latest when it has worked off what it has received."""
     client.until(lambda: client.get_extrinsic()[0], "an extrinsic")
     assert_kept(client, reference)
-
-
-@contextmanager
-def playing(bag: Path) -> Iterator[None]:
-    """A player that runs until it is killed, hard."""
-    player = play(bag, "--rate", "4", "--loop")
-    try:
-        yield
-    finally:
-        player.kill()
-        player.communicate()
 
 
 def assert_broken_off(text: str) -> None:
