@@ -147,6 +147,8 @@ def test_odometry(odometry):
     assert [source[i].name for i in range(len(source))] == ["000000", "000004", "000009"]
     assert np.abs(source.reference - expected_extrinsic(2, np.eye(3))).max() < 1e-9
     assert [source[i].stamp for i in range(3)] == [0, 400_000_000, 900_000_000]
+    assert (source[0].compensated, source[0].twist, source[0].cloud.time) == (True, None, None)
+    assert "compensated" in source.describe()["motion"]
     (odometry / "times.txt").write_text("".join(f"{0.1037 * i:e}\n" for i in range(10)))
     assert [open_dataset(odometry)[i].stamp for i in range(3)] == [0, 414_800_000, 933_300_000]
     assert len(open_dataset(odometry.parents[1])) == 3
@@ -162,6 +164,7 @@ def test_object_frames_have_their_own_calibration(objects):
     assert np.abs(source[1].reference - expected_extrinsic(2, np.eye(3))).max() < 1e-9
     assert [source[i].camera.height for i in range(2)] == [HEIGHT + 3, HEIGHT + 11]
     assert [source[i].stamp for i in range(2)] == [300_000_000, 1_100_000_000]
+    assert (source[0].cloud_stamp, source[0].twist, source[0].cloud.time) == (None, None, None)
     assert len(open_dataset(objects.parent)) == 2
 
 

@@ -352,15 +352,6 @@ class TestRealDrive:
         assert not frame.compensated
         assert source.describe()["motion"] == "from oxts"
 
-    def test_odometry_is_compensated_and_object_has_no_stamps(self, kitti_root):
-        odometry, objects = (open_dataset(kitti_root / name) for name in ("odometry/sequences/00", "object/training"))
-        assert odometry[0].compensated
-        for frame in (odometry[0], objects[0]):
-            assert frame.twist is None
-            assert frame.cloud.time is None
-            assert not needs_ego_motion(frame, ALWAYS)
-        assert "compensated" in odometry.describe()["motion"]
-
     def test_scans_agree_with_oxts(self, source):
         """oxts is 5 % faster here than scans, a second apart or consecutive, and 10 % faster than its own positions."""
         pytest.importorskip("small_gicp")
