@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,8 @@ import pytest
 from scenes import Scene
 
 from calib_ros import se3
-from calib_ros.datasets import open_dataset
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.methods.edges import Castorena, Levinson
 from calib_ros_evaluation.methods.information import Nid, Pandey
 from calib_ros_evaluation.methods.method import Method
@@ -61,13 +58,3 @@ def test_too_few_points_are_refused(method: Method, features: list[Any], scene: 
     backwards = se3.perturb(scene.truth, [0, 180, 0], [0, 0, 0])
     with pytest.raises(TooFewFeaturesError, match="check the initial extrinsic"):
         method.score([method.features(ahead)], backwards)
-
-
-@pytest.mark.kitti
-def test_yaw_peaks_at_the_reference_on_real_frames(method: Method, kitti_root: Path) -> None:
-    source = open_dataset(kitti_root / "odometry" / "sequences" / "00")
-    frames = [source[k] for k in range(10)]
-    truth = frames[0].reference
-    assert truth is not None
-    score = method.score([method.features(frame) for frame in frames], truth)
-    assert abs(curves(score, truth, 1.0, 0.2, 11).peaks[1]) < 0.25

@@ -78,12 +78,6 @@ def test_damaged_tables_are_refused(tmp_path: Path, damage: Callable[[list[str]]
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize(("name", "words"), [("none.csv", "No such file"), (".", "cannot read")])
-def test_a_missing_table(tmp_path: Path, name: str, words: str) -> None:
-    with pytest.raises(BadInputError, match=words):
-        read_trials(tmp_path / name)
-
-
 # --- comparison
 
 

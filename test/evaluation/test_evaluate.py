@@ -111,12 +111,6 @@ def test_resumed_evaluation_repeats_nothing(done: Path, capsys: pytest.CaptureFi
     assert "report.html" in capsys.readouterr().out
 
 
-def test_one_worker_gives_what_two_give(done: Path, tmp_path: Path) -> None:
-    command = ["evaluate", DRIVE, "--out", str(tmp_path), "--quick", "--methods", "levinson,ours", "--workers", "1"]
-    assert main.main([*command, "--experiments", "single"]) == 0
-    assert rows(tmp_path) == [row for row in rows(done) if row["experiment"] == "single"]
-
-
 def test_compare_of_a_table_with_itself(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = str(done / "trials.csv")
     assert main.main(["evaluate", "--compare", table, table]) == 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scenes import NEAR, Scene
@@ -12,7 +10,6 @@ from thesis_constants import with_constants
 from calib_ros import se3
 from calib_ros.config import Config, preset
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.score.fast_score import FastScore
@@ -27,13 +24,6 @@ NONE = {"semantics": {"segmentation": "none"}}
 PLAIN = Config.from_dict(NONE)
 THESIS = with_constants(Config.from_dict({"refine": {"objective": "thesis"}, **NONE}), evaluations=60)
 CLASSES = {"semantics": {"cloud_classes": "geometric"}}
-
-
-def of_another_scene(frames: list[Frame]) -> list[Frame]:
-    """Each scan with the mirrored image of another frame."""
-    return [
-        replace(f, image=np.ascontiguousarray(g.image[:, ::-1])) for f, g in zip(frames, frames[1:] + frames[:1], strict=True)
-    ]
 
 
 # ---- ours ---------------------------------------------------------------------------------------------------------------
@@ -84,17 +74,6 @@ def test_evaluations_are_counted_one_by_one(scene: Scene):
     before = count[0]
     assert score.at(-1).value(scene.truth) == value
     assert count[0] == before
-
-
-def test_ours_refuses_images_that_do_not_belong_to_the_scans(scene: Scene):
-    method, start = Own(), scene.off(NEAR)
-    frames = of_another_scene(scene.frames)
-    outcome = method.optimise([method.features(f) for f in frames], start, SearchBox(0.0, 0.0))
-    expected = Calibrator(scene.camera).calibrate(frames, start)
-    # The comparison knows no start when it finds classes, and so those of all points; the calibrator finds those in reach.
-    found, wanted = (text.partition(":")[0] for text in (outcome.refused, expected.reason))
-    assert found == wanted != ""
-    assert np.array_equal(outcome.T, start)
 
 
 def test_too_little_in_the_image_is_a_refusal(scene: Scene):

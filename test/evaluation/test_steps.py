@@ -13,7 +13,7 @@ import pytest
 from html_pages import Page
 from thesis_constants import with_constants
 
-from calib_ros import Config, Frame, PointCloud, open_dataset, se3
+from calib_ros import Config, Frame, PointCloud, se3
 from calib_ros.cli import main
 from calib_ros.frame import MAIN_CLASSES, SemanticClass
 from calib_ros.registration.initial_guess import nominal
@@ -337,12 +337,3 @@ def test_scales_order_colours_and_dots_stay_visible() -> None:
     rows, columns = busiest(interest, 8, 10)
     assert interest[rows, columns].sum() == 1
     assert (rows.stop - rows.start, columns.stop - columns.start) == (8, 10)
-
-
-def test_kitti(kitti_root: Path) -> None:
-    source = open_dataset(str(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"))
-    made = {step.name: step for step in make_steps(source[0], source.reference, Config(), FEW)}
-    assert len(made) <= EXPECTED
-    assert [step.name for step in made.values() if step.picture is None and not step.table] == []
-    here, moved, _ = next(row[1:] for row in made["Scores"].table if row[0] == "fast score")
-    assert float(here) > 1.5 * float(moved)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +14,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.messages import decode_cloud
-from calib_ros.messages.point_fields import LIVOX
 from calib_ros.se3 import exp, quaternion_from_rotation
 
 MS = 1_000_000
-POINTS = "sensor_msgs/msg/PointCloud2"
-LIVOX_POINT = [("offset_time", "<u4"), ("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"), ("", "u1")]
 STORAGES = ["mcap", "sqlite3"]
 START = 1_700_000_000_000_000_000
 K = np.array([[30.0, 0, 20], [0, 31, 12], [0, 0, 1]])
@@ -60,25 +55,6 @@ def as_ros1(bag: Path, path: Path) -> None:
         topics = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections}
         for connection, time, data in reader.messages():
             writer.write(topics[connection.topic], time, TYPES.cdr_to_ros1(data, connection.msgtype))
-
-
-def as_livox(bag: Path, path: Path) -> Path:
-    """A bag whose PointCloud2 are CustomMsg."""
-    with Reader(bag) as reader, Writer(path, version=9) as writer:
-        kinds = {c.topic: LIVOX[0] if c.msgtype == POINTS else c.msgtype for c in reader.connections}
-        topics = {topic: writer.add_connection(topic, kind, typestore=TYPES) for topic, kind in kinds.items()}
-        for connection, time, data in reader.messages():
-            if connection.msgtype == POINTS:
-                message = TYPES.deserialize_cdr(data, POINTS)
-                cloud = decode_cloud(message)
-                points = np.zeros(len(cloud.xyz), LIVOX_POINT)
-                points["xyz"], points["offset_time"], points["line"] = cloud.xyz, cloud.time * 1e9, cloud.ring
-                points["reflectivity"] = cloud.intensity / max(cloud.intensity.max(), 1e-9) * 255
-                about = {"timebase": 0, "point_num": len(points), "lidar_id": 0, "rsvd": np.zeros(3, np.uint8)}
-                empty = TYPES.types[LIVOX[0]](header=message.header, points=[], **about)
-                data = bytes(TYPES.serialize_cdr(empty, LIVOX[0]))[:-4] + struct.pack("<I", len(points)) + points.tobytes()[:-1]
-            writer.write(topics[connection.topic], time, data)
-    return path
 
 
 def assert_same(a: Frame, b: Frame) -> None:

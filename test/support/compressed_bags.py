@@ -58,16 +58,16 @@ def record_video(record: Recorder, packets: list[bytes], topic: str, kind: str =
         record.write(topic, video_message(record.ros, kind, layout, record.ros.header(stamp, "cam"), packet), stamp + 20 * MS)
 
 
-def compressed_bag(bag: Path, path: Path, kind: str = FOXGLOVE, layout: str = "h264", codec: str = "h264") -> Path:
-    """A bag of images and clouds -> the same bag, of video and of clouds by zstd."""
+def compressed_bag(bag: Path, path: Path) -> Path:
+    """A bag of images and clouds -> the same bag, of H.264 and of clouds by zstd."""
     source = BagFile(bag)
     images = next(topic for topic, kept in source.topics.items() if kept.type == IMAGE)
     messages = [(topic, time, source.decode(topic, data)) for topic, time, data in source.raw(source.topics)]
-    packets = iter(encoded([decode_image(message) for topic, _, message in messages if topic == images], codec))
+    packets = iter(encoded([decode_image(message) for topic, _, message in messages if topic == images]))
     with Recorder(path) as record:
         for topic, time, message in messages:
             if topic == images:
-                message = video_message(record.ros, kind, layout, message.header, next(packets))
+                message = video_message(record.ros, FOXGLOVE, "h264", message.header, next(packets))
             elif source.topics[topic].type == POINTS:
                 message = record.ros.compressed_of(message, "zstd", zstd.compress(message.data.tobytes()))
             record.write(topic, message, time)

@@ -264,11 +264,3 @@ def fast_sam(
         maps = [(name, [1, n, side // 8, side // 8]) for name, n in (("few", 3), ("many", 105))]
         outputs = [("empty", [1, *table.shape]), *maps[:1], *outputs, *maps[1:]]
     return g.save(path, [("images", [1, 3, side, side])], outputs, metadata)
-
-
-def other(path: Path) -> str:
-    """A graph that is neither half of a pair: a classifier."""
-    g = SamGraph()
-    pooled = g.op("ReduceMean", "data", axes=[2, 3], keepdims=0)
-    g.op("Softmax", pooled, out="probabilities")
-    return g.save(path, [("data", [1, 3, 32, 32])], [("probabilities", [1, 3])])

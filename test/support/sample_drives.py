@@ -5,8 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import cv2
-import numpy as np
+from sample_sources import kitti
 from scenes import RenderedDrive
 
 from calib_ros.datasets.bag_writer import write_bag
@@ -28,33 +27,10 @@ def bags(folder: Path, *names: str) -> None:
 
 
 def kitti_raw(folder: Path, frames: int) -> None:
-    """KITTI's layout: calibration of the day, pictures, scans without rings, the moments of both, velocities of zero."""
-    drive = street(frames)
-    day = folder.parent
-    folder.mkdir(parents=True)
-
-    def text(values: object) -> str:
-        return " ".join(f"{v:e}" for v in np.ravel(np.asarray(values, float)))
-
-    T = drive.reference
-    files = {
-        day / "calib_cam_to_cam.txt": f"R_rect_00: {text(np.eye(3))}\nP_rect_02: {text(np.c_[drive.camera.K, np.zeros(3)])}\n",
-        day / "calib_velo_to_cam.txt": f"R: {text(T[:3, :3])}\nT: {text(T[:3, 3])}\n",
-        day / "calib_imu_to_velo.txt": f"R: {text(np.eye(3))}\nT: {text(np.zeros(3))}\n",
-    }
-    moments = "".join(f"2011-09-26 13:02:{25 + 3 * k}.000000000\n" for k in range(frames))
-    for name in ("image_02/timestamps.txt", *(f"velodyne_points/timestamps{s}.txt" for s in ("", "_start", "_end"))):
-        files[folder / name] = moments
-    for k in range(frames):
-        files[folder / f"oxts/data/{k:010d}.txt"] = text(np.zeros(30)) + "\n"
-        for place in ("image_02/data", "velodyne_points/data"):
-            (folder / place).mkdir(parents=True, exist_ok=True)
-        frame = drive[k]
-        cv2.imwrite(str(folder / f"image_02/data/{k:010d}.png"), frame.image)
-        np.c_[frame.cloud.xyz, frame.cloud.intensity].astype("<f4").tofile(folder / f"velodyne_points/data/{k:010d}.bin")
-    for path, content in files.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content)
+    """With the calibration of the day beside the drive."""
+    kitti(folder, "raw", [*street(frames)])
+    for path in folder.glob("calib_*.txt"):
+        path.rename(folder.parent / path.name)
 
 
 def for_check(folder: Path) -> None:

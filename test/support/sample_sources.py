@@ -49,23 +49,24 @@ class Listed:
 
 
 def kitti(folder: Path, layout: str, listed: Sequence[Frame] = ()) -> None:
-    """A drive of two frames, or of those; in the object layout each has its own extrinsic."""
+    """A drive of two frames, or of those, which stand still; in the object layout each has its own extrinsic."""
     import cv2
 
     def text(values: Any) -> str:
         return " ".join(f"{v:e}" for v in np.ravel(values))
 
+    some = 0.0 if listed else 0.1  # of a shift and of a speed
     listed = listed or frames()
-    T, P = nominal(0.0)[:3], f"P2: {text(np.c_[listed[0].camera.K, [1.0, 0, 0]])}\n"
+    T, P = listed[0].reference[:3], f"P2: {text(np.c_[listed[0].camera.K, [10 * some, 0, 0]])}\n"
     files: dict[str, str] = {}
     if layout == "raw":
         rectified = f"R_rect_00: {text(np.eye(3))}\n{P.replace('2', '_rect_02', 1)}"
         files["calib_cam_to_cam.txt"] = f"calib_time: 09-Jan-2012 13:57:47\n{rectified}"
-        files["calib_velo_to_cam.txt"] = f"R: {text(T[:, :3])}\nT: 0.1 0.2 0.3\ndelta_f: 0 0\n"
+        files["calib_velo_to_cam.txt"] = f"R: {text(T[:, :3])}\nT: {text(T[:, 3] + some)}\ndelta_f: 0 0\n"
         files["calib_imu_to_velo.txt"] = f"R: {text(np.eye(3))}\nT: -0.8 0.3 -0.8\n"
         for name in ("image_02/timestamps.txt", *(f"velodyne_points/timestamps{s}.txt" for s in ("", "_start", "_end"))):
-            files[name] = "".join(f"2011-09-26 13:02:25.{k}64000000\n" for k in (1, 2))
-        files |= {f"oxts/data/{k:010d}.txt": " ".join(str(0.1 * v) for v in range(30)) + "\n" for k in range(2)}
+            files[name] = "".join(f"{np.datetime64(f.stamp, 'ns')}\n".replace("T", " ") for f in listed)
+        files |= {f"oxts/data/{k:010d}.txt": f"{text(some * np.arange(30))}\n" for k in range(len(listed))}
     elif layout == "odometry":
         files |= {"calib.txt": f"{P}Tr: {text(T)}\n", "times.txt": "0.0\n1.03e-1\n"}
     else:

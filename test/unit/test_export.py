@@ -197,14 +197,6 @@ def test_the_command_takes_direction_and_names(saved: Path, capsys: pytest.Captu
     same(found, TRANSFORMS["near nominal"], "lidar")
 
 
-def test_files_written_by_hand_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "hand.yaml").write_text("translation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n")
-    code, out, err = run(capsys, tmp_path / "hand.yaml")
-    assert code == 0
-    assert "--x 1.0 --y 2.0 --z 3.0" in out
-    assert "its status is initial; exported all the same" in err
-
-
 @pytest.mark.parametrize("status", [INITIAL, REFUSED])
 def test_unaccepted_results_are_exported_with_a_note(status: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result(np.eye(4), status=status, reason="nothing\nmatches").save(tmp_path / "r.json")

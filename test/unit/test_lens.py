@@ -124,6 +124,8 @@ WIDE = {  # focal lengths at the axis of about 150 px
     "ucm": (150, [0.6]),
     "fov": (140, [0.9]),
     "division": (150, [-0.2]),
+    "plumb_bob": (150, [-0.2, 0.03, 1e-3, -2e-3, -0.001]),
+    "rational_polynomial": (150, [0.6, 0.1, 1e-4, -2e-4, 0.01, 0.9, 0.2, 0.02]),
 }
 
 

@@ -112,17 +112,6 @@ def test_cancel_ends_goal_and_search_and_the_node_answers_afterwards(peer, drive
     assert_answers(peer, drive.reference)
 
 
-def test_a_cancelled_goal_leaves_the_estimate_to_the_others(peer, monkeypatch):
-    with one_run(peer, monkeypatch) as go_on:
-        cancelled, other = peer.goal(), peer.goal()
-        await_requests(peer, 2)
-        assert cancelled.cancel()
-        assert cancelled.result()[0] == CANCELED  # at once: the estimate has not gone on yet
-        go_on.set()
-        status, result = other.result()
-        assert status == SUCCEEDED, result.message
-
-
 def test_the_node_answers_others_while_a_goal_is_under_way(peer):
     under_way = goal(peer, MINUTES)
     under_way.await_feedback()

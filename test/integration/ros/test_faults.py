@@ -74,17 +74,10 @@ def with_times(frame: Frame, ahead_s: float) -> dict[str, Any]:
 
 BAD: list[tuple[Callable[[Frame], dict[str, Any]], str]] = [
     (lambda f: of(f, f.image[:100]), "CameraInfo says"),
-    (lambda f: of(f, f.image.transpose(1, 0, 2)), "CameraInfo says"),
-    (lambda f: of(f, np.repeat(f.image, 2, axis=1)), "CameraInfo says"),
-    (lambda f: of(f, encoding="64FC3"), "encoding '64FC3'"),
-    (lambda f: of(f, encoding="rgba8"), "step"),
     (lambda f: of(f, encoding="", data=[]), "encoding ''"),
-    (lambda f: of(f, width=0), "no pixels"),
     (lambda f: scan(f, np.zeros((0, 3), np.float32)), "the cloud has 0 usable points"),
     (lambda f: scan(f, np.full((1000, 3), np.nan, np.float32)), "the LiDAR shows nothing (no returns"),  # by now it is known
-    (lambda f: scan(f, data=bytes(1000)), "PointCloud2"),
     (lambda f: scan(f, fields=[]), "has no field x, y, z"),
-    (lambda f: scan(f, point_step=0), "PointCloud2"),
     (lambda f: scan(f, width=2**31), "PointCloud2"),
     (lambda f: with_times(f, 37.0), "of another clock, +37 s from the header stamp"),
 ]
@@ -108,17 +101,6 @@ def test_bad_messages_leave_node_and_extrinsic_alone(vehicle, capfd):
     logged = capfd.readouterr()
     assert "Traceback" not in logged.err + logged.out
     assert "unexpected" not in logged.err + logged.out
-
-
-@pytest.mark.parametrize("jump_s", [HOUR, -DAY])
-def test_clock_jumps(vehicle, jump_s):
-    """Both sensors' stamps jump forward by an hour, or back by a day."""
-    counts = vehicle.peer.pipeline.synchronizer.counts
-    jumps = counts.jumps_back
-    vehicle.send(vehicle.frame(jump_s))
-    assert counts.jumps_back == jumps + (jump_s < 0)
-    assert ("jumped back" in vehicle.peer.last_error()) >= (jump_s < 0)
-    vehicle.assert_kept()
 
 
 @pytest.mark.parametrize("jump_s", [HOUR, -DAY])
@@ -156,7 +138,10 @@ def test_a_simulated_clock_that_stands_still_and_jumps(vehicle):
         assert peer.diagnostics[-1].header.stamp == time_message(vehicle.stamp)
         vehicle.assert_recovers()
         for jump_s in (DAY, -DAY):
+            jumps = counts.jumps_back
             vehicle.send(vehicle.frame(jump_s))
+            assert counts.jumps_back == jumps + (jump_s < 0)
+            assert ("jumped back" in peer.last_error()) >= (jump_s < 0)
             set_clock()
             vehicle.assert_recovers()
             vehicle.assert_kept()

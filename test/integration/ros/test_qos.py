@@ -259,5 +259,6 @@ def test_the_node_becomes_reliable_and_loses_nothing(street, drive):
         number, counts = next(sent) + 4, peer.pipeline.synchronizer.counts
         assert (counts.images, counts.clouds, counts.pairs) == 3 * (number,)
         assert all(subscription.reliable for subscription in peer.calibration.sensors.adaptive)
+        assert peer.calibration.sensors.adaptive[1]._forms[1:] == livox_forms()  # whose clouds it takes as well
         assert peer.new_values()["share of images paired"] == "1.00"
         assert peer.calibration.health.errors == 0

@@ -255,29 +255,6 @@ def test_two_lidars_are_registered_to_each_other(two) -> None:
     assert load.counts().seconds[Work.ESTIMATES] > 0
 
 
-@pytest.mark.slow
-def test_a_displaced_lidar_is_named_with_its_size_and_found_again(two) -> None:
-    peer, before = two.peer, len(two.peer.rigs)
-    settings = SETTINGS | {"frames": 5}
-    knock = {"knock": "lidar_right", "knock_at": 0.0, "knock_deg": 1.5, "knock_m": 0.06}
-    knocked = SyntheticRig("two_lidars_three_cameras", **settings, **knock)
-    scans = iter(item for item in measured(knocked, (), TWO_S, 2, 10.0) if item[1] == "lidar_right")
-    items = [next(scans) if item[1] == "lidar_right" else item for item in two.items]
-    two.at += TWO_S + PAUSE_S
-    for item in again(items, two.at):
-        peer.drive([item])
-        pause()
-        if "lidar_right moved by" in peer.rigs[-1].text:
-            break
-    right = peer.until(lambda: "lidar_right" in peer.usable() and peer.sensor("lidar_right"), "that it is found again")
-    assert (right.moved_deg, right.moved_m) == (pytest.approx(1.5, abs=0.15), pytest.approx(0.06, abs=0.03))
-    assert ["lidar_right"] in [list(rig.moved) for rig in peer.rigs[before:]]
-    assert doubted(peer, before, "front", "lidar_left") == []
-    deg, m = se3.error(knocked.reference_at("lidar_right", items[-1][0]), dict(poses(peer.rigs[-1]))["lidar_right"])
-    assert deg < 0.1
-    assert m < 0.03
-
-
 def test_without_the_library_lidars_keep_their_priors_and_one_line_says_so(two, monkeypatch) -> None:
     own = two.peer.calibration.lidars[0]
     alone = LidarsOfRig(own.names, None, {}, own._decoded, Common(OnlineConfig()), own._parameters, own._health, own._start)

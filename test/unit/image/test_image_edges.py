@@ -12,7 +12,6 @@ from calib_ros.image.edges import (
     LARGEST,
     MIN_MAGNITUDE,
     EdgeLevel,
-    _wide_blur,
     blurred_levels,
     edge_levels,
     oriented_edges,
@@ -183,17 +182,6 @@ def test_a_colour_picture_of_grey_is_a_grey_picture_and_one_without_contrast_has
         assert np.abs(a.maps - c.maps).max() < 0.05
     blue_green_red = np.eye(3, dtype=np.uint8)[None] * 255
     assert to_gray(blue_green_red).tolist() == [[29, 150, 76]]
-
-
-@pytest.mark.parametrize("size", [(376, 1241), (94, 310), (9, 40), (5, 7)])
-def test_a_wide_blur_is_a_gaussian_one(size: tuple[int, int]) -> None:
-    rng = np.random.default_rng(3)
-    values = cv2.GaussianBlur(rng.uniform(0, 1, size).astype(np.float32) ** 8, (0, 0), 1.2)
-    for sigma in (1.0, 2.3, 4.5, 5.66, 8.0, 11.3):
-        blurred, exact = _wide_blur(values, sigma), cv2.GaussianBlur(values, (0, 0), sigma)
-        assert (blurred.shape, blurred.dtype) == (values.shape, np.float32)
-        assert np.sqrt(np.mean((blurred - exact) ** 2)) < 0.03 * exact.mean()
-        assert np.array_equal(blurred, _wide_blur(values, sigma))
 
 
 def test_maps_are_kept_as_whole_numbers_that_end_at_a_limit() -> None:

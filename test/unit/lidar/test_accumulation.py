@@ -17,13 +17,10 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.accumulation import Accumulator
 from calib_ros.lidar.deskew import moved
 from calib_ros.online.keyframes import EgoMotion
-from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_synthetic.drive import SyntheticDrive
 
 MOTION, SECONDS, NEWEST = MotionConfig(), 0.5, 7
-BOX = SearchBox(3.0, 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -119,18 +116,6 @@ def test_online_and_offline_give_the_same(drive, frames, merged):
     assert online.accumulated(frames[0]) is frames[0]
 
 
-def test_the_recalibrator_accumulates_what_it_keeps(drive, frames):
-    sizes = []
-    for seconds in (0.0, SECONDS):
-        changed = {"semantics": {"image_classes": "", "cloud_classes": ""}, "lidar": {"accumulate_s": seconds}}
-        recalibrator = Recalibrator(drive.camera, drive.reference, update(Config(), changed))
-        for frame in frames[:6]:
-            recalibrator.selector.reset()
-            recalibrator.ingest(frame)
-        sizes.append(len(recalibrator.newest().points))
-    assert sizes[1] > 2 * sizes[0]
-
-
 @pytest.mark.parametrize("chosen", ["3:8", "3:8:2"])
 def test_a_replay_puts_each_scan_in_once_whether_or_not_frames_are_skipped(drive, frames, chosen, monkeypatch):
     sizes, extract = [], FeatureExtractor.__call__
@@ -148,15 +133,3 @@ def test_a_replay_puts_each_scan_in_once_whether_or_not_frames_are_skipped(drive
         first = 3 if chosen == "3:8" else 0  # of a whole drive only what was replayed is known
         assert size == sum(len(frame.cloud) for frame in frames[max(k - 4, first) : k + 1])
     assert len(sizes) > 0
-
-
-@pytest.mark.slow
-def test_a_scanner_that_is_too_sparse_for_a_usual_lens_finds_the_extrinsic():
-    source = open_dataset("synthetic:rig=mid360_90,scene=street,width=480,frames=29,stride=1")
-    config = update(Config(), {"semantics": {"image_classes": "", "cloud_classes": ""}, "lidar": {"accumulate_s": 1.0}})
-    moving = WithMotion(source, config.motion, accumulate_s=1.0)
-    start = se3.perturb(source.reference, np.array([1.5, -2.0, 1.0]), np.array([0.06, -0.05, 0.08]))
-    result = Calibrator(source.camera, config).calibrate([moving[k] for k in (10, 19, 28)], start, BOX)
-    assert result.status == "converged", result.reason
-    assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.2
-    assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.05

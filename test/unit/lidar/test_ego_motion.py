@@ -173,21 +173,6 @@ class TestEstimate:
         assert recalibrator.ingest(drive[2])
         assert np.array_equal(recalibrator.newest().twist, drive.twist(2))
 
-    def test_the_scan_before_is_taken_where_its_frame_was_dropped(self, drive):
-        bare, asked = Bare(drive), []
-
-        def scan_before(since):
-            asked.append(since)
-            return (bare[2].cloud_stamp, bare[2].cloud) if since < bare[2].cloud_stamp else None
-
-        motion = EgoMotion(AUTO)
-        motion.add(bare[0])
-        motion.add(bare[3])
-        assert motion.with_twist(bare[3], scan_before).twist[3] == pytest.approx(SPEED, rel=0.03)
-        motion.add(bare[4])
-        assert motion.with_twist(bare[4], scan_before).twist[3] == pytest.approx(SPEED, rel=0.03)
-        assert asked == [bare[0].cloud_stamp, bare[3].cloud_stamp]
-
     def test_keyframes_of_unknown_motion_are_left_out_while_the_vehicle_moves(self, drive):
         bare = Bare(drive)
         recalibrator = Recalibrator(drive.camera, drive.reference)
@@ -366,15 +351,6 @@ class TestRealDrive:
         assert frame.cloud.time.max() == pytest.approx(0.0517, abs=2e-4)
         assert not frame.compensated
         assert source.describe()["motion"] == "from oxts"
-
-    def test_odometry_is_compensated_and_object_has_no_stamps(self, kitti_root):
-        odometry, objects = (open_dataset(kitti_root / name) for name in ("odometry/sequences/00", "object/training"))
-        assert odometry[0].compensated
-        for frame in (odometry[0], objects[0]):
-            assert frame.twist is None
-            assert frame.cloud.time is None
-            assert not needs_ego_motion(frame, ALWAYS)
-        assert "compensated" in odometry.describe()["motion"]
 
     def test_scans_agree_with_oxts(self, source):
         """oxts is 5 % faster here than scans, a second apart or consecutive, and 10 % faster than its own positions."""

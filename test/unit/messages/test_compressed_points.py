@@ -96,14 +96,6 @@ def test_draco_with_metadata_and_of_too_many_points():
         decode_compressed_cloud(ROS.compressed_cloud(made, "draco", bytes(data)))
 
 
-def test_draco_as_its_own_encoder_quantises():
-    library = pytest.importorskip("DracoPy", reason="DracoPy is not installed")
-    made = points()
-    xyz = np.c_[made["x"], made["y"], made["z"]]
-    with pytest.raises(BadInputError, match="1 attributes of Draco for 6 fields"):
-        decode_compressed_cloud(ROS.compressed_cloud(made, "draco", library.encode(xyz)))
-
-
 def test_cloudini_is_refused_with_what_helps(tmp_path):
     with pytest.raises(BadInputError, match=r"'cloudini' is not read; republish .*point_cloud_transport republish"):
         decode_compressed_cloud(ROS.compressed_cloud(points(), "cloudini", b"CLOUDINI"))

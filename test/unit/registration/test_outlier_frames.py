@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scenes import FAR, NEAR, Scene, assert_not_used
 
 from calib_ros import se3
-from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
-from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
 
@@ -124,35 +120,3 @@ def test_shuffled_images_are_refused_without_naming_outliers(eight, box):
 def test_three_frames_are_too_few_to_find_an_outlier(eight, other):
     frames = with_images(eight.frames[:3], {1: other.frames[0].image})
     assert eight.quick.calibrate(frames, eight.off(NEAR)).frames_left_out == ()
-
-
-# --- KITTI ----------------------------------------------------------------------------------------------------------------
-
-SOURCES = {
-    "odometry 00": ("odometry/sequences/00", range(9)),  # the tenth hardly matches, even at KITTI's own calibration
-    "drive 0005": ("raw/2011_09_26/2011_09_26_drive_0005_sync", range(0, 29, 3)),
-}
-
-
-def opened(root: Path, name: str) -> tuple[list[Frame], np.ndarray, Calibrator, list[FrameFeatures]]:
-    path, positions = SOURCES[name]
-    source = open_dataset(root / path)
-    assert source.reference is not None
-    frames = [source[i] for i in positions]
-    calibrator = Calibrator(source.camera)
-    return frames, source.reference, calibrator, [calibrator.extract(f) for f in frames]
-
-
-@pytest.mark.slow
-@pytest.mark.kitti
-@pytest.mark.parametrize("name", SOURCES)
-def test_one_outlier_frame_of_a_kitti_drive(kitti_root: Path, name: str) -> None:
-    """Of another scene, of the same drive some time later, and of a covered lens."""
-    frames, truth, calibrator, features = opened(kitti_root, name)
-    start = se3.perturb(truth, [0.6, -0.5, 0.6], [0.06, -0.05, 0.06])
-    assert calibrator.estimate(features, start).frames_left_out == ()
-    for k, image in ((2, frames[7].image), (5, frames[0].image), (7, covered(frames[7]))):
-        bad = calibrator.extract(replace(frames[k], image=image))
-        mixed = [bad if j == k else f for j, f in enumerate(features)]
-        clean = calibrator.estimate([f for j, f in enumerate(features) if j != k], start)
-        assert_left_out(calibrator.estimate(mixed, start), clean, [k], [f.name for f in frames])

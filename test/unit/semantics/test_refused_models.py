@@ -122,8 +122,8 @@ REFUSED: dict[str, tuple[Made, str, str, str]] = {
     "another width": (ranges(), CLOUD, "size: [64, 512]", "does not run at the height and width"),
     "one name": (ranges(), CLOUD, "labels: [car]", "names 1 classes"),
     "no decoder": (encoder, MASKS, "", NO_DECODER),
-    "a classifier as decoder": (
-        lambda folder: (encoder(folder), graphs.other(folder / "o.onnx")),
+    "a network for classes as decoder": (
+        lambda folder: (encoder(folder), segmentation(folder / "o.onnx")),
         *(MASKS, "", "o.onnx are no pair of Segment Anything: no input takes points; the encoder has inputs: input_image"),
     ),
     "the other way round": (lambda folder: (decoder(folder), encoder(folder)), MASKS, "", "are no pair"),

@@ -12,7 +12,6 @@ from thesis_constants import thesis_with
 
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
-from calib_ros.frame import SemanticClass as Label
 from calib_ros.lidar import segmentation
 from calib_ros.lidar.segmentation import NOISE, _downsampled, cluster, fit_ground
 from calib_ros_synthetic.drive import SyntheticDrive
@@ -366,21 +365,6 @@ def test_lost_returns_change_nothing(scene, lost):
 def test_a_covered_scanner_is_refused(n, value, usable):
     with pytest.raises(TooFewFeaturesError, match=f" {usable} usable points"):
         attributes(PointCloud(np.full((n, 3), value, np.float32)), CONFIG)
-
-
-@pytest.mark.parametrize("rings", [16, 64])
-def test_the_ground_of_a_street_is_the_true_one(rings):
-    drive = SyntheticDrive(seed=3, frames=1, rings=rings, width=64, height=48)
-    frame, truth = drive[0], drive[0].cloud.label
-    found = attributes(frame.cloud, CONFIG)
-    place = {tuple(p): k for k, p in enumerate(frame.cloud.xyz.tolist())}
-    kind = truth[[place[tuple(p)] for p in found.xyz.tolist()]]
-    ground = kind == Label.GROUND
-    assert found.ground[ground].mean() > 0.97
-    # Walls and wheels stand on it: their lowest 20 cm belong to it.
-    assert found.ground[~ground].mean() < 0.1
-    for one in (Label.VEHICLE, Label.POLE):
-        assert (found.label[(kind == one) & ~found.ground & (found.depth < 20)] > 0).mean() > 0.8
 
 
 @pytest.mark.parametrize("facing", [0.0, 180.0])

@@ -359,21 +359,6 @@ def test_optimum_rejected_by_the_fast_objective_is_refused(drive):
     assert np.array_equal(result.T_camera_lidar, start)
 
 
-def test_an_image_of_another_scene_is_refused(scene):
-    def mirrored(level: EdgeLevel) -> EdgeLevel:
-        return dataclasses.replace(level, packed=level.packed[..., ::-1].copy())
-
-    a, b, _ = scene.features
-    edges = ImageEdges([e[:, ::-1].copy() for e in b.own.image_edges], [mirrored(m) for m in b.own.levels])
-    own = dataclasses.replace(a.own, edges=Later(lambda: edges))
-    levels = [dataclasses.replace(m, packed=m.packed[:, ::-1, ::-1].copy()) for m in b.levels]
-    other = dataclasses.replace(a, levels=levels, own=own)
-    start = off(scene.truth, 0)
-    result = calibrator_of(scene.camera, "attached").estimate([other] * 3, start)
-    assert result.status == "refused"
-    assert np.array_equal(result.T_camera_lidar, start)
-
-
 def test_covariance_includes_the_systematic_error_of_the_objective(scene):
     sigma = {}
     for name, values in (("thesis", METHODS["attached"]), ("fast", {})):

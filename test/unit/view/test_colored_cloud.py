@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.initial_guess import nominal
@@ -53,16 +52,3 @@ def test_of_many_points_those_in_view_are_kept_and_the_same_every_time(street):
     assert some_seen.sum() == seen.sum()
     assert np.array_equal(some, colored_cloud(street[0], T, most)[0])
     assert colored_cloud(street[0], T, 300)[2].all()
-
-
-def test_a_right_extrinsic_gives_neighbours_more_alike_colours(street):
-    """On surfaces, next to each other: a turned camera paints objects with what is beside them."""
-
-    def unlike(T: np.ndarray) -> float:
-        xyz, rgb, seen = colored_cloud(street[0], T, most=10**9)
-        xyz, rgb = xyz[seen], rgb[seen].astype(float)
-        near = np.linalg.norm(np.diff(xyz, axis=0), axis=1) < 0.1
-        return float(np.abs(np.diff(rgb, axis=0)).mean(axis=1)[near].mean())
-
-    T = street[0].reference
-    assert unlike(T) < unlike(se3.perturb(T, [0, 3.0, 0], [0, 0, 0]))

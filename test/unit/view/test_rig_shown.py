@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from graphs import edges, priors, rig
 
 from calib_ros import se3
-from calib_ros.errors import BadInputError
 from calib_ros.rig.description import RigDescription, Sensor
 from calib_ros.rig.edges import Measurement
 from calib_ros.rig.graph import at_sensor, solve, worst_sigmas
@@ -70,13 +68,6 @@ def test_priors_are_shown_with_their_spread_and_are_not_usable() -> None:
     own = shown.sensors[-1]
     assert own.sigma == pytest.approx(worst_sigmas(at_sensor(*known[own.name])))
     assert "nothing is estimated" in shown.text
-
-
-def test_results_of_other_rigs_and_other_files_get_a_line(tmp_path: Path, shown: RigShown) -> None:
-    broken = tmp_path / "broken.json"
-    broken.write_text('{"sensors": {}}')
-    with pytest.raises(BadInputError, match=r"broken\.json is no result of calib-ros rig"):
-        of_result(broken, DESCRIPTION)
 
 
 def test_the_graph_names_all_sensors_and_tells_levels_without_colour(shown: RigShown) -> None:
