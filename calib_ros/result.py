@@ -73,7 +73,6 @@ class Cause(Enum):
         "give the transform of the optical frame",
     )  # or vice versa
     QUATERNION_ORDER = "quaternion_order", "quaternion in another order", "give the quaternion as (x, y, z, w)"
-    MILLIMETRES = "millimetres", "millimetres instead of metres", "give the translation in metres"
     CLOUD_FRAME = "cloud_frame", "points in another frame", "publish the points in the scanner's frame"
 
     words: str  # for people

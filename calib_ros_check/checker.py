@@ -180,9 +180,8 @@ class Checker:
         given = self._judge.as_given(features, inputs.T, optima)
         # Where the scenes match beyond doubt, only a picture can be another one: a transform would lead elsewhere.
         undoubted = near is not None and match_of(near) >= UNDOUBTED_Z
-        asked = Question(features, inputs.T, None, inputs.as_taken, inputs.vehicle_frames, undoubted, near is None)
-        tolerance = inputs.tolerance
-        asked = replace(asked, progress=Progress(inputs.progress, "causes"))
+        tolerance, watch = inputs.tolerance, Progress(inputs.progress, "causes")
+        asked = Question(features, inputs.T, None, inputs.as_taken, inputs.vehicle_frames, True, undoubted, near is None, watch)
         one = self._judge.explain(asked, given, tolerance.deg, tolerance.m)
         if one is not None:
             # What holds on most vehicles has to hold exactly; else its optimum tells how far the extrinsic is off.
@@ -218,8 +217,7 @@ class Checker:
         if other is not None:
             found, score, C, shared, whole = other.T, other.score, None, None, None
             causes = explained(other.hypothesis, self.camera)
-            if clocks.state is CauseState.FOUND:
-                clocks = NOT_THE_CLOCKS
+            clocks = NOT_THE_CLOCKS if clocks.state is CauseState.FOUND else clocks
         elif lens is not None and (fault is not None or not inputs.tolerance.covers(inputs.T, found)):
             seen, T = lens.seen(score)
             if fault is not None or inputs.tolerance.covers(inputs.T, T):  # a usual lens explains it
@@ -231,9 +229,8 @@ class Checker:
                 causes = tuple(own if own is not None and own.cause is finding.cause else finding for finding in causes)
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *causes)
-        why = AS_GIVEN if inputs.tolerance.covers(inputs.T, found) else OFF
-        if any(own.state is CauseState.FOUND for own in causes):
-            why = OTHER_FITS
+        blamed, right = any(own.state is CauseState.FOUND for own in causes), inputs.tolerance.covers(inputs.T, found)
+        why = OTHER_FITS if blamed else AS_GIVEN if right else OFF
         return Explanation(score, found, C, inputs.T, result, (*causes, *not_mixed_up(why)), shared, whole)
 
     def _lens(
@@ -285,7 +282,8 @@ class Checker:
             again = self._calibrator.estimate(features, result.optimum, None, inputs.progress)
             optimum = again.T_camera_lidar if again.converged else result.optimum
             result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
-            result = replace(result, covariance_with_intrinsics=again.covariance_with_intrinsics)
+            whole, shared = again.covariance_with_intrinsics, again.shared_covariance
+            result = replace(result, covariance_with_intrinsics=whole, shared_covariance=shared)
         return features, result, finding
 
     def _lens_instead(

@@ -81,8 +81,8 @@ def judge(
 ) -> Judgement:
     """Verdict about T_checked (4, 4), from an estimate of the true one (4, 4) and its covariance (6, 6), of a left twist.
 
-    freedom: degrees of freedom of the covariance. shared: (6, 6), the part of it that intrinsics and clocks leave open; more
-    scenes would not help, so that they need not show it.
+    freedom: degrees of freedom of the covariance. shared: (6, 6), the part of it that the clocks, or a lens that was
+    mended, leave open; more scenes would not help, so that they need not show it.
     """
     error, C = deviation(T_checked, T_estimated, covariance)
     samples = posterior_samples(error, C, tolerance, freedom)

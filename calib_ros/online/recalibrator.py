@@ -36,10 +36,10 @@ from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.progress import Callback
-from calib_ros.registration.search.constraints import SearchBox
-from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, RefusalCode, Result
+from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
+from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, RefusalCode, Result
 
-JUDGED_AFTER = 3  # estimates in a row where nothing matches: then the judge is asked once what may be mixed up
+JUDGED_AFTER = 3  # estimates where nothing matches: then the judge is asked once what may be mixed up
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 # p value of a keyframe that asks for an estimate at rest: by chance, of the two tests at each, one rest in twenty ends early.
@@ -108,7 +108,8 @@ class Recalibrator:
         self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
-        self._unmatched, self._mixed_up = 0, Result(self.tracker.T, INITIAL)  # estimates in a row; what was found then
+        self._unmatched = 0  # estimates since the last one that converged
+        self._mixed_up: Result | None = None  # what was found of these
         self._seen_motion = SeenMotion()
         self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
@@ -367,12 +368,12 @@ class Recalibrator:
             batch = self.keyframes.batch(self._informative() or list(self.buffer))
             self.schedule.start_estimate()
             fitted, self._keyframes_fit = self._keyframes_fit, self.config.monitor.enabled  # until one from now on does not
-        names, force_search = self.tracker.initial, force_search and bool(batch.features)
+        names, force_search, box = self.tracker.initial, force_search and bool(batch.features), None
         try:
             if not batch.features:
                 result = Result(self.tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds")
             elif self.first_guess.pending:
-                force_search = False
+                force_search, box = False, SEMANTIC_BOX
                 result = self.first_guess.estimate(self.calibrator, batch.features, names, progress)
             else:
                 tracker, box, start = self.tracker, self._search_box() if force_search else None, self.tracker.T
@@ -382,7 +383,7 @@ class Recalibrator:
                 # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
                 anchor = tracker.initial.T_camera_lidar
                 result = self.calibrator.estimate(batch.features, start, box, progress, anchor=anchor, near=box is None)
-                result = self._explained(result, batch, box, progress)
+            result = self._explained(result, batch, box, progress)
         except Cancelled:
             with self._lock:
                 self.keyframes.give_back(batch)
@@ -396,16 +397,21 @@ class Recalibrator:
         return extrinsic
 
     def _explained(self, result: Result, batch: Batch, box: SearchBox | None, progress: Callback | None) -> Result:
-        """The result; where nothing has matched several times in a row, with the cause that was found then, if any."""
-        if result.refusal not in NO_MATCH or result.cause is not None:
-            self._unmatched = 0
+        """The result; where nothing has matched several times, with the cause that was found then, if any."""
+        if result.converged:
+            self._forget_cause()
+        if result.refusal not in NO_MATCH:
             return result
+        if self._unmatched + 1 == JUDGED_AFTER:
+            guessed = self.tracker.initial.origin in (InitialSource.NOMINAL, InitialSource.SEMANTIC, InitialSource.MOTION)
+            self._mixed_up = self.calibrator.explained(result, batch.features, box, progress, stated=not guessed)
         self._unmatched += 1
-        if self._unmatched == JUDGED_AFTER:
-            self._mixed_up = self.calibrator.explained(result, batch.features, box, progress=progress)
-        if self._unmatched < JUDGED_AFTER or self._mixed_up.cause is None:
+        if self._mixed_up is None or self._mixed_up.cause is None:
             return result
         return replace(result, cause=self._mixed_up.cause, reason=self._mixed_up.reason)
+
+    def _forget_cause(self) -> None:
+        self._unmatched, self._mixed_up = 0, None
 
     def _search_box(self, rounds: int | None = None) -> SearchBox:
         return SearchBox(self.config.search.rotation_deg, self.config.search.translation_m, rounds)
@@ -415,9 +421,10 @@ class Recalibrator:
             if batch.generation != self.keyframes.generation:  # reset, configured or moved meanwhile: the estimate is void
                 return self.tracker.current
             if self.first_guess.pending and result.converged:
-                self.tracker = Tracker(replace(result, status=INITIAL, covariance=None), None, self.config)
+                unknown = replace(result, status=INITIAL, covariance=None, covariance_with_intrinsics=None)
+                self.tracker = Tracker(unknown, None, self.config)
                 self.first_guess.end()
-            seconds, self._in_doubt = 0.0, leaves_doubt(result)
+            seconds, self._in_doubt = 0.0, leaves_doubt(replace(result, cause=None))
             if batch.features:
                 before = self._seen_motion.newest
                 seconds = 0.0 if before is None else (batch.features[-1].stamp - before) / NANOSECONDS
@@ -489,5 +496,6 @@ class Recalibrator:
         """With the lock held. Features and estimates that are being computed from the old keyframes become void."""
         self.keyframes.clear()
         self._restart_monitor = self._in_doubt = True
-        self._to_segment, self._unmatched = None, 0
+        self._to_segment = None
+        self._forget_cause()
         self.selector.reset()

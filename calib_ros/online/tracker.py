@@ -124,10 +124,11 @@ class Tracker:
         """What another tracker goes on with: the last good extrinsic if there is one; a calibration that has moved stays so."""
         if self.lost:
             reason = self._objection or ""
-            return replace(self._result, T_camera_lidar=self.search_center, status=MOVED, reason=reason, covariance=None)
+            return _without_doubts(replace(self._result, T_camera_lidar=self.search_center, status=MOVED, reason=reason), None)
+        known = self.last_good or self._result
         if self.tentative:
-            return replace(self.last_good or self._result, status=INITIAL, reason="not confirmed before", covariance=None)
-        return self.last_good or self._result
+            return _without_doubts(replace(known, status=INITIAL, reason="not confirmed before"), None)
+        return _without_doubts(known, known)
 
     # ---- changes ------------------------------------------------------------------------------------------------------
 
@@ -382,12 +383,13 @@ class Tracker:
             more = RECOVERING - self._agreeing_in_a_row
             missing = f"{more} more estimate{'s in a row' if more > 1 else ''} must agree with the new one"
             reason = f"estimate {result.status}: {result.reason or missing}" if estimated else self._objection
+            result = result if estimated else _without_doubts(result, result)
             by_hand = "online.mode is manual: call ~/calibrate" if self.config.online.mode == MANUAL else ""
             result = replace(result, status=MOVED, reason="; ".join(filter(None, [reason, by_hand, blinded])))
         elif self.sensor_problem is not None:
-            result = replace(result, status=BLINDED, reason=blinded)
+            result = _without_doubts(replace(result, status=BLINDED, reason=blinded), result)
         elif self.suspect:
-            result = replace(result, status=SUSPECT, reason=self._objection or "")
+            result = _without_doubts(replace(result, status=SUSPECT, reason=self._objection or ""), result)
         elif result.converged and self.tentative:
             lacking, by = self.missing, "frames of another speed or turn, which show whether the clocks agree"
             if lacking.keyframes:
@@ -413,3 +415,9 @@ class Tracker:
             return False
         current = np.array_equal(self.last_good.T_camera_lidar, self.T)
         return current and (status == CONVERGED or self._rejected_in_a_row < UNSETTLING_REJECTIONS)
+
+
+def _without_doubts(result: Result, known: Result | None) -> Result:
+    """The result without what an estimate was refused for. known: whose covariances it has, None = none."""
+    own, whole = (None, None) if known is None else (known.covariance, known.covariance_with_intrinsics)
+    return replace(result, covariance=own, covariance_with_intrinsics=whole, cause=None, refusal=None)

@@ -23,7 +23,7 @@ from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import change_between
 from calib_ros.registration.acceptance.checks import Acceptance, leaves_doubt
-from calib_ros.registration.acceptance.refusal import MAYBE_RAW, SUSPECT_INTRINSICS, joined
+from calib_ros.registration.acceptance.refusal import MAYBE_RAW, SUSPECT_INTRINSICS, joined, odd_intrinsics
 from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.classes import ALL, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
@@ -45,13 +45,14 @@ from calib_ros.registration.judgement.lens import LensEstimate, estimate_lens, l
 from calib_ros.registration.motion_guess.registration import best_registration, from_anything, from_motion
 from calib_ros.registration.objective import Objective, ObjectiveMaker
 from calib_ros.registration.progress import Callback, Progress
+from calib_ros.registration.score.chance import UNDOUBTED_Z
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result
 
 LACKS_EVIDENCE = (RefusalCode.NOT_SIGNIFICANT, RefusalCode.TOO_UNCERTAIN)
 # Refusals where nothing matches: then something may be mixed up.
 NO_MATCH = (
-    *(RefusalCode.TOO_FEW_FEATURES, RefusalCode.LOW_SCORE, RefusalCode.NOT_SIGNIFICANT),
+    *(RefusalCode.TOO_FEW_FEATURES, RefusalCode.LOW_SCORE, RefusalCode.NOT_SIGNIFICANT, RefusalCode.WRONG_TIMES),
     *(RefusalCode.WORSE_THAN_START, RefusalCode.TOO_FAR_FROM_START),
 )
 Classified = Callable[[], tuple[Sequence[FrameFeatures], Sequence[str]]]
@@ -169,6 +170,9 @@ class Calibrator:
 
             given = register, len(frames), consecutive or frames, self.extract, search
             result = from_motion(*given) if initial == MOTION else from_anything(*given, self.segmentation.active)
+            if explained and result.refusal in NO_MATCH and result.cause is None:
+                used, notes = usable_frames(frames, self.extract, None, Progress(progress, "features"))
+                result = self.explained(result, used, search or SEMANTIC_BOX, progress, notes, stated=False)
             return replace(result, elapsed_s=time.perf_counter() - started)
         wait = T0 is not None and self.classes_in_doubt_only
         segmentation = self.segmentation if self.segmentation.active and not wait else None
@@ -178,11 +182,12 @@ class Calibrator:
         features = [features for _, features in used]
         if T0 is None:
             result = self.guess(features, search, progress, notes, str(initial))
+            if explained:
+                result = self.explained(result, used, search or SEMANTIC_BOX, progress, notes, stated=False)
         else:
             seen = partial(with_classes, used, self.extract, self.segmentation, T0, search, Progress(progress, "classes"))
             result = self.estimate(features, T0, search, progress, notes)
-            if explained:
-                result = self.explained(result, features, search, self.pictures_of(used), progress)
+            result = self.explained(result, used, search, progress, notes) if explained else result
             if wait:
                 result = self.again_in_doubt(result, features, seen, T0, search, progress, notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
@@ -253,13 +258,13 @@ class Calibrator:
             nuisance = found.nuisance(self.config, lens if self._given is None else None)
             # Accept, or say why not.
             refusal = acceptance.refusal(found, watch)
-            if refusal is not None and refusal.code in SUSPECT_INTRINSICS and self.extract.source_camera.said_rectified:
+            stated = self.extract.source_camera
+            if refusal is not None and refusal.code in SUSPECT_INTRINSICS and stated.said_rectified:
                 notes = [MAYBE_RAW, *notes]
+            notes = [*odd_intrinsics(stated), *notes]
             result = found.result(nuisance, refusal, self.config.motion, notes)
             if self.config.camera.intrinsics == REFINE and lens is not None:
-                result = replace(
-                    result, refined_camera=lens.refined_camera(self.extract.source_camera, found.T, found.covariance)
-                )
+                result = replace(result, refined_camera=lens.refined_camera(stated, found.T, found.covariance))
             self.objectives.keep_maps(objective)
         except TooFewFeaturesError as error:
             result = insufficient(error, initial, len(features), notes)
@@ -300,25 +305,34 @@ class Calibrator:
     def explained(
         self,
         result: Result,
-        features: Sequence[FrameFeatures],
+        used: Sequence[Used] | Sequence[FrameFeatures],
         box: SearchBox | None,
-        as_taken: AsTaken | None = None,
         progress: Callback | None = None,
+        notes: Sequence[str] = (),
+        stated: bool = True,
     ) -> Result:
-        """The result; where nothing matches, with its cause, if a hypothesis about what was mixed up explains these features.
-        box: that was searched about its start."""
-        if result.refusal not in NO_MATCH or result.cause is not None or not features or result.initial is None:
-            return result
+        """The result; where nothing matches, with its cause, if a hypothesis about what was mixed up explains the frames.
+
+        used: with their pictures, which may be rectified anew, or features alone. box: that was searched about its start. notes:
+        for its reason. stated: somebody has stated that start.
+        """
+        frames = [own for own in used if isinstance(own, tuple)]
+        features = [own for own in used if isinstance(own, FrameFeatures)] or [own for _, own in frames]
+        undoubted = result.cause is not None and (result.evidence is None or result.evidence.z_score >= UNDOUBTED_Z)
+        if result.refusal not in NO_MATCH or undoubted or not features or result.initial is None:
+            return result  # of clocks there is doubt where their best offset hardly matches
         optima = [] if result.optimum is None else [result.optimum]
         refine = self.config.refine
-        asked = Question(features, result.initial, box, as_taken, progress=Progress(progress, "causes"))
+        as_taken = self.pictures_of(frames) if frames else None
+        box = None if box is None or box.is_empty else box
+        asked = Question(features, result.initial, box, as_taken, stated=stated, progress=Progress(progress, "causes"))
         given = self.judge.as_given(features, result.initial, optima)
         found = self.judge.explain(asked, given, refine.tolerance_deg, refine.tolerance_m)
         if found is None or is_only_off(found, refine.tolerance_deg, refine.tolerance_m):
             return result
         figures = {**result.refusal_figures, "z_score_mended": found.z_score}
         reason = f"{found.hypothesis.message} (with that mended they match, z-score {found.z_score:.1f})"
-        return replace(result, reason=reason, cause=found.hypothesis.cause, refusal_figures=figures)
+        return replace(result, reason=joined([reason, *notes]), cause=found.hypothesis.cause, refusal_figures=figures)
 
     def pictures_of(self, used: Sequence[Used]) -> AsTaken:
         """The features of frames (those with these numbers, None = all), had another camera taken them."""

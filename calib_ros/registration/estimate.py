@@ -23,11 +23,13 @@ from calib_ros.registration.objective import Objective, penalised
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.chance import NullDistribution, null_distribution
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SearchBox
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, RefusalCode, Result
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Cause, Evidence, RefusalCode, Result
 
 UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
 NEGLIGIBLE = 3e-5  # of the score: what steps of a thousandth of a degree leave of an optimum
 OUTLIER_ROUNDS = 3  # an outlier frame may hide another
+# Causes that a corrected camera may mend; of others, it would only be another wrong one.
+OF_LENSES = (Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.NOT_RECTIFIED, Cause.ALREADY_RECTIFIED)
 CAMERA_ROUNDS = 3  # after two, changes are those by which pictures differ that are rectified a fraction of a pixel apart
 
 
@@ -214,6 +216,8 @@ def refined_with_camera(first: Result, given: Camera, whole: Callable[[Camera], 
     result, clocks = first, np.zeros((6, 6))
     if left is None or found is None:  # too little is seen to estimate anything
         return first
+    if left.settled or first.cause not in (None, *OF_LENSES):
+        return replace(first, intrinsics=left.changes) if first.converged else replace(first, refined_camera=None)
     for _ in range(CAMERA_ROUNDS):
         result = whole(left.camera)
         if result.refined_camera is None or result.covariance is None or not result.converged:

@@ -91,6 +91,7 @@ class CheckServer(NodeService):
         nothing = unknown()
         response.rotation, response.translation = deviation_message(nothing.rotation), deviation_message(nothing.translation)
         response.p_within, response.covariance = nothing.p_within, covariance_for_ros(None)
+        response.covariance_with_intrinsics = covariance_for_ros(None)
         try:
             asked = request_check(self._pipeline, check_request(request))
             asked.add_done_callback(self._note)
@@ -142,6 +143,7 @@ def fill_response(response: Check.Response, outcome: CheckOutcome) -> None:
     if result.T_estimated is not None:
         response.estimate_known, response.estimated = True, transform_message(result.T_estimated, *frames)
     response.covariance = covariance_for_ros(result.covariance)
+    response.covariance_with_intrinsics = covariance_for_ros(result.covariance_with_intrinsics)
     response.keyframes_used, response.keyframes = result.frames_used, len(result.frame_names)
     response.stamp, response.notes = time_message(result.data_stamp), list(result.notes)
     response.elapsed, response.cpu = result.elapsed_s, result.cpu_s

@@ -7,7 +7,7 @@ test follows elsewhere: of the node, over time (the gate of online/tracker.py).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
 from calib_ros.registration.acceptance.refusal import (
     Refusal,
     low_score,
-    mirrored_image,
     not_significant,
     objectives_disagree,
     too_far_from_start,
@@ -37,7 +36,7 @@ from calib_ros.registration.nuisance.clock_offset import ClockOffset, estimate_c
 from calib_ros.registration.nuisance.time_offset import with_known_motion
 from calib_ros.registration.objective import Objective, penalised, trust_region
 from calib_ros.registration.progress import Progress
-from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, LOWEST_DECOY_Z, UNDOUBTED_Z, null_extrinsics, p_value
+from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, UNDOUBTED_Z, null_extrinsics, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import NEARLY, SearchBox
 from calib_ros.registration.search.search import SearchResult, search_decoy
@@ -113,8 +112,6 @@ class Acceptance:
         if evidence.p_value <= largest * ratio:
             return None
         score, decoy_z = found.objective.edges.score.at(-1).value(T), evidence.decoy_z_score
-        if decoy_z is not None and p_value(decoy_z, max(evidence.z_score, LOWEST_DECOY_Z)) <= largest:
-            return mirrored_image(evidence.z_score, decoy_z)
         if not score > 0:  # that of the mean of the maps; less, or NaN, is of an image that shows nothing
             return low_score(score)
         decoy_z = HIGHEST_DECOY_Z if decoy_z is None else decoy_z
@@ -125,7 +122,9 @@ class Acceptance:
         optimised, objective, evidence, refine = found.optimised, found.objective, found.evidence, self.config.refine
         wrong, tolerance = self._check_offset(optimised), (refine.tolerance_deg, refine.tolerance_m)
         limited = tolerance[0] < NO_LIMIT_DEG or tolerance[1] < NO_LIMIT_M
-        if wrong is not None or not limited or evidence.p_value > refine.max_p_value:
+        if evidence.p_value > refine.max_p_value:  # where nothing matches, neither do clocks
+            return None if wrong is None else replace(wrong, cause=None)
+        if wrong is not None or not limited:
             return wrong
         fault = None if found.lens is None else found.lens.fault(*tolerance)
         if fault is not None:

@@ -22,6 +22,7 @@ ONE_FRAME = "one frame only: a direction that it does not show may be wrong; use
 AS_RAW = "give --no-rectified, or image_is_rectified: false to the node"
 # And where intrinsics may be at fault, of a Camera.said_rectified.
 MAYBE_RAW = f"the images are taken for rectified, but camera_info has a distortion: if straight lines are bent in them, {AS_RAW}"
+USUAL_ASPECT, MIDDLE = 0.05, 0.25  # shares: fy and fx differ by less, and the principal point lies farther from every border
 SUSPECT_INTRINSICS = (RefusalCode.WRONG_INTRINSICS, RefusalCode.NOT_SIGNIFICANT, RefusalCode.LOW_SCORE)
 
 
@@ -70,13 +71,6 @@ def low_score(score: float) -> Refusal:
         "search if the start may be farther off"
     )
     return _refusal(RefusalCode.LOW_SCORE, text, score=score)
-
-
-def mirrored_image(z_score: float, decoy_z: float) -> Refusal:
-    """The scenes match their mirror images beyond chance, and not the images as they come."""
-    text = f"the images are mirrored left to right: they match so (z-score {decoy_z:.1f}), and not as they come ({z_score:.1f})"
-    figures = {"z_score": z_score, "decoy_z": decoy_z}
-    return Refusal(RefusalCode.NOT_SIGNIFICANT, f"{text}; turn it off in the driver", figures, Cause.MIRRORED_IMAGE)
 
 
 def not_significant(z_score: float, decoy_z: float, p_value: float, largest: float, inconsistent: bool) -> Refusal:
@@ -165,6 +159,16 @@ def wrong_times(seconds: float, deviations: float) -> Refusal:
         "motion.time_offset_s"
     )
     return Refusal(RefusalCode.WRONG_TIMES, text, {"seconds": float(seconds), "deviations": float(deviations)}, Cause.TIME_OFFSET)
+
+
+def odd_intrinsics(camera: Camera) -> list[str]:
+    """What is unusual of stated intrinsics, whether or not anything is refused."""
+    (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
+    out = [f"fx and fy differ by {abs(fy / fx - 1):.0%}"] if abs(fy / fx - 1) > USUAL_ASPECT else []
+    shares = cx / camera.width, cy / camera.height
+    if not all(MIDDLE <= share <= 1 - MIDDLE for share in shares):
+        out.append(f"the principal point lies at {shares[0]:.0%} of the image's width and {shares[1]:.0%} of its height")
+    return [f"{' and '.join(out)}: check that K in camera_info is of this image"] if out else []
 
 
 def joined(parts: Sequence[str]) -> str:

@@ -29,14 +29,13 @@ from calib_ros.result import Cause
 
 # Features of frames with these numbers, None = of all, had this camera taken them. Raises BadInputError if it cannot have.
 AsTaken = Callable[[Camera, Sequence[int] | None], Sequence[FrameFeatures]]
-OF_TRANSFORM = (Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.QUATERNION_ORDER, Cause.MILLIMETRES, Cause.CLOUD_FRAME)
+OF_TRANSFORM = (Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.QUATERNION_ORDER, Cause.CLOUD_FRAME)
 OF_PICTURE = (Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
 MIXED_UP = (*OF_TRANSFORM, *OF_PICTURE)
 _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 # Turns of the picture about the optical axis, clockwise.
 _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 90 deg anticlockwise"}
 _TURNED = "the image is {}; turn it back, or mend the driver's rotation"
-MAX_MOUNT_M, MM = 20.0, 1000.0  # a sensor stands no farther from another on one vehicle; then its shift may be in mm
 PLACES, SAME_PLACE_M = 3, 0.1  # of the scanner in its clouds: how many are tried, and how far they are apart
 # Of an image to this one, as pictures are resized; between them the lens is refined.
 SIZES = (0.25, 1 / 3, 0.4, 0.5, 0.6, 2 / 3, 0.75, 0.8, 5 / 6, 0.9, 10 / 9, 1.2, 1.25, 4 / 3, 1.5, 5 / 3, 2.0, 2.5, 3.0, 4.0)
@@ -106,14 +105,14 @@ def transforms(T: Transform) -> Iterator[Hypothesis]:
     twice = "the rotation from the camera's body frame to its optical frame is applied twice; leave one out"
     yield Hypothesis(Cause.BODY_FRAME, twice, se3.inverse(_BODY) @ T)
     yield Hypothesis(Cause.BODY_FRAME, f"{twice}, and invert the transform", se3.inverse(_BODY) @ inverse)
-    order = "the quaternion of the transform is in another order than expected: its {} comes first; take it as (x, y, z, w)"
     quaternion = se3.quaternion_from_rotation(T[:3, :3])
-    for first, shift in (("w", -1), ("x, as if w came first,", 1)):
+    for how, shift in (
+        ("is given with w first, and was read as (x, y, z, w)", -1),
+        ("was read with w first, but is (x, y, z, w)", 1),
+    ):
         R = se3.rotation_from_quaternion(np.roll(quaternion, shift))
-        yield Hypothesis(Cause.QUATERNION_ORDER, order.format(first), se3.from_parts(R, T[:3, 3]))
-    if np.linalg.norm(T[:3, 3]) > MAX_MOUNT_M:
-        millimetres = "the translation of the transform is in millimetres; give it in metres"
-        yield Hypothesis(Cause.MILLIMETRES, millimetres, se3.from_parts(T[:3, :3], T[:3, 3] / MM))
+        what = f"the quaternion of the transform {how}; mend its order"
+        yield Hypothesis(Cause.QUATERNION_ORDER, what, se3.from_parts(R, T[:3, 3]))
 
 
 def pictures(T: Transform, camera: Camera) -> Iterator[Hypothesis]:

@@ -58,15 +58,17 @@ SHOWN_SIGMAS = 2.0  # of what a size lacks to the one that was tried
 
 @dataclass(frozen=True, eq=False)
 class Candidate(Match):
-    """A hypothesis at its optimum. searched: all of the box that is asked about, not only near where it predicts one."""
+    """A hypothesis at its optimum. searched: all of the box that is asked about, not only near where it predicts one. rarer:
+    factor from its z-score to that of all frames."""
 
     hypothesis: Hypothesis
     searched: bool = False
+    rarer: float = 1.0
 
     @cached_property
     def z_score(self) -> float:
         """Of the match, against extrinsics around it."""
-        return null_distribution(self.score, self.T).z_score
+        return self.rarer * null_distribution(self.score, self.T).z_score
 
     @property
     def surprise(self) -> float:
@@ -82,15 +84,20 @@ class Candidate(Match):
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What is asked about frames. T: T_camera_lidar (4, 4) as it is given. box: about T, in which it is to be searched; None = it
-    is right, or just off. as_taken: None = pictures cannot be rectified anew. frames: T_camera_F (4, 4) of frames F of the
-    vehicle, by name, in which the clouds may be. only_pictures, thorough: fewer hypotheses, and also those that take long."""
+    """What is asked about frames.
+
+    T: T_camera_lidar (4, 4) as it is given. box: about T, in which it is to be searched; None = it is right, or just off.
+    as_taken: None = pictures cannot be rectified anew. frames: T_camera_F (4, 4) of frames F of the vehicle, by name, in which
+    the clouds may be. stated: somebody has stated T; else it is a guess, and no transform was mixed up. only_pictures, thorough:
+    fewer hypotheses, and also those that take long.
+    """
 
     features: Sequence[FrameFeatures]
     T: Transform
     box: SearchBox | None = None
     as_taken: AsTaken | None = None
     frames: Mapping[str, Matrix] = field(default_factory=dict)
+    stated: bool = True
     only_pictures: bool = False
     thorough: bool = False
     progress: Progress = SILENT
@@ -99,11 +106,6 @@ class Question:
     def some(self) -> Sequence[int]:
         """Numbers of a few frames."""
         return spread_positions(FEW_FRAMES, len(self.features))
-
-    @property
-    def rarer(self) -> float:
-        """Factor of their z-scores to those of all: they grow with the root of the number of points."""
-        return math.sqrt(len(self.features) / len(self.some))
 
 
 class Judge:
@@ -146,21 +148,23 @@ class Judge:
 
     def _simplest_as_good(self, found: Candidate, tried: Sequence[Candidate], asked: Question) -> Candidate:
         """What was found, or a simpler hypothesis that predicts about the same optimum as well: a rough start ranks none."""
-        simpler = (own for own in tried if own.hypothesis.rank < found.hypothesis.rank)
-        rivals = (own for own in simpler if _distance(own.hypothesis.T, found.T) <= found.surprise + SLACK)
-        others = [self._confirmed(own, asked) for own in rivals]
+        if found.hypothesis.of_lens:
+            return found
+        simpler = [own for own in tried if own.hypothesis.rank < found.hypothesis.rank and not own.hypothesis.of_lens]
+        rivals = [own for own in simpler if _distance(own.hypothesis.T, found.T) <= found.surprise + SLACK]
+        others = [self._confirmed(own, asked) for own in rivals[:CONFIRMED]]
         return simplest(found, [found, *(own for own in others if own is not None)])
 
     def tried(self, asked: Question, guesses: Sequence[Hypothesis]) -> list[Candidate]:
         """The hypotheses that leave enough points in view, and say more than that the extrinsic is off, the best match first."""
         atlas: Atlas | None = None
-        ranked: list[tuple[float, Candidate]] = []
+        tried: list[Candidate] = []
         for k, guess in enumerate(guesses):
             asked.progress(k / len(guesses))
             with suppress(TooFewFeaturesError, BadInputError):
                 if guess.camera is not None and not any(guess.lens):
-                    own = self._by_few(guess, asked)
-                    ranked += [] if own is None else [(asked.rarer * own.z_score, own)]
+                    few = self._by_few(guess, asked)
+                    tried += [] if few is None else [few]
                     continue
                 score = self.score(asked.features, guess.T, atlas)
                 atlas = score.atlas  # one for all: each would take as much memory as the maps of all frames
@@ -168,8 +172,8 @@ class Judge:
                 own = Candidate(seen, _optimum(seen, guess.T), guess)
                 if asked.box is not None and guess.cause in OF_PICTURE:  # the likeliest: they come with every extrinsic
                     own = self._searched(own, asked)
-                ranked.append((own.z_score, own))
-        return [own for _, own in sorted(ranked, key=lambda one: -one[0]) if own.says_more_than(asked.T)]
+                tried.append(own)
+        return sorted((own for own in tried if own.says_more_than(asked.T)), key=lambda own: -own.z_score)
 
     def by_camera(
         self,
@@ -194,7 +198,10 @@ class Judge:
     def _by_few(self, guess: Hypothesis, asked: Question) -> Candidate | None:
         """The same by a few frames, searched where the extrinsic is not known: rectifying takes longer than a search."""
         own = self.by_camera(guess, asked, numbers=asked.some)
-        return own if own is None or asked.box is None else self._searched(own, asked)
+        if own is None:
+            return None
+        own = replace(own, rarer=math.sqrt(len(asked.features) / len(asked.some)))  # it grows with the root of the points
+        return own if asked.box is None else self._searched(own, asked)
 
     def lens(
         self, score: PointScore, T: Transform, inflated: float = 1.0, turned: Transform | None = None
@@ -211,6 +218,7 @@ class Judge:
             yield list(pictures(T, working))
             return
         made = mix_ups(T, working, [f.points.pose for f in asked.features], asked.frames)
+        made = [own for own in made if asked.stated or own.cause in (Cause.CLOUD_FRAME, *OF_PICTURE)]
         made += [turned_over(T, self.camera)] if distorted else []  # rectified upside down, a picture is bent
         sizes = [] if working.is_sphere else list(resized(T, self.camera, working, asked.thorough))
         made += [*rectified_otherwise(T, self.camera)] + ([] if asked.thorough and distorted else sizes)
@@ -227,7 +235,7 @@ class Judge:
         else:
             with suppress(TooFewFeaturesError, BadInputError):
                 few = self._by_few(guess, asked) if any(guess.lens) else one
-                if few is None or p_value(asked.rarer * few.z_score, LOWEST_DECOY_Z) > self.config.refine.max_p_value:
+                if few is None or p_value(few.z_score, LOWEST_DECOY_Z) > self.config.refine.max_p_value:
                     return None
                 anew = self.by_camera(guess, asked, few.T)
                 if anew is None:
@@ -276,7 +284,7 @@ def is_only_off(one: Candidate, deg: float, m: float) -> bool:
 
 def simplest(best: Candidate, tried: Sequence[Candidate]) -> Candidate:
     """Of all hypotheses that match about as well as the best one, that which predicts its optimum best; else the simplest."""
-    alike = [own for own in tried if own.z_score >= ALIKE * best.z_score]
+    alike = [own for own in tried if own is best or own.z_score >= ALIKE * best.z_score]
     nearest = min(own.surprise for own in alike)
     near = [own for own in alike if own.surprise <= nearest + SLACK]
     return min(near, key=lambda own: own.hypothesis.rank)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtri
+from scipy.special import fdtri, ndtri
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -36,7 +36,15 @@ from calib_ros.lens import PERSPECTIVE
 from calib_ros.registration.acceptance.refusal import Refusal, left_open, wrong_intrinsics
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.covariance import LEAST_CURVATURE, NO_NOISE, REGIONS, STEP, effective_frames
-from calib_ros.registration.nuisance.parameters import GROSSLY, NEAR_LEVELS, OPEN_PROBABILITY, POINTS, REACH, noise_of
+from calib_ros.registration.nuisance.parameters import (
+    GROSSLY,
+    NEAR_LEVELS,
+    OPEN_PROBABILITY,
+    POINTS,
+    REACH,
+    SIGNIFICANCE,
+    noise_of,
+)
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, unlimited
@@ -226,8 +234,11 @@ class LensEstimate:
         return np.asarray(self.moves @ self.posterior[1] @ self.moves.T)
 
     def refined_camera(self, camera: Camera, T: Transform, extrinsic: Covariance) -> RefinedCamera:
-        """The camera with the change that is expected. T, extrinsic: the optimum (4, 4) by `camera`, its covariance (6, 6)."""
-        mean, spread = self.posterior
+        """The camera with the change that is expected, if the scenes show one (F test): a right one would else get their noise.
+        T, extrinsic: the optimum (4, 4) by `camera`, its covariance (6, 6)."""
+        (mean, spread), n = self.posterior, len(self.unknowns)
+        if self.change @ self.information @ self.change < n * fdtri(n, self.freedom, 1 - SIGNIFICANCE):
+            mean, spread = np.zeros(n), spread + np.outer(mean, mean)
         units = np.array([own.unit for own in self.unknowns])
         T, changes = se3.exp(self.moves @ mean) @ T, {}
         for own, value, sigma in zip(self.unknowns, mean * units, np.sqrt(np.diag(spread)) * units, strict=True):

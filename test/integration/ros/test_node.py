@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import threading
+from dataclasses import replace
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -25,8 +26,9 @@ from vehicle import QUICK, Vehicle, is_right, off
 
 from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros.messages import decode_compressed_image, decode_image
-from calib_ros.result import CONVERGED, Result
+from calib_ros.result import CONVERGED, Cause, Result
 from calib_ros.ros.client import result_from_message
+from calib_ros.ros.conversions import extrinsic_message
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 PERIOD_S, AGE_S = 0.1, 0.5  # AGE_S: of data that are too old, in the test of it
@@ -195,8 +197,12 @@ def test_from_messages_to_a_published_extrinsic(peer, street, drive):
     assert (answer.extrinsic.advice.progress, seconds(answer.extrinsic.advice.remaining)) == (1.0, 0.0)
     values = {value.key: value.value for value in peer.until(lambda: peer.diagnostics, "diagnostics")[-1].status[0].values}
     assert {"advice", "progress, %"} <= values.keys()
-    # The covariance crosses the border into ROS's order and back unchanged.
-    np.testing.assert_allclose(result.covariance, peer.recalibrator.current.result.covariance)
+    # Covariances cross the border into ROS's order and back unchanged, and a cause as it is.
+    current = peer.recalibrator.current
+    np.testing.assert_allclose(result.covariance, current.result.covariance)
+    np.testing.assert_allclose(result.covariance_with_intrinsics, current.result.covariance_with_intrinsics)
+    blamed = replace(current, result=replace(current.result, cause=Cause.ROTATED_IMAGE))
+    assert (result.cause, result_from_message(extrinsic_message(blamed, 0)).cause) == (None, Cause.ROTATED_IMAGE)
     assert np.sqrt(answer.extrinsic.covariance[0]) == pytest.approx(0.018, abs=0.02)  # metres come first in ROS
 
     # Whoever joins late gets the latched extrinsic and transform.

@@ -6,6 +6,9 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +16,13 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from ros_processes import Observer, end, initial, node_process, play, played
 from scenes import is_near
+from sensor_msgs.msg import Image, PointCloud2
 from vehicle import CLOSE_DEG, CLOSE_M, QUICK, off
 from waiting import LIMIT_S
 
 from calib_ros import se3
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.result import CONVERGED, Result
 
 pytestmark = pytest.mark.ros
@@ -40,6 +46,25 @@ def assert_found(client: Observer, reference: np.ndarray) -> None:
     """At the latest when it has worked off what it has received."""
     client.until(lambda: client.get_extrinsic()[0], "an extrinsic")
     assert_kept(client, reference)
+
+
+def assert_recovers(client: Observer, reference: np.ndarray) -> None:
+    """More pairs come, and another estimate is accepted."""
+    client.new_values()
+    pairs, accepted = client.count("pairs"), client.count("estimates accepted")
+    client.until(lambda: client.count("pairs") > pairs and client.count("estimates accepted") > accepted, "another estimate")
+    assert_kept(client, reference)
+
+
+@contextmanager
+def playing(bag: Path) -> Iterator[None]:
+    """A player that runs until it is killed, hard."""
+    player = play(bag, "--rate", "4", "--loop")
+    try:
+        yield
+    finally:
+        player.kill()
+        player.communicate()
 
 
 def assert_broken_off(text: str) -> None:
@@ -125,6 +150,54 @@ def test_signals_during_a_goal(street_bag, managed, numbers):
         assert_broken_off(end(node, *numbers))
 
 
+@pytest.mark.slow
+def test_a_publisher_is_killed_and_comes_back(street_bag, drive):
+    """In the middle of its messages; between the two others publish the wrong types on the topics."""
+    start = initial(off(drive.reference))
+    with node_process(*start, **QUICK) as node, Observer() as client:
+        with playing(street_bag):
+            client.until(lambda: client.count("estimates accepted") > 1, "an estimate")
+            assert_recovers(client, drive.reference)
+        assert_kept(client, drive.reference)
+        topics = {"/camera/image_raw": PointCloud2, "/velodyne_points": Image, "/camera/camera_info": Image}
+        swapped = [client._node.create_publisher(kind, topic, 10) for topic, kind in topics.items()]
+
+        def disturb() -> None:
+            for publisher in swapped:
+                publisher.publish(publisher.msg_type())
+            client.spin(0.02)
+
+        for _ in range(20):
+            disturb()
+        assert_kept(client, drive.reference)
+        with playing(street_bag):
+            assert_recovers(client, drive.reference)
+            disturb()  # beside the right ones
+            assert_recovers(client, drive.reference)
+        assert_kept(client, drive.reference)
+        end(node)
+
+
+@pytest.mark.slow
+def test_killed_node_restarts_with_the_last_good_extrinsic(street_bag, drive, tmp_path):
+    """SIGKILL at any moment leaves a whole state file. The next node answers with it before the first image."""
+    state = tmp_path / "state.json"
+    settings = {**QUICK, "state_file": state}
+    with node_process(*initial(off(drive.reference)), **settings) as node, Observer() as client, playing(street_bag):
+        client.until(lambda: client.count("estimates accepted") > 1, "an estimate")
+        node.kill()
+        node.wait()
+    assert [path.name for path in tmp_path.iterdir() if not path.name.startswith(".")] == [state.name]
+    saved = json.loads(state.read_text())
+    assert saved["status"] == "converged"
+    with node_process(**settings), Observer() as client:
+        _, message, result, _ = client.get_extrinsic()
+        assert message
+        np.testing.assert_allclose(result.T_camera_lidar, saved["T_camera_lidar"], atol=1e-9)
+        with playing(street_bag):
+            assert_found(client, drive.reference)  # keyframes confirm what was saved
+
+
 @pytest.mark.parametrize(("entry_point", "number"), [("calib_node", signal.SIGINT), ("calib_lifecycle_node", signal.SIGTERM)])
 def test_a_signal_while_the_libraries_are_imported(entry_point, number):
     program = f"""
@@ -190,6 +263,26 @@ def test_a_player_says_where_it_follows_nobody(street_bag):
     _, err = player.communicate(timeout=LIMIT_S)
     assert player.returncode == 0, err
     assert "/nobody is not heard" in err
+
+
+@pytest.mark.slow
+@pytest.mark.kitti
+def test_a_kitti_drive_played_into_the_node(kitti_root, tmp_path):
+    """All images and clouds arrive, the service's answer is soon within 0.35 deg and 10 cm, an overlay comes."""
+    source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
+    bag = write_bag(source, tmp_path / "bag", "mcap")
+    start = se3.perturb(source.reference, [1.2, -1.0, 0.7], [0.1, -0.1, 0.05])
+    # The scanner triggers the camera; three seconds of a drive need not show it.
+    known = {"motion__max_time_offset_s": 0.0, "online__max_load": 1.0, "semantics__segmentation": "auto"}
+    with node_process(*initial(start), **known) as node, Observer() as client:
+        played(bag)
+        client.until(lambda: client.count("images") == client.count("clouds") == 29, "all images and clouds")
+        client.until(lambda: client.count("estimates accepted") >= 1, "an extrinsic")
+        # Whether the last keyframes, a second apart, make the monitor doubt it depends on which estimates there was time for.
+        T = client.get_extrinsic()[2].T_camera_lidar
+        assert is_near(source.reference, T, 0.35, 0.10)
+        client.until(lambda: client.overlays > 0, "an overlay")
+        end(node, signal.SIGTERM)
 
 
 # The core alone, without the packages beside it: thesis, semantics, check, view, synthetic.

@@ -88,6 +88,9 @@ def test_right_intrinsics_are_estimated_as_given(scene):
     focal = result.intrinsics[FOCAL]
     assert focal.observable
     assert abs(focal.value) < 4 * focal.sigma < 0.02
+    asked = calibrated(scene, scene.camera, config=REFINE)  # the noise of the scenes corrects nothing
+    assert asked.refined_camera.camera == scene.camera
+    assert np.array_equal(asked.T_camera_lidar, result.T_camera_lidar)
 
 
 @pytest.mark.parametrize("focal", [-0.01, 0.01])

@@ -10,7 +10,13 @@ import pytest
 from calib_ros.camera import Camera
 from calib_ros.errors import defect
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL
-from calib_ros.registration.acceptance.refusal import left_open, low_score, mirrored_image, wrong_intrinsics, wrong_times
+from calib_ros.registration.acceptance.refusal import (
+    left_open,
+    low_score,
+    odd_intrinsics,
+    wrong_intrinsics,
+    wrong_times,
+)
 
 CAMERA = Camera(np.diag([700.0, 700.0, 1.0]), 1000, 500)
 LENS = {FOCAL: 0.0, ASPECT: 0.0, CENTRE[0]: 0.0, CENTRE[1]: 0.0, RADIAL: 0.0}
@@ -26,7 +32,6 @@ LENSES = [
     ("said", "text"),
     [
         (wrong_times(-0.6, 0.0), "the clocks set 600 ms apart, which the scenes do not confirm: images"),
-        (mirrored_image(3.0, 8.4), "left to right: they match so (z-score 8.4), and not as they come (3.0)"),
         (low_score(math.nan), "the image shows nothing where the LiDAR sees edges; check"),
         (left_open("time_offset_s", 0.0, math.inf, 0.13, 0.25, 0.05), "the scenes do not show time_offset_s, and leave open"),
         *((wrong_intrinsics(main, LENS | {main: value}, CAMERA, gone, 3.6), text) for main, value, gone, text in LENSES),
@@ -35,3 +40,9 @@ LENSES = [
 )
 def test_reasons_without_riddles(said: object, text: str) -> None:
     assert text in str(said)
+
+
+@pytest.mark.parametrize(("fy", "cx", "says"), [(734, 350, []), (740, 350, ["differ by 6%"]), (700, 180, ["at 18% of"])])
+def test_odd_intrinsics_are_told(fy: float, cx: float, says: list[str]) -> None:
+    told = odd_intrinsics(Camera(np.array([[700.0, 0, cx], [0, fy, 250], [0, 0, 1]]), 1000, 500))
+    assert [text in line for text, line in zip(says, told, strict=True)] == [True] * len(says)
