@@ -11,7 +11,7 @@ from calib_ros.errors import ConfigError
 ESTIMATE = "estimate"  # of motion.time_offset
 GIVEN, REFINE = "given", "refine"  # of camera.intrinsics
 MAX_OFFSET_S = 0.5  # to either side of motion.time_offset_s, in which offsets are searched
-CENTRE_PER_FOCAL = 0.4  # uncertainty of the principal point, a share of the width, by that of the focal length, a share of it
+CENTRE_PER_FOCAL = 0.6  # uncertainty of the principal point, a share of the width, by that of the focal length, a share of it
 FARTHEST_OFFSET_S = 60.0  # of motion.time_offset_s: messages wait no longer, and other epochs are found
 
 
@@ -68,14 +68,14 @@ class CameraConfig(Stage):
     focal_sigma: float = option(
         0.005,
         "standard deviation of the focal length, as a share of it; that of the principal point, as a share of the image width, "
-        "is 0.4 of it; 0 = exact: the lens is not judged",
+        "is 0.6 of it; 0 = exact: the lens is not judged",
         low=0.0,
         high=0.1,
     )
 
     @property
     def centre_sigma(self) -> float:
-        """Standard deviation of the principal point, each way, as a share of the image width: boards tell it to 1 to 3 px."""
+        """Standard deviation of the principal point, each way, as a share of the image width: boards tell it to 3 px of 1000."""
         return CENTRE_PER_FOCAL * self.focal_sigma
 
 

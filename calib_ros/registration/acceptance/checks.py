@@ -124,11 +124,12 @@ class Acceptance:
         limited = tolerance[0] < NO_LIMIT_DEG or tolerance[1] < NO_LIMIT_M
         if evidence.p_value > refine.max_p_value:  # where nothing matches, neither do clocks
             return None if wrong is None else replace(wrong, cause=None)
+        fault = found.lens.fault(*tolerance) if limited and found.lens is not None else None
+        # A lens that is plainly wrong looks like other clocks, too, and those in vain: it is wrong at theirs as well.
+        if fault is not None and (wrong is None or fault.probability == 1):
+            return fault.refusal(self.camera, *tolerance)
         if wrong is not None or not limited:
             return wrong
-        fault = None if found.lens is None else found.lens.fault(*tolerance)
-        if fault is not None:
-            return fault.refusal(self.camera, *tolerance)
         if not self.searched:
             return None
         moving = with_known_motion(optimised.features, objective.edges.score)

@@ -48,7 +48,6 @@ STARTS, ROUNDS, SAME_K = 12, 40, 0.01  # of the search for a raw picture's K, an
 INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
 ALREADY_RECTIFIED = "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
 _MOVED = f"{ALREADY_RECTIFIED}; set image_is_rectified (--rectified)"
-_FISHEYE = "the image is that of a fisheye, but {}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +231,7 @@ def fisheyes(T: Transform, camera: Camera) -> Iterator[Hypothesis]:
         if not camera.said_rectified:
             said = "its CameraInfo has no distortion; take the rectified topic, or give 'equidistant' with its coefficients"
         lens = replace(camera, model="equidistant", D=D)
-        yield Hypothesis(Cause.NOT_RECTIFIED, _FISHEYE.format(said), T, camera=lens)
+        yield Hypothesis(Cause.NOT_RECTIFIED, f"the image is that of a fisheye, but {said}", T, camera=lens)
     elif not camera.is_sphere and camera.model not in PERSPECTIVE:
         for share in NEAR_FOCALS:
             K = camera.K * np.array([[1 + share, 1, 1], [1, 1 + share, 1], [1, 1, 1]])
