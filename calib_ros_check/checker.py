@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -248,9 +247,9 @@ class Checker:
         asks = shows_noise(score) and (score.camera.is_sphere or not inputs.tolerance.covers(inputs.T, found))
         guesses, others = [*fisheyes(found, self.camera)] if asks else [], list[Candidate]()
         asked = Question((), inputs.T, as_taken=inputs.as_taken)
-        for guess, T in product(guesses, (found, inputs.T)):
+        for guess in guesses:  # one after the other: each holds the maps of all frames
             with suppress(TooFewFeaturesError, BadInputError):
-                own = self._judge.by_camera(guess, asked, T, offset_s=offset_s)
+                own = self._judge.by_camera(guess, asked, (found, inputs.T), offset_s=offset_s)
                 others += [] if own is None else [own]
         best = max(others, key=lambda own: own.z_score, default=None)
         better = best is not None and convinces(log_odds(best, Match(score, found)), rare_odds(len(guesses)))

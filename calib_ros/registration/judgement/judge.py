@@ -132,15 +132,16 @@ class Judge:
     def explain(self, asked: Question, given: Match | None, deg: float, m: float) -> Candidate | None:
         """The hypothesis that explains the frames, if one matches beyond chance, and convinces against the extrinsic being off.
         given: see `as_given`. deg, m: the tolerance, within which an extrinsic is the same."""
-        count = 0
+        count, done = 0, set[Candidate]()
         for guesses in self._hypotheses(asked):  # until one explains the frames
             tried = self.tried(asked, guesses)
             count += len(tried)
             for best in tried[:CONFIRMED]:
                 if asked.box is None and not self._beyond_chance(best, count):
                     break
-                for one in dict.fromkeys((simplest(best, tried), best)):
-                    own = self._confirmed(one, asked)
+                for one in (simplest(best, tried), best):
+                    own = None if one in done else self._confirmed(one, asked)
+                    done.add(one)
                     odds = rare_odds(count) if own is None or not is_only_off(own, deg, m) else EVEN
                     if own is not None and self._beyond_chance(own, count) and convinces(log_odds(own, given), odds):
                         return own if asked.box is None else self._simplest_as_good(own, tried, asked)
@@ -179,21 +180,23 @@ class Judge:
         self,
         guess: Hypothesis,
         asked: Question,
-        start: Transform | None = None,
+        starts: Sequence[Transform] = (),
         numbers: Sequence[int] | None = None,
         offset_s: float = 0.0,
     ) -> Candidate | None:
-        """A hypothesis whose pictures are rectified anew; None where they cannot be. start: (4, 4), near its optimum. offset_s:
-        of the clocks, as found. numbers: of the frames, None = all. Raises BadInputError where no picture can be rectified so,
-        TooFewFeaturesError."""
+        """A hypothesis whose pictures are rectified anew, once; None where they cannot be. starts: (4, 4), one of them near its
+        optimum; none = where it predicts that. offset_s: of the clocks, as found. numbers: of the frames, None = all. Raises
+        BadInputError where no picture can be rectified so, TooFewFeaturesError."""
         if asked.as_taken is None or guess.camera is None:
             return None
         features = asked.as_taken(guess.camera, numbers)
         if offset_s:
             features = [at_time_offset(f, offset_s) for f in features]
-        start = guess.T if start is None else start
-        score = self.score(features, start)
-        return Candidate(score, _optimum(score, start), guess)
+        found: list[Candidate] = []
+        for start in starts or (guess.T,):
+            score = self.score(features, start, found[-1].score.atlas if found else None)
+            found.append(Candidate(score, _optimum(score, start), guess))
+        return max(found, key=lambda own: own.z_score)
 
     def _by_few(self, guess: Hypothesis, asked: Question) -> Candidate | None:
         """The same by a few frames, searched where the extrinsic is not known: rectifying takes longer than a search."""
@@ -203,9 +206,7 @@ class Judge:
         own = replace(own, rarer=math.sqrt(len(asked.features) / len(asked.some)))  # it grows with the root of the points
         return own if asked.box is None else self._searched(own, asked)
 
-    def lens(
-        self, score: PointScore, T: Transform, inflated: float = 1.0, turned: Transform | None = None
-    ) -> LensEstimate | None:
+    def lens(self, score: PointScore, T: Transform, inflated: float, turned: Transform | None) -> LensEstimate | None:
         """What the scenes tell of the lens at an optimum T (4, 4); to a check no lens is exact. turned: see `estimate_lens`."""
         known = self.config.camera if self.config.camera.focal_sigma else CameraConfig()
         unknowns = lens_unknowns(known, self.camera, score.camera) if shows_lens(score) else ()
@@ -237,7 +238,7 @@ class Judge:
                 few = self._by_few(guess, asked) if any(guess.lens) else one
                 if few is None or p_value(few.z_score, LOWEST_DECOY_Z) > self.config.refine.max_p_value:
                     return None
-                anew = self.by_camera(guess, asked, few.T)
+                anew = self.by_camera(guess, asked, (few.T,))
                 if anew is None:
                     return None
                 one = anew
@@ -258,11 +259,10 @@ class Judge:
         seen, T = lens.seen(score)
         other = replace(one, score=seen, T=refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0])
         left = next((k for k, own in enumerate(lens.unknowns) if own.name == FOCAL), None)
-        share, hypothesis = one.hypothesis.lens[0], one.hypothesis
-        if share and left is not None and abs(lens.change[left]) > SHOWN_SIGMAS * lens.sigma[left]:
-            scale = (1 + share) * (1 + float(lens.change[left]))
-            if hypothesis.cause is Cause.OTHER_CAMERA:
-                hypothesis = replace(hypothesis, message=of_another_size(scale))
+        hypothesis, share = one.hypothesis, one.hypothesis.lens[0]
+        told = left is not None and abs(lens.change[left]) > SHOWN_SIGMAS * lens.sigma[left]
+        if told and share and hypothesis.cause is Cause.OTHER_CAMERA:
+            hypothesis = replace(hypothesis, message=of_another_size((1 + share) * (1 + float(lens.change[left]))))
         return max(one, replace(other, hypothesis=hypothesis), key=evidence)
 
     def _beyond_chance(self, best: Candidate, tried: int) -> bool:
