@@ -58,6 +58,7 @@ AT_ONCE = 30000  # points that OpenCV samples at once
 # Standard deviations in advance of aspect and radial distortion, the latter as a displacement of the corner, a share of its
 # radius: pixels are square to 0.2 %, and calibrations of one lens differ by 1 to 3 px. And of values that are plainly wrong.
 ASPECT_USUAL, RADIAL_USUAL, GROSS = 0.002, 0.004, 0.03
+SQUARE = 3 * ASPECT_USUAL  # of pixels that are stated to be so two things must be wrong: the pixels, and what is said of them
 ACCUSING = float(ndtri(0.995))  # standard deviations of what is accused: a right one shows as much in 1 % of cases
 DRAWS = 512  # from an explanation: tell a probability to 1 %
 OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes then tell as much
@@ -66,14 +67,16 @@ OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes th
 @dataclass(frozen=True, eq=False)
 class LensUnknown:
     """A change of a camera. name: of `calib_ros.intrinsics`. unit: by which values are multiplied for files. usual: standard
-    deviation in advance. field: (h, w, 2) shift of the ray at every node of the working image, per unit of the value. bend: (k,
-    3) how far some of the rays turn, rad, but for a common turn. stated: value of the camera itself, of a distortion."""
+    deviation in advance. rare: share of cameras of which it is plainly wrong. field: (h, w, 2) shift of the ray at every node
+    of the working image, per unit of the value. bend: (k, 3) how far some of the rays turn, rad, but for a common turn.
+    stated: value of the camera itself, of a distortion."""
 
     name: str
     unit: float
     usual: float
     field: NDArray[np.float32]
     bend: Matrix
+    rare: float = GROSSLY
     stated: float = 0.0
 
 
@@ -97,9 +100,13 @@ def lens_unknowns(config: CameraConfig, source: Camera, working: Camera) -> tupl
         share = float(farthest) ** 2  # by which a k1 of 1 moves the corner, but for what is stated
         out.append((RADIAL, 1 / share, RADIAL_USUAL, radial / share))
         stated = share * float(source.D[0]) if len(source.D) else 0.0
-    shape = NODES[1], NODES[0], 2
+    shape, square = (NODES[1], NODES[0], 2), abs(source.K[1, 1] / source.K[0, 0] - 1) < SQUARE
     return tuple(
-        LensUnknown(name, unit, usual, moved.reshape(shape).astype(np.float32), _bend(rays, moved), stated * (name == RADIAL))
+        LensUnknown(
+            *(name, unit, usual, moved.reshape(shape).astype(np.float32), _bend(rays, moved)),
+            rare=GROSSLY**2 if name == ASPECT and square else GROSSLY,
+            stated=stated * (name == RADIAL),
+        )
         for name, unit, usual, moved in out
     )
 
@@ -182,8 +189,9 @@ class LensEstimate:
 
     @cached_property
     def explanations(self) -> list[LensHypothesis]:
-        """All ways in which it may be wrong, the most probable first: each unknown is plainly wrong as rarely as GROSSLY."""
+        """All ways in which it may be wrong, the most probable first: each unknown is plainly wrong as rarely as it says."""
         found, n, off = [], len(self.unknowns), self.change - self.centre
+        rarity = np.array([np.log(own.rare / (1 - own.rare)) for own in self.unknowns])
         for wrong in product((False, True), repeat=n):
             mask = np.array(wrong)
             prior = np.where(mask, np.hypot(GROSS, self.usual), self.usual)
@@ -193,7 +201,7 @@ class LensEstimate:
             spread = np.linalg.inv(self.information) + np.diag(prior**2)
             distance = float(off @ np.linalg.solve(spread, off))
             log_density = -0.5 * (self.freedom + n) * np.log1p(distance / self.freedom) - 0.5 * np.linalg.slogdet(spread)[1]
-            found.append((log_density + mask.sum() * np.log(GROSSLY / (1 - GROSSLY)), mask, mean, covariance))
+            found.append((log_density + float(rarity[mask].sum()), mask, mean, covariance))
         logs = np.array([own[0] for own in found])
         odds: Matrix = np.exp(logs - logs.max())
         out = [LensHypothesis(mask, float(p), mean, C) for p, (_, mask, mean, C) in zip(odds / odds.sum(), found, strict=True)]

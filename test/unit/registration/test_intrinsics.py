@@ -108,9 +108,9 @@ def test_a_focal_length_one_per_cent_off_is_an_unknown_and_no_reason_to_refuse(s
     assert np.allclose(result.covariance, exact.covariance)
 
 
-def shown(name: str, value: float, sigma: float, shift_m: float) -> LensEstimate:
+def shown(name: str, value: float, sigma: float, shift_m: float, camera: Camera = LENSES[0]) -> LensEstimate:
     """The scenes show a change of an intrinsic by `value`, which shifts the optimum by so much forward."""
-    unknowns = [own for own in lens_unknowns(CameraConfig(), LENSES[0], LENSES[0]) if own.name == name]
+    unknowns = [own for own in lens_unknowns(CameraConfig(), camera, camera) if own.name == name]
     forward = np.array([[0, 0, 0, 0, 0, shift_m / value]]).T
     T, x, information = se3.exp(forward[:, 0] * value), np.array([value]), np.array([[sigma**-2.0]])
     return LensEstimate(tuple(unknowns), x, T, information, forward, np.eye(4), 100.0, np.zeros(1), 10.0, np.ones(6, bool))
@@ -132,6 +132,13 @@ def shown(name: str, value: float, sigma: float, shift_m: float) -> LensEstimate
 def test_what_is_refused_is_significant_and_matters(name, value, sigma, shift_m, refusal):
     fault = shown(name, value, sigma, shift_m).fault(0.5, 0.1)
     assert (fault and fault.refusal(LENSES[0], 0.5, 0.1).code) == refusal
+
+
+def test_square_pixels_are_doubted_less_readily_than_others():
+    square = Camera(np.array([[700.0, 0, 630], [0, 700, 370], [0, 0, 1]]), 1280, 720)
+    assert shown(ASPECT, 0.03, 0.0075, 0.3).fault(0.5, 0.1) is not None
+    assert shown(ASPECT, 0.03, 0.0075, 0.3, square).fault(0.5, 0.1) is None
+    assert shown(ASPECT, 0.03, 0.003, 0.3, square).fault(0.5, 0.1) is not None
 
 
 def test_they_are_checked_where_it_is_wanted(scene):
