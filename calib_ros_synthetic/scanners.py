@@ -266,16 +266,13 @@ class PrismScanner(RosetteScanner):
         return f"no rings, {n} points per scan of {PERIOD:g} s in a rosette {field:g} deg wide"
 
 
-def plain_scanner(rings: int) -> SpinningScanner:
-    """The plain drive's scanner with a number of rings in PLAIN."""
-    return (PlainScanner if rings else PrismScanner)(PLAIN[rings])
-
-
 def scanner(name: str, rate: float = RATE) -> SpinningScanner:
-    """The scanner of a name in MODELS, turning at `rate` Hz."""
-    model = MODELS[name]
-    kind = RosetteScanner if model.table is None else GridScanner if model.firings == 1 else SpinningScanner
-    return kind(model, rate)
+    """The scanner of a name in MODELS, or of a plain drive with a number of rings in PLAIN, turning at `rate` Hz."""
+    if name in MODELS:
+        model = MODELS[name]
+        kind = RosetteScanner if model.table is None else GridScanner if model.firings == 1 else SpinningScanner
+        return kind(model, rate)
+    return (PlainScanner if int(name) else PrismScanner)(PLAIN[int(name)], rate)
 
 
 def in_frame(twist: Floats, T: Floats) -> Floats:
