@@ -23,7 +23,7 @@ class SyntheticDrive(RigPair):
     noise : factor on all sensor noise; 0 = none.
     T_camera_lidar : extrinsic (4, 4); by default a camera below and in front of the LiDAR, or where the rig has it, rotated by
         tilt_deg degrees about an axis that depends on the seed. camera : Camera instead of the rig's.
-    rig : a name in rigs.RIGS. scene : a name in scenes.SCENES. condition : a name in conditions.CONDITIONS, by default the rig's.
+    rig : a name in rigs.RIGS. scene : a name in scenes.SCENES. condition : a name in camera.CONDITIONS, by default the rig's.
     fields : all, xyzir, xyzi or xyz: what the clouds hold, by default what the rig's driver gives.
     ride : steady, or weaving: the vehicle swerves, brakes and accelerates.
     image_late_ms : images are stamped that much late; jitter_ms : standard deviation of their stamps.

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from calib_ros.errors import BadInputError
-from calib_ros_synthetic.ride import SPINS, STEADY
 from calib_ros_synthetic.rigs import RIGS
 from calib_ros_synthetic.scanners import PLAIN
+from calib_ros_synthetic.street import SPINS, STEADY
 
 V = TypeVar("V")
 # Parameter -> its default (None: it depends on others), and of one that is a number its type, lowest and highest value.

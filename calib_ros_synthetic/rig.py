@@ -23,18 +23,15 @@ from calib_ros.frame import SemanticClass as Label
 from calib_ros.lens import PERSPECTIVE
 from calib_ros.stamps import nearest_index, nearest_pairs, pair_tolerance
 from calib_ros_synthetic import ego
-from calib_ros_synthetic.camera import Scene, render
-from calib_ros_synthetic.conditions import CONDITIONS
-from calib_ros_synthetic.driver import delivered
-from calib_ros_synthetic.lidar import OwnReturns, own_returns, scan
+from calib_ros_synthetic.camera import CONDITIONS, Scene, render
+from calib_ros_synthetic.lidar import OwnReturns, delivered, own_returns, scan
 from calib_ros_synthetic.parameters import CHOICE, PARAMETERS, checked, known_of, named, parsed
 from calib_ros_synthetic.rays import CameraView, row_motion
-from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, WEAVING, Ride
 from calib_ros_synthetic.rigs import OPTICAL, RIGS, Fields, Lens, plain
 from calib_ros_synthetic.scanners import PERIOD, RosetteScanner, SpinningScanner, in_frame, scanner
 from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Floats, Solids
-from calib_ros_synthetic.street import LIDAR_HEIGHT
+from calib_ros_synthetic.street import LIDAR_HEIGHT, RIDES, SPINS, STAMP_AT, WEAVING, Ride
 from calib_ros_synthetic.wide import WideView
 
 START = 1_600_000_000 * NANOSECONDS  # stamp of the first frame; 0 would mean "no stamp" to many tools
@@ -119,11 +116,6 @@ class SyntheticRig:
         if self.model.is_pair and self._T_camera_lidar is None:
             self._T_camera_lidar = self._reference_of_pair()
 
-    @classmethod
-    def from_text(cls, text: str) -> SyntheticRig:
-        """Of `synthetic:rig=six_cameras_one_lidar,seed=3` or the like."""
-        return cls(**parsed(text))
-
     def camera(self, name: str) -> Camera:
         """The intrinsics of a camera."""
         return self._lens or self._camera_of_lens(named("camera", name, {own: own for own in self.cameras}))
@@ -192,12 +184,6 @@ class SyntheticRig:
         seconds = self.seconds(lidar, index)
         return self._in_world(self._frame(lidar, self._is_after(lidar, seconds)), seconds)
 
-    def twist(self, lidar: str, index: int) -> Floats:
-        """The velocity (rx, ry, rz, tx, ty, tz), rad/s and m/s, of that frame. It is constant in a scan: at `time` the scanner
-        stands at pose @ se3.exp(twist * time)."""
-        seconds = self.seconds(lidar, index)
-        return self._twist(self._frame(lidar, self._is_after(lidar, seconds)), seconds)
-
     def scan(self, lidar: str, index: int) -> tuple[PointCloud, Floats]:
         """Scan `index` of a LiDAR, with the twist (6,) of the frame that it is given in."""
         return self._made((lidar, index), lambda: self._scan(lidar, index))
@@ -205,13 +191,6 @@ class SyntheticRig:
     def picture(self, camera: str, index: int) -> tuple[Bytes, Bytes]:
         """Image `index` of a camera, with the classes of its pixels."""
         return self._made((camera, index), lambda: self._picture(camera, index))
-
-    def picture_from(
-        self, T_camera_lidar: Floats, camera: str, index: int, lidar: str, age_s: float = 0.0
-    ) -> tuple[Bytes, Bytes]:
-        """Image `index` of a camera that is mounted at T_camera_lidar (4, 4). age_s: it shows the world that long before."""
-        frame = self._frame(lidar, self._is_after(lidar, self.seconds(camera, index)))
-        return self._picture(camera, index, (frame, se3.inverse(T_camera_lidar)), age_s)
 
     def T_camera_lidar(self, camera: str, image: int, lidar: str, scan: int) -> Floats:
         """The exact extrinsic (4, 4) between the sensors where they were at an image and at a scan."""
@@ -371,7 +350,7 @@ class SyntheticRig:
         shift = self._shift_s(lidar)
         if shift and cloud.time is not None:  # the points' times count from the stamp
             cloud = replace(cloud, time=(cloud.time - shift).astype(np.float32))
-        return replace(cloud, label=_labels(solids, hit[kept])), self.twist(lidar, index)
+        return replace(cloud, label=_labels(solids, hit[kept])), self._twist(self._frame(lidar, after), seconds)
 
     def _picture(
         self, camera: str, index: int, hung: tuple[Floats, Floats] | None = None, age_s: float = 0.0
@@ -432,17 +411,14 @@ class RigPair:
 
         age_s: the image shows the world as seen that long before its stamp.
         """
-        camera, lidar = self._names
-        seen = self.rig.picture_from(T_camera_lidar, camera, self._pairs[index][0], lidar, age_s)
+        (camera, lidar), (image_at, scan_at), rig = self._names, self._pairs[index], self.rig
+        T_base_lidar = rig._frame(lidar, rig._is_after(lidar, rig.seconds(lidar, scan_at)))
+        seen = rig._picture(camera, image_at, (T_base_lidar, se3.inverse(T_camera_lidar)), age_s)
         return self._frame(index, seen, T_camera_lidar)
 
     def pose(self, index: int) -> Floats:
         """T_world_lidar (4, 4) at the stamp of the frame's scan, see `SyntheticRig.pose`."""
         return self.rig.pose(self._names[1], self._pairs[index][1])
-
-    def twist(self, index: int) -> Floats:
-        """The velocity (6,) of that frame then, see `SyntheticRig.twist`."""
-        return self.rig.twist(self._names[1], self._pairs[index][1])
 
     def describe(self) -> dict[str, str]:
         """Facts for people."""

@@ -115,7 +115,7 @@ class Rig:
     """A vehicle's sensors. Those of one pair measure together, frame by frame; more go each at its own rate.
 
     why: it is here. sensors: by name; the others are stated in the first LiDAR. vehicle: a name in ego.BODIES, "" = out of view,
-    None = none: the scanner rides by itself. condition: a name in conditions.CONDITIONS. base_frame: the cloud is given in
+    None = none: the scanner rides by itself. condition: a name in camera.CONDITIONS. base_frame: the cloud is given in
     base_link. compensated: the points are moved to where they are at the cloud's stamp. crop: m to either side at which the cloud
     ends. triggered: the picture is taken when the scan sweeps the camera's axis, else at the cloud's stamp. top_speed: m/s.
     """

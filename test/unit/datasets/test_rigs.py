@@ -12,8 +12,8 @@ from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as Label
-from calib_ros_synthetic import camera, lidar, rays, scanners, wide, windows
-from calib_ros_synthetic.conditions import CONDITIONS
+from calib_ros_synthetic import camera, lidar, rays, scanners, wide
+from calib_ros_synthetic.camera import CONDITIONS
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_synthetic.rig import RigPair
 from calib_ros_synthetic.rigs import PAIRS, RIGS
@@ -246,7 +246,7 @@ PLACES = [{"rig": "vlp16_narrow"}, {"rig": "mid360_90"}, {"rig": "os1_128_fishey
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: next(iter(place.values())))
 def test_trying_every_solid_on_every_ray_finds_no_more(place, monkeypatch: pytest.MonkeyPatch) -> None:
     """Solids are cast on the rays of their windows only."""
-    for module in (rays, windows, wide):
+    for module in (rays, scanners, wide):
         monkeypatch.setattr(module, "SMALLEST", 0.0)
     drive = {"seed": 4, "frames": 1, "width": 96, "noise": 0.0, **place}
     expected = SyntheticDrive(**drive)[0]

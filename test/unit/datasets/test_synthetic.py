@@ -16,8 +16,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.frame import SemanticClass as Label
 from calib_ros_synthetic import rays
-from calib_ros_synthetic.camera import Scene, render
-from calib_ros_synthetic.conditions import CONDITIONS
+from calib_ros_synthetic.camera import CONDITIONS, Scene, render
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_synthetic.rays import Rays, intersect
 from calib_ros_synthetic.rig import open_drive
