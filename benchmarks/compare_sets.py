@@ -23,7 +23,7 @@ from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros_synthetic.rigs import RIGS
+from calib_ros_synthetic.rigs import PAIRS
 
 Matrix = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,7 +80,7 @@ def rigs(name: str) -> list[Recording]:
     scenes = ("street", "park", "street", "trees", "car_park")
     return [
         Recording(name, f"synthetic:rig={rig},scene={scenes[k % 5]},seed={7000 + k},frames=4,stride=13", k)
-        for k, rig in enumerate(RIGS)
+        for k, rig in enumerate(PAIRS)
     ]
 
 

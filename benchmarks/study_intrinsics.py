@@ -17,7 +17,7 @@ from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import CONVERGED, RefusalCode
-from calib_ros_synthetic.rigs import RIGS
+from calib_ros_synthetic.rigs import PAIRS
 
 BOX = SearchBox(2.5, 0.2)
 START_DEG, START_M = 2.0, 0.15
@@ -57,7 +57,7 @@ VARIANTS = {
 
 def sets(args: argparse.Namespace) -> Iterator[Case]:
     """Of the sources; without any, of the synthetic rigs."""
-    for number, name in enumerate(args.sources or [f"synthetic:rig={rig},frames=10" for rig in RIGS]):
+    for number, name in enumerate(args.sources or [f"synthetic:rig={rig},frames=10" for rig in PAIRS]):
         frames, rng = frames_of(name), np.random.default_rng(number)
         chosen = [[k] for k in range(min(len(frames), SINGLES))]
         for size in SIZES:

@@ -26,7 +26,7 @@ from calib_ros.lidar.rings import rings_by_order
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_synthetic.rigs import RIGS
+from calib_ros_synthetic.rigs import PAIRS
 
 Matrix = NDArray[np.float64]
 DRIVE, ODOMETRY = "raw/2011_09_26/2011_09_26_drive_0005_sync", "odometry/sequences/00"
@@ -47,7 +47,7 @@ def short(source: str) -> str:
 def rigs_of(args: argparse.Namespace) -> list[str]:
     """The synthetic rigs, in the scenes of --rigs."""
     scenes = () if args.rigs is None else args.rigs or SCENES
-    return [f"synthetic:rig={rig},scene={scene},frames={FEW}" for scene in scenes for rig in RIGS]
+    return [f"synthetic:rig={rig},scene={scene},frames={FEW}" for scene in scenes for rig in PAIRS]
 
 
 def subset(frames: Sequence[Frame], size: int, number: int, rng: np.random.Generator) -> list[Frame]:

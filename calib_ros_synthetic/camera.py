@@ -1,15 +1,15 @@
-"""Renders the camera image of the synthetic street, with sub-pixel exact silhouettes and shadows."""
+"""Renders the camera image of the synthetic street, with sub-pixel exact silhouettes and shadows, and what makes a picture bad:
+light, haze, rain drops, motion blur, a rolling shutter, compression."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros_synthetic import surfaces
-from calib_ros_synthetic.conditions import CLEAR, Conditions, compressed, motion_blurred, with_drops
 from calib_ros_synthetic.ego import OwnLayer
 from calib_ros_synthetic.materials import Part
 from calib_ros_synthetic.rays import (
@@ -30,7 +30,7 @@ from calib_ros_synthetic.rays import (
 )
 from calib_ros_synthetic.solids import Float32, Floats, Solids, Surface
 from calib_ros_synthetic.street import Street
-from calib_ros_synthetic.surfaces import DAY, Lighting, spots
+from calib_ros_synthetic.surfaces import DAY, LAMPS, Lighting, spots
 
 AHEAD, SIDE, TEXEL = 55.0, 13.0, 0.07  # m that the map reaches ahead and to either side; m per texel
 Ids = NDArray[np.int32]
@@ -38,6 +38,50 @@ BLUR = 0.5  # px, standard deviation of the lens and the sensor
 READ_NOISE = 1.8  # grey levels
 SHADED = 1 << 16  # rays at a time: larger arrays do not fit the cache
 FAR, FLOW_STEP = 1000.0, 1e-3  # m, the distance of the sky; s over which the flow of the picture is taken
+
+Picture = NDArray[np.float32]
+BLUR_TAPS = 9  # samples along the way that a pixel's surface moves during the exposure
+LONGEST_BLUR = 60.0  # px
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a picture is taken under.
+
+    lighting: of the scene; indoors, the lamps' light is scaled by it. noise: factor on the noise of the image sensor.
+    visibility: m at which haze leaves 1/e of a LiDAR's light. exposure: s, for motion blur. readout: s from the first row to the
+    last. drops: on the lens. jpeg: quality, 1 to 100; 0 = not compressed.
+    """
+
+    lighting: Lighting = field(default_factory=lambda: DAY)
+    noise: float = 1.0
+    visibility: float = np.inf
+    exposure: float = 0.0
+    readout: float = 0.0
+    drops: int = 0
+    jpeg: int = 0
+
+    def lit(self, indoors: bool) -> Lighting:
+        """The lighting of a scene under these conditions."""
+        if not indoors:
+            return self.lighting
+        a, b = self.lighting, LAMPS
+        return replace(a, sun=a.sun * b.sun, ambient=a.ambient * b.ambient, sky=a.sky * b.sky, haze=min(a.haze, b.haze))
+
+
+NIGHT = Lighting(sun=0.02, ambient=0.035, sky=0.01, headlights=60.0, haze=900.0, exposure=2.2)
+HAZY = Lighting(sun=0.25, ambient=1.0, sky=1.0, haze=55.0)
+
+CONDITIONS: dict[str, Conditions] = {
+    "clear": Conditions(),
+    "night": Conditions(lighting=NIGHT, noise=5.0, exposure=0.012),  # headlights, hardly any contrast beyond them
+    "haze": Conditions(lighting=HAZY, noise=1.5, visibility=160.0),  # two thirds of the contrast are lost at 55 m
+    "rain": Conditions(lighting=Lighting(sun=0.1, ambient=0.9, sky=0.8, haze=160.0), noise=2.0, visibility=300.0, drops=40),
+    "blur": Conditions(noise=1.5, exposure=0.020),  # a long exposure from a moving vehicle
+    "rolling": Conditions(readout=0.030),  # a CMOS sensor read row by row in 30 ms
+    "jpeg": Conditions(noise=1.5, jpeg=25),  # blocks of 8 x 8
+}
+CLEAR = CONDITIONS["clear"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +128,18 @@ def render(
         _cover(scene, scene.own, colour, ids)
     image = np.ascontiguousarray(colour.reshape(3, *ids.shape).transpose(1, 2, 0))
     if spoilt.exposure and scene.twist is not None:
-        image = motion_blurred(image, _flow(view, t, ids, scene.twist), spoilt.exposure)
+        image = _motion_blurred(image, _flow(view, t, ids, scene.twist), spoilt.exposure)
     image[~view.seen] = 0
     image = cv2.GaussianBlur(image, (0, 0), BLUR)
     if spoilt.drops:
-        image = with_drops(image, spoilt.drops, np.random.default_rng([scene.street.seed, 10]))
+        image = _with_drops(image, spoilt.drops, np.random.default_rng([scene.street.seed, 10]))
     if noise > 0:
         image += np.float32(READ_NOISE * noise) * rng.standard_normal(image.shape, np.float32)
     levels = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-    return compressed(levels, spoilt.jpeg) if spoilt.jpeg else levels, np.where(view.seen, ids, SKY)
+    if spoilt.jpeg:
+        data = cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, spoilt.jpeg])[1]
+        levels = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+    return levels, np.where(view.seen, ids, SKY)
 
 
 def _flow(view: CameraView, t: Float32, ids: Ids, twist: Floats) -> Float32:
@@ -178,18 +225,86 @@ def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge:
     return np.asarray(colour.reshape(3, *rays.shape).mean(axis=1))
 
 
+def _motion_blurred(image: Picture, flow: Picture, exposure: float) -> Picture:
+    """Image (H, W, 3) averaged along the way that each pixel's surface takes. flow: (H, W, 2) px/s. exposure: s.
+
+    The way is centred on the moment of the picture, so that no edge is displaced.
+    """
+    way = flow * np.float32(exposure)
+    length = np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-6)
+    way *= np.minimum(1, np.float32(LONGEST_BLUR) / length)
+    if float(np.abs(way).max()) < 0.3:
+        return image
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
+    out = np.zeros_like(image)
+    for k in np.linspace(-0.5, 0.5, BLUR_TAPS, dtype=np.float32):
+        out += cv2.remap(image, u + k * way[..., 0], v + k * way[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(out / BLUR_TAPS, np.float32)
+
+
+def _with_drops(image: Picture, count: int, rng: np.random.Generator) -> Picture:
+    """Image (H, W, 3) through rain drops: each shows the scene upside down, small and out of focus. rng: places the drops."""
+    height, width = image.shape[:2]
+    v, u = np.mgrid[:height, :width].astype(np.float32)
+    weight = np.zeros((height, width), np.float32)
+    for _ in range(count):
+        x, y = rng.uniform(0, width), rng.uniform(0, height)
+        radius = width * rng.uniform(0.006, 0.026)
+        tall = rng.uniform(1.0, 1.5)
+        r0, r1 = max(int(y - 1.5 * radius * tall), 0), min(int(y + 1.5 * radius * tall) + 2, height)
+        c0, c1 = max(int(x - 1.5 * radius), 0), min(int(x + 1.5 * radius) + 2, width)
+        if r1 <= r0 or c1 <= c0:
+            continue
+        rows, columns = np.mgrid[r0:r1, c0:c1].astype(np.float32)
+        dx, dy = columns - np.float32(x), (rows - np.float32(y)) / np.float32(tall)
+        inside = np.clip((radius - np.hypot(dx, dy)) / (0.25 * radius), 0, 1)
+        u[r0:r1, c0:c1] += inside * (-5.0 * dx)
+        v[r0:r1, c0:c1] += inside * (-5.0 * dy)
+        weight[r0:r1, c0:c1] = np.maximum(weight[r0:r1, c0:c1], inside)
+    blurred = cv2.GaussianBlur(image, (0, 0), width / 320)
+    seen = cv2.remap(blurred, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    return np.asarray(image + weight[..., None] * (seen - image), np.float32)
+
+
 class Shadows:
-    """Looks up which places the sun reaches."""
+    """Looks up which places the sun reaches: parallel rays from it on a grid of texels that covers a box."""
 
     def __init__(self, solids: Solids, sun: Floats, forward: Floats, height: float) -> None:
         """solids: relative to the lens. sun, forward: towards the sun and along the view (3,). height: of the lens, m."""
         forward = forward[:2] / (np.linalg.norm(forward[:2]) + 1e-9)
-        self._view = SunView(sun, forward, (0.0, AHEAD), SIDE, (-height, 5.0), TEXEL)
-        self._depth, self._ids = unmet(self._view.shape)
-        cast(self._view.rays(), solids, self._view.jobs(solids), self._depth, self._ids)
+        left = np.array([-forward[1], forward[0]])
+        receivers = np.array(
+            [[*(a * forward + b * left), z] for a in (0.0, AHEAD) for b in (-SIDE, SIDE) for z in (-height, 5.0)]
+        )
+        e1 = np.cross([0.0, 0.0, 1.0], sun)
+        e1 /= np.linalg.norm(e1)
+        self._axes = np.stack([e1, np.cross(sun, e1), -sun])  # columns, rows, distance from the sun
+        flat = receivers @ self._axes.T
+        self._low = flat.min(axis=0)
+        self._low[2] -= 60.0  # far enough towards the sun to start outside everything that throws shadows
+        shape = tuple(int(n) for n in np.ceil((flat.max(axis=0) - self._low)[1::-1] / TEXEL) + 1)
+        rows, columns = (self._low[k] + np.arange(shape[1 - k]) * TEXEL for k in (1, 0))
+        (e1, e2, down), start = self._axes, self._low[2]
+        origin = tuple((e1[k] * columns[None] + e2[k] * rows[:, None] + down[k] * start).astype(np.float32) for k in range(3))
+        self._depth, self._ids = unmet(shape)
+        rays = Rays(origin, tuple(np.full((1, 1), v, np.float32) for v in down))  # type: ignore[arg-type]
+        cast(rays, solids, self._jobs(solids, shape), self._depth, self._ids)
         d = self._depth
         d = np.minimum(d, np.roll(d, -1, axis=1))
         self._first = np.minimum(d, np.roll(d, -1, axis=0))  # of the four texels around a place
+
+    def _jobs(self, solids: Solids, shape: tuple[int, ...]) -> Jobs:
+        """Windows for `cast`."""
+        flat = solids.corners() @ self._axes.T
+        low, high = flat.min(axis=1), flat.max(axis=1)
+        spans = []
+        for k in (1, 0):
+            spans += [np.ceil((low[:, k] - self._low[k]) / TEXEL), np.floor((high[:, k] - self._low[k]) / TEXEL) + 1]
+        clipped = np.clip(np.array(spans), 0, np.repeat(shape, 2)[:, None]).astype(np.int32)
+        keep = (clipped[1] > clipped[0]) & (clipped[3] > clipped[2]) & (low[:, 2] > self._low[2])
+        keep &= solids.surface != Surface.CEILING
+        jobs = np.concatenate([np.arange(len(solids), dtype=np.int32)[None], clipped])[:, keep].T
+        return nearest_first(np.ascontiguousarray(jobs), low[keep, 2] - self._low[2])
 
     def lit(self, xyz: Float32, ids: Ints, faces_sun: NDArray[np.bool_]) -> Float32:
         """Share (n,) of the sun that reaches points xyz (3, n) on the things ids (n,); 1 outside the map.
@@ -197,7 +312,7 @@ class Shadows:
         Only places that face the sun (n,) are looked up. A solid does not shade itself here: its normals tell that,
         without the speckles of a depth map.
         """
-        axes, low, scale = self._view.axes.tolist(), self._view.low.tolist(), 1 / self._view.texel
+        axes, low, scale = self._axes.tolist(), self._low.tolist(), 1 / TEXEL
         height, width = self._depth.shape
         some = np.flatnonzero(faces_sun)
         x, y, z = (xyz[k].take(some) for k in range(3))
@@ -216,45 +331,3 @@ class Shadows:
         out = np.ones(len(ids), np.float32)
         out[some] -= shade
         return out
-
-
-class SunView:
-    """Parallel rays from the sun on a grid of texels that covers a box, so that shadows can be looked up."""
-
-    def __init__(
-        self, sun: Floats, forward: Floats, ahead: tuple[float, float], side: float, up: tuple[float, float], texel: float
-    ) -> None:
-        """sun: unit vector towards it (3,). forward: level unit vector (2,). ahead, up: from, to; side: to either; texel: m."""
-        left = np.array([-forward[1], forward[0]])
-        receivers = np.array([[*(a * forward + b * left), z] for a in ahead for b in (-side, side) for z in up])
-        e1 = np.cross([0.0, 0.0, 1.0], sun)
-        e1 /= np.linalg.norm(e1)
-        self.axes = np.stack([e1, np.cross(sun, e1), -sun])  # columns, rows, distance from the sun
-        flat = receivers @ self.axes.T
-        self.texel = texel
-        self.low = flat.min(axis=0)
-        self.low[2] -= 60.0  # far enough towards the sun to start outside everything that throws shadows
-        self.shape = tuple(int(n) for n in np.ceil((flat.max(axis=0) - self.low)[1::-1] / texel) + 1)
-
-    def rays(self) -> Rays:
-        """The rays; their distance starts at `low`."""
-        rows = (self.low[1] + np.arange(self.shape[0]) * self.texel)[:, None]
-        columns = (self.low[0] + np.arange(self.shape[1]) * self.texel)[None]
-        e1, e2, down = self.axes
-        origin = tuple((e1[k] * columns + e2[k] * rows + down[k] * self.low[2]).astype(np.float32) for k in range(3))
-        direction = tuple(np.full((1, 1), v, np.float32) for v in down)
-        return Rays(origin, direction)  # type: ignore[arg-type]
-
-    def jobs(self, solids: Solids) -> Jobs:
-        """Windows for `cast`."""
-        flat = solids.corners() @ self.axes.T
-        low, high = flat.min(axis=1), flat.max(axis=1)
-        spans = []
-        for k in (1, 0):
-            spans += [np.ceil((low[:, k] - self.low[k]) / self.texel), np.floor((high[:, k] - self.low[k]) / self.texel) + 1]
-        size = np.array([self.shape[0], self.shape[0], self.shape[1], self.shape[1]])[:, None]
-        clipped = np.clip(np.array(spans), 0, size).astype(np.int32)
-        keep = (clipped[1] > clipped[0]) & (clipped[3] > clipped[2]) & (low[:, 2] > self.low[2])
-        keep &= solids.surface != Surface.CEILING
-        jobs = np.concatenate([np.arange(len(solids), dtype=np.int32)[None], clipped])[:, keep].T
-        return nearest_first(np.ascontiguousarray(jobs), low[keep, 2] - self.low[2])

@@ -64,7 +64,7 @@ BODIES: dict[str, Callable[[Builder], None]] = {"car": _car, "truck": _truck, "r
 
 
 def body(name: str) -> Solids | None:
-    """The solids of an own vehicle in its frame; None for "" (it is nowhere near the sensors' views)."""
+    """The solids of an own vehicle in its frame; None for "" (it is nowhere near the sensors' views, or there is none)."""
     if not name:
         return None
     b = Builder()

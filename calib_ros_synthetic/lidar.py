@@ -1,8 +1,9 @@
-"""Scans of the synthetic street: what comes back to a scanner's beams, with noise, losses and the distortion of motion."""
+"""Scans of the synthetic street: what comes back to a scanner's beams, with noise, losses and the distortion of motion, as
+drivers and data sets hand it out."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +11,19 @@ from scipy.interpolate import make_interp_spline
 
 from calib_ros import se3
 from calib_ros.frame import PointCloud
-from calib_ros_synthetic.materials import REFLECTIVITY, Part
+from calib_ros_synthetic.materials import REFLECTIVITY, Bytes, Part
 from calib_ros_synthetic.rays import ORIGIN, OWN, SKY, Ints, Jobs, Rays, cast, cast_ground, unmet
+from calib_ros_synthetic.rigs import Fields, Intensity, Rig
 from calib_ros_synthetic.scanners import SpinningScanner
 from calib_ros_synthetic.solids import Float32, Floats, Solids
 from calib_ros_synthetic.street import Street
-from calib_ros_synthetic.surfaces import Bytes, spots
+from calib_ros_synthetic.surfaces import spots
 
 At = tuple[NDArray[np.intp], ...]  # rows and columns
+OwnReturns = tuple[Float32, Bytes, Float32, Float32]  # see own_returns
 DROPPED = 0.004  # share of returns that are lost for no reason
 MIXED = 0.15  # share of returns at an edge that fall between foreground and background
+SIGNAL, BRIGHTEST = 2000.0, 70_000.0  # photons from a white wall 10 m away; of a retro-reflector, where intensity is WIDE
 MIXED_STEP = 2.0  # m; across larger steps the two echoes are told apart
 
 
@@ -62,8 +66,8 @@ def scan(
     cast(rays, solids, scanner.jobs(solids, beams, pose, float(np.linalg.norm(moved, axis=-1).max()), turn), t, ids)
     cast_ground(rays, street, pose[:3, 3], t, ids)
     if own is not None:
-        hidden = own.t < t
-        t[hidden], ids[hidden] = own.t[hidden], OWN
+        hidden = own[0] < t
+        t[hidden], ids[hidden] = own[0][hidden], OWN
 
     order = scanner.order(time)
     ring, column = np.nonzero((ids != SKY)[:, order])
@@ -72,7 +76,7 @@ def scan(
     part, rho, cosine = _surface(street, solids, rays, t, ids, at, pose[:3, 3])
     if own is not None:
         mine = np.flatnonzero(ids[at] == OWN)
-        part[mine], rho[mine], cosine[mine] = (a[ring[mine], column[mine]] for a in (own.part, own.rho, own.cosine))
+        part[mine], rho[mine], cosine[mine] = (a[ring[mine], column[mine]] for a in own[1:])
     pane = (part == Part.WINDOW) | (part == Part.GLASS)  # a mirror: little comes back unless hit squarely
     lobe = np.where(pane, 0.05 + 0.95 * cosine**6, 0.15 + 0.85 * cosine)
     shine = rho * np.where(part == Part.LEAF, np.float32(0.7), lobe)
@@ -112,7 +116,8 @@ def _surface(
 
 
 def own_returns(solids: Solids, beams: Float32, T_base_lidar: Floats) -> OwnReturns:
-    """What rays (3, rows, columns) of a scanner at T_base_lidar (4, 4) meet of its vehicle, the solids in the vehicle's frame."""
+    """What rays (3, rows, columns) of a scanner at T_base_lidar (4, 4) meet of its vehicle, the solids in the vehicle's frame:
+    distance (rows, columns) m, inf for those that do not; material, reflectivity, cosine of the incidence."""
     R = T_base_lidar[:3, :3].astype(np.float32)
     direction = tuple(sum(R[k, j] * beams[j] for j in range(3)) for k in range(3))
     rays = Rays(ORIGIN, direction)
@@ -120,19 +125,9 @@ def own_returns(solids: Solids, beams: Float32, T_base_lidar: Floats) -> OwnRetu
     t, ids = unmet(rays.shape)
     cast(rays, around, Jobs.whole(len(solids), rays.shape), t, ids)
     at = np.nonzero(ids != SKY)
-    out = OwnReturns(t, np.zeros(t.shape, np.uint8), np.zeros(t.shape, np.float32), np.zeros(t.shape, np.float32))
-    out.part[at], out.rho[at], out.cosine[at] = _surface(None, around, rays, t, ids, at, T_base_lidar[:3, 3])
-    return out
-
-
-@dataclass(frozen=True, eq=False)
-class OwnReturns:
-    """Rays that meet the own vehicle: distance t (rows, columns) m, inf for the others; material, reflectivity, cosine."""
-
-    t: Float32
-    part: Bytes
-    rho: Float32
-    cosine: Float32
+    out = (np.zeros(t.shape, np.uint8), np.zeros(t.shape, np.float32), np.zeros(t.shape, np.float32))
+    out[0][at], out[1][at], out[2][at] = _surface(None, around, rays, t, ids, at, T_base_lidar[:3, 3])
+    return t, *out
 
 
 def _scatter(t: Float32, at: At, part: Bytes, clock: float, noise: float, rng: np.random.Generator) -> Float32:
@@ -146,3 +141,32 @@ def _scatter(t: Float32, at: At, part: Bytes, clock: float, noise: float, rng: n
         split = (rng.random(n, np.float32) < min(MIXED * noise, 1)) & (beside > 0.2) & (beside < MIXED_STEP)
         error[split] += rng.random(int(split.sum()), np.float32) * beside[split]
     return np.asarray(error, np.float32)
+
+
+def delivered(
+    rig: Rig, T_base_lidar: Floats, cloud: PointCloud, twist: Floats, fields: Fields, rng: np.random.Generator
+) -> tuple[PointCloud, NDArray[np.intp]]:
+    """A scan as the driver or the data set hands it out, and which of its points (n,) are left.
+
+    cloud: in the frame of the moving scanner, which is at T_base_lidar (4, 4) on the vehicle; twist: (6,) of the scanner.
+    """
+    assert cloud.intensity is not None
+    xyz, intensity = cloud.xyz.astype(float), cloud.intensity
+    if rig.intensity is Intensity.BYTE:
+        intensity = np.rint(255 * intensity).astype(np.float32)
+    elif rig.intensity is Intensity.SIGNAL:
+        photons = SIGNAL * 100.0 * intensity / np.maximum(np.square(cloud.xyz).sum(axis=1), 1.0)
+        intensity = np.asarray(rng.poisson(np.minimum(photons, 60_000.0)), np.float32)
+    elif rig.intensity is Intensity.WIDE:
+        bright = BRIGHTEST * rng.random(len(intensity)) ** 3
+        intensity = np.asarray(np.where(intensity > 0.97, bright, intensity), np.float32)
+    if rig.compensated and cloud.time is not None and twist.any() and len(xyz):  # to where they are at time 0
+        time = cloud.time.astype(float)
+        knots = np.linspace(time.min(), time.max(), 65)
+        at = make_interp_spline(knots, np.array([se3.exp(twist * s)[:3] for s in knots]), k=1)(time)
+        xyz = np.einsum("nij,nj->ni", at[:, :, :3], xyz) + at[:, :, 3]
+    base = se3.transform(T_base_lidar, xyz)
+    keep = np.flatnonzero(np.abs(base[:, 1]) <= rig.crop)
+    left_out = ("time", "ring", "intensity")[: list(Fields).index(fields)]
+    whole = replace(cloud, xyz=(base if rig.base_frame else xyz).astype(np.float32), intensity=intensity)
+    return replace(whole, **dict.fromkeys(left_out)).select(keep), keep  # type: ignore[arg-type]

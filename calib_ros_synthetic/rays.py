@@ -6,7 +6,7 @@ on the window of the grid that its bounding box covers, so that no step tests al
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import Any
@@ -64,10 +64,6 @@ class Rays:
 
         return Rays(tuple(map(cut, self.origin)), tuple(map(cut, self.direction)))  # type: ignore[arg-type]
 
-    def at(self, t: Float32) -> Vectors:
-        """The points at distances t (rows, columns): x, y, z."""
-        return tuple(o + t * d for o, d in zip(self.origin, self.direction, strict=True))  # type: ignore[return-value]
-
 
 @dataclass(frozen=True, eq=False)
 class Jobs:
@@ -85,29 +81,20 @@ class Jobs:
         return cls(window, np.zeros(count))
 
 
-Pierce = Callable[[int, Rays, Float32, NDArray[np.bool_]], None]
-
-
 def unmet(shape: tuple[int, ...]) -> tuple[Float32, Ints]:
     """Distances and ids of rays that have met nothing."""
     return np.full(shape, np.inf, np.float32), np.full(shape, SKY, np.int32)
 
 
-def cast(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints, pierce: Pierce | None = None) -> None:
-    """Lowers t (rows, columns) to the first hit of the solids and writes their indices to ids, in place.
-
-    pierce: clears the hits that lie in holes of a solid; given its index, rays, their distances to it, and the hits.
-    """
+def cast(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints) -> None:
+    """Lowers t (rows, columns) to the first hit of the solids and writes their indices to ids, in place."""
     for (i, r0, r1, c0, c1), nearest in zip(jobs.window.tolist(), jobs.nearest.tolist(), strict=True):
         rows, columns = slice(r0, r1), slice(c0, c1)
         old = t[rows, columns]
         if old.max() <= nearest:
             continue
-        window = rays.window(rows, columns)
-        new = intersect(solids, i, window, old)
+        new = intersect(solids, i, rays.window(rows, columns), old)
         hit = new < old
-        if pierce is not None:
-            pierce(i, window, new, hit)
         np.copyto(old, new, where=hit)
         np.copyto(ids[rows, columns], i, where=hit)
 
@@ -239,18 +226,15 @@ def pixel_directions(camera: Camera) -> tuple[Float32, Float32, NDArray[np.bool_
     A pixel's centre is at integer coordinates, as in Camera.project. Where a distortion polynomial has no inverse the
     lens sees nothing, as in the black corners of real wide-angle images.
     """
+    x, y = np.zeros((2, camera.height, camera.width), np.float32)
+    seen = np.zeros(x.shape, bool)
     step = max(1, BLOCK_PIXELS // camera.width)
-    blocks = [_directions(camera, first, min(first + step, camera.height)) for first in range(0, camera.height, step)]
-    x, y, seen = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    return x, y, seen
-
-
-def _directions(camera: Camera, first: int, past: int) -> tuple[Float32, Float32, NDArray[np.bool_]]:
-    """As `pixel_directions`, of the rows from first to before past."""
-    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(first, past)), axis=-1)
-    rays = camera.unproject(pixels).reshape((*pixels.shape[:2], 3))
-    seen = rays[..., 2] > SHALLOWEST
-    x, y = (np.divide(rays[..., k], rays[..., 2], where=seen, out=np.zeros(seen.shape)).astype(np.float32) for k in (0, 1))
+    for rows in (slice(first, min(first + step, camera.height)) for first in range(0, camera.height, step)):
+        pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(rows.start, rows.stop)), axis=-1)
+        rays = camera.unproject(pixels).reshape((*pixels.shape[:2], 3))
+        seen[rows] = rays[..., 2] > SHALLOWEST
+        for k, out in enumerate((x, y)):
+            out[rows] = np.divide(rays[..., k], rays[..., 2], where=seen[rows], out=np.zeros(seen[rows].shape))
     return x, y, seen
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib_ros.frame import SemanticClass as Label
-from calib_ros_synthetic import objects, structures
+from calib_ros_synthetic import objects
 from calib_ros_synthetic.solids import Builder, Floats
 from calib_ros_synthetic.street import BLOCK, Street
 
@@ -30,11 +30,11 @@ class Trees(Street):
             for _ in range(rng.poisson(self._density)):
                 d = self.road + 2.2 + 22.0 * rng.random() ** 1.6
                 self._at(b, start + rng.uniform(0, BLOCK), side * d, rng.uniform(0, 2 * np.pi))
-                (structures.conifer if rng.random() < self._conifers else structures.broadleaf)(b, rng)
+                (objects.conifer if rng.random() < self._conifers else objects.broadleaf)(b, rng)
             for _ in range(rng.poisson(self._density)):
                 self._at(b, start + rng.uniform(0, BLOCK), side * (self.road + 1.5 + rng.exponential(5.0)))
-                structures.thicket(b, rng)
-            structures.delineator(self._at(b, start + rng.uniform(0, BLOCK), side * (self.road + 0.8)), rng)
+                objects.thicket(b, rng)
+            objects.delineator(self._at(b, start + rng.uniform(0, BLOCK), side * (self.road + 0.8)), rng)
         if rng.random() < 0.35:
             self._at(b, start + rng.uniform(0, BLOCK), 1.6, np.pi)
             (objects.car if rng.random() < 0.7 else objects.cyclist)(b, rng)
@@ -57,16 +57,16 @@ class Park(Street):
         for side in (-1, 1):
             for _ in range(rng.poisson(self._density)):
                 self._beside(b, rng, start, side * (self.road + 1.5 + 34.0 * rng.random() ** 1.5))
-                (structures.conifer if rng.random() < 0.2 else structures.broadleaf)(b, rng)
+                (objects.conifer if rng.random() < 0.2 else objects.broadleaf)(b, rng)
             for _ in range(rng.poisson(14)):
                 self._beside(b, rng, start, side * (self.road + 1.2 + rng.exponential(7.0)))
-                structures.thicket(b, rng)
+                objects.thicket(b, rng)
             if rng.random() < 0.5:
                 self._beside(b, rng, start, side * (self.road + rng.uniform(1.0, 10.0)))
-                structures.boulder(b, rng)
+                objects.boulder(b, rng)
             if rng.random() < 0.5:
                 self._at(b, start + rng.uniform(0, BLOCK), side * (self.road + 0.6), 0.0 if side > 0 else np.pi)
-                structures.bench(b, rng)
+                objects.bench(b, rng)
             if rng.random() < 0.6:
                 self._beside(b, rng, start, side * (self.road + rng.uniform(0.5, 6.0)))
                 objects.person(b, rng)
@@ -107,13 +107,13 @@ class CarPark(Street):
                     (objects.truck if rng.random() < 0.02 and row == 0 else objects.car)(b, rng)
         for side in (-1, 1):
             for s in np.arange(start, start + BLOCK, 7.5):
-                structures.pillar(self._at(b, s, side * (self.road + 0.7)), rng, self.height)
-                structures.pillar(self._at(b, s, side * (self.road + 5.0)), rng, self.height)
+                objects.pillar(self._at(b, s, side * (self.road + 0.7)), rng, self.height)
+                objects.pillar(self._at(b, s, side * (self.road + 5.0)), rng, self.height)
             self._at(b, start + BLOCK / 2, side * (1.5 * aisle), 0.0 if side > 0 else np.pi)
-            structures.wall(b, rng, BLOCK + 0.5, self.height)
+            objects.wall(b, rng, BLOCK + 0.5, self.height)
         for s in np.arange(start + 5, start + BLOCK, 10.0):
-            structures.slab(self._at(b, s, 0.0), 10.05, 3 * aisle, self.height, 5.0)
-        structures.duct(self._at(b, start + BLOCK / 2, rng.uniform(-1, 1) * self.road), rng, BLOCK, self.height)
+            objects.slab(self._at(b, s, 0.0), 10.05, 3 * aisle, self.height, 5.0)
+        objects.duct(self._at(b, start + BLOCK / 2, rng.uniform(-1, 1) * self.road), rng, BLOCK, self.height)
         _bulkhead(self._at(b, start, 0.0), self.road + 0.4, 1.5 * aisle, self.height)
         if rng.random() < 0.7:
             self._at(b, start + rng.uniform(0, BLOCK), rng.uniform(1.0, self.road), rng.uniform(0, 2 * np.pi))
@@ -145,21 +145,21 @@ class Warehouse(Street):
             passage = start + rng.uniform(10, 28)
             for s in np.arange(start + 1.6 + self._bay / 2, start + BLOCK - 1.5, self._bay):
                 if abs(s - passage) > 2.4:
-                    structures.rack(self._at(b, s, side * (self.road + depth / 2), turn), rng, self._bay, depth, 4, self._step)
-            structures.wall(self._at(b, start + BLOCK / 2, side * (self.road + 9.0), turn), rng, BLOCK + 0.5, self.height)
+                    objects.rack(self._at(b, s, side * (self.road + depth / 2), turn), rng, self._bay, depth, 4, self._step)
+            objects.wall(self._at(b, start + BLOCK / 2, side * (self.road + 9.0), turn), rng, BLOCK + 0.5, self.height)
             for _ in range(rng.poisson(1.5)):
                 self._at(b, start + rng.uniform(2, BLOCK), side * (self.road - 0.5), rng.uniform(-0.2, 0.2))
-                structures.pallet(b, rng)
+                objects.pallet(b, rng)
             for _ in range(rng.poisson(2.0)):  # behind the racks, seen through the passages
                 self._at(b, passage + rng.normal(0, 2.0), side * (self.road + rng.uniform(2.5, 8.0)), rng.uniform(0, 6))
-                structures.pallet(b, rng)
+                objects.pallet(b, rng)
         for s in np.arange(start + 5, start + BLOCK, 10.0):
-            structures.slab(self._at(b, s, 0.0), 10.05, 2 * (self.road + 9.2), self.height, 5.0)
+            objects.slab(self._at(b, s, 0.0), 10.05, 2 * (self.road + 9.2), self.height, 5.0)
         _bulkhead(self._at(b, start, 0.0), self.road + 0.2, self.road + 9.1, self.height)
         if rng.random() < 0.6:
             objects.person(self._at(b, start + rng.uniform(3, BLOCK), self.road - 0.6, rng.uniform(0, 2 * np.pi)), rng)
         if rng.random() < 0.4:
-            structures.forklift(self._at(b, passage, self.road + 0.5, rng.uniform(0, 2 * np.pi)))
+            objects.forklift(self._at(b, passage, self.road + 0.5, rng.uniform(0, 2 * np.pi)))
 
 
 class Highway(Street):
@@ -178,22 +178,22 @@ class Highway(Street):
     def _fill(self, b: Builder, rng: Rng, start: float) -> None:
         for side in (-1, 1):
             for s in np.arange(start + 4, start + BLOCK, 8.0):
-                structures.guard_rail(self._at(b, s, side * (self.road + 0.9), 0.0 if side > 0 else np.pi), 8.05)
-            structures.delineator(self._at(b, start, side * (self.road + 0.6)), rng)
+                objects.guard_rail(self._at(b, s, side * (self.road + 0.9), 0.0 if side > 0 else np.pi), 8.05)
+            objects.delineator(self._at(b, start, side * (self.road + 0.6)), rng)
             for _ in range(rng.poisson(2.0)):
                 self._at(b, start + rng.uniform(0, BLOCK), side * (self.road + rng.uniform(9, 45)))
-                (structures.thicket if rng.random() < 0.6 else structures.broadleaf)(b, rng)
+                (objects.thicket if rng.random() < 0.6 else objects.broadleaf)(b, rng)
         if rng.random() < 0.25:
-            structures.gantry(self._at(b, start + rng.uniform(0, BLOCK), 0.0), rng, 2 * self.road + 3.0)
+            objects.gantry(self._at(b, start + rng.uniform(0, BLOCK), 0.0), rng, 2 * self.road + 3.0)
         if rng.random() < 0.45:
-            structures.road_sign(self._at(b, start + rng.uniform(0, BLOCK), -(self.road + 3.2)), rng)
+            objects.road_sign(self._at(b, start + rng.uniform(0, BLOCK), -(self.road + 3.2)), rng)
         for lane in (0, 1):  # the own lane stays free
             if rng.random() < 0.4:
                 self._at(b, start + rng.uniform(0, BLOCK), self.road - 0.6 - (lane + 0.5) * self._lane, rng.normal(0, 0.01))
-                (structures.lorry if rng.random() < 0.3 else objects.car)(b, rng)
+                (objects.lorry if rng.random() < 0.3 else objects.car)(b, rng)
         if rng.random() < 0.3:
             self._at(b, start + rng.uniform(0, BLOCK), self.road + 14.0, np.pi)  # the other carriageway
-            (structures.lorry if rng.random() < 0.4 else objects.car)(b, rng)
+            (objects.lorry if rng.random() < 0.4 else objects.car)(b, rng)
 
 
 SCENES: dict[str, type[Street]] = {

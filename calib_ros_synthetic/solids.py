@@ -6,7 +6,7 @@ The tables of the noise are made once from a fixed seed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import lru_cache, partialmethod
 from math import cos, sin
@@ -73,11 +73,6 @@ class Solids:
         c, s = np.cos(self.yaw)[:, None], np.sin(self.yaw)[:, None]
         turned = np.stack([c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1)
         return np.asarray(turned + self.centre[:, None])
-
-
-def concatenate(parts: Sequence[Solids]) -> Solids:
-    """All solids of the parts, in their order; at least one part is needed."""
-    return Solids(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Solids)))
 
 
 class Builder:

@@ -1,19 +1,22 @@
-"""The street of a seed: its winding centre line, the drive along it, and its objects, generated block by block.
+"""The street of a seed: its winding centre line, its objects, generated block by block, and how a vehicle drives along it.
 
 Blocks do not depend on each other, so that the street has no end.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
+from calib_ros import se3
 from calib_ros.datasets.recent import Recent
 from calib_ros_synthetic import objects
-from calib_ros_synthetic.solids import Builder, Solids, concatenate
+from calib_ros_synthetic.solids import Builder, Solids
 
 Rng = np.random.Generator
 Floats = NDArray[np.float64]
@@ -26,14 +29,19 @@ BLOCK = 40.0  # m of street per block
 KERB = 0.12  # m that the pavement lies above the road
 VIEW_BEHIND, VIEW_AHEAD = 110.0, 150.0  # m of street that the sensors may see
 CACHED_BLOCKS = 32
+STEADY, WEAVING = RIDES = ("steady", "weaving")
+SPINS = ("clockwise", "counterclockwise")
+SWERVE, SWERVE_LENGTH = 0.8, 35.0  # m; at 5 m/s the vehicle turns at up to 7 deg/s
+SPEED_CHANGE, SPEED_PERIOD_S = 0.5, 12.0  # of the mean speed, up and down
+STAMP_AT = {"start": -0.5, "middle": 0.0, "end": 0.5}  # share of a revolution after the scanner has faced ahead
 
 
 class Street:
     """What stands where. `road`: half width of the road; `pavement`: width of each pavement; metres.
 
-    Other scenes are streets with other furniture. ground: a name in grounds.PAINTERS. kerb: m that all beyond the road lies above
-    it. bend: factor on the bends of the centre line. view: m of it behind and ahead that sensors may see. cruise: usual speed,
-    m/s. indoors: lamps at the ceiling instead of sun and sky.
+    Other scenes are streets with other furniture. ground: a name in materials.GROUNDS. kerb: m that all beyond the road lies
+    above it. bend: factor on the bends of the centre line. view: m of it behind and ahead that sensors may see. cruise: usual
+    speed, m/s. indoors: lamps at the ceiling instead of sun and sky.
     """
 
     ground: ClassVar[str] = "street"
@@ -66,7 +74,8 @@ class Street:
     def around(self, s: float) -> Solids:
         """All solids in `view` of station s, by whole blocks."""
         first, last = int((s - self.view[0]) // BLOCK), int((s + self.view[1]) // BLOCK)
-        return concatenate([self._blocks(k, partial(self._furnish, k)) for k in range(first, last + 1)])
+        blocks = [self._blocks(k, partial(self._furnish, k)) for k in range(first, last + 1)]
+        return Solids(*(np.concatenate([getattr(block, f.name) for block in blocks]) for f in fields(Solids)))
 
     def _furnish(self, k: int) -> Solids:
         # Block numbers before the start are negative, seeds must not be.
@@ -213,3 +222,54 @@ class Path:
 
     def _at(self, row: int, index: NDArray[np.int32], part: Float32) -> Float32:
         return np.asarray(self._table[row].take(index) + part * self._rise[row].take(index))
+
+
+@dataclass(frozen=True)
+class Ride:
+    """The vehicle's way along a street: a lane offset in metres, and slow swaying in yaw, pitch, roll and height.
+
+    speed: m/s on average. weaving: it accelerates and brakes, and swerves to either side, by heading where it goes.
+    """
+
+    seed: int
+    speed: float
+    weaving: bool = False
+
+    def station(self, seconds: float) -> float:
+        """m from the start."""
+        if not self.weaving:
+            return self.speed * seconds
+        wave, phase = 2 * np.pi / SPEED_PERIOD_S, self._phase
+        return float(self.speed * (seconds + SPEED_CHANGE * (np.sin(wave * seconds + phase) - np.sin(phase)) / wave))
+
+    def speed_at(self, seconds: float) -> float:
+        """m/s."""
+        if not self.weaving:
+            return self.speed
+        return float(self.speed * (1 + SPEED_CHANGE * np.cos(2 * np.pi * seconds / SPEED_PERIOD_S + self._phase)))
+
+    @property
+    def _phase(self) -> float:
+        return float(np.random.default_rng([self.seed, 12]).uniform(0, 2 * np.pi))
+
+    def pose(self, street: Street, s: float) -> Floats:
+        """T_world_lidar (4, 4) at station s."""
+        rng = np.random.default_rng([self.seed, 2])
+        phase = rng.uniform(0, 2 * np.pi, (5, 2))
+        wave = 2 * np.pi / rng.uniform([[40, 17]] * 2 + [[13, 7]] * 3, [[70, 29]] * 2 + [[29, 11]] * 3)
+        size = np.array([[0.25, 0.1], [1.5, 0.4], [0.5, 0.25], [0.7, 0.3], [0.012, 0.006]])  # m, deg, deg, deg, m
+        lane, yaw, pitch, roll, bump = (np.sin(wave * s + phase) * size).sum(axis=1)
+        if self.weaving:
+            angle = 2 * np.pi * s / SWERVE_LENGTH + phase[0, 0]
+            lane += SWERVE * np.sin(angle)
+            yaw += np.rad2deg(np.arctan(SWERVE * np.cos(angle) * 2 * np.pi / SWERVE_LENGTH))
+        x, y, heading = street.path.place(s, street.lane + lane)
+        angles = [np.rad2deg(heading) + yaw, pitch, roll]
+        R = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+        return se3.from_parts(R, [x, y, LIDAR_HEIGHT + bump])
+
+    def twist(self, street: Street, s: float, speed: float) -> Floats:
+        """(rx, ry, rz, tx, ty, tz) in rad/s and m/s in the LiDAR's own frame: T(t) = T(0) exp(twist t)."""
+        h = 0.05  # m; short against the waves, long against rounding
+        step = se3.log(se3.inverse(self.pose(street, s - h)) @ self.pose(street, s + h))
+        return np.asarray(step * (speed / (2 * h)))

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros_synthetic import grounds
-from calib_ros_synthetic.materials import ALBEDO, CONTRAST, GLOSS, GRAIN, OWN_COLOUR, Part
+from calib_ros_synthetic.materials import ALBEDO, CONTRAST, GLOSS, GRAIN, GROUNDS, OWN_COLOUR, Bytes, Part
 from calib_ros_synthetic.rays import CURB, ROAD, Ints
 from calib_ros_synthetic.solids import Float32, Floats, Kind, Solids, Surface, cell, noise2
 from calib_ros_synthetic.street import Street
 
-Bytes = NDArray[np.uint8]
 SUN = np.array([0.95, 1.10, 1.20], np.float32)
 AMBIENT = np.array([0.52, 0.44, 0.40], np.float32)
 ZENITH = np.array([0.72, 0.45, 0.26], np.float32)
@@ -63,7 +61,7 @@ def spots(street: Street | None, solids: Solids, ids: Ints, xyz: Float32, origin
     if street is not None and len(ground):
         s, d = street.path.frenet(xyz[0, ground], xyz[1, ground], origin)
         out.u[ground], out.v[ground] = s, d
-        out.part[ground] = grounds.PAINTERS[street.ground](street, ids[ground], s, d)
+        out.part[ground] = GROUNDS[street.ground](street, ids[ground], s, d)
         curb = ground[ids[ground] == CURB]
         heading = street.path.station(out.u[curb])[2]
         towards_road = -np.sign(out.v[curb])

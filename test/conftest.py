@@ -29,7 +29,7 @@ from typing import IO
 
 import pytest
 from paths import ROOT
-from scenes import RENDERINGS, RenderedDrive, Scene, picture_once, render_once, scan_once
+from scenes import RENDERINGS, RenderedDrive, Scene, picture_once, scan_once
 
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.frame import Frame
@@ -117,7 +117,6 @@ def street(drive: SyntheticDrive) -> list[Frame]:
 def rendered_once() -> Iterator[None]:
     """Sources named `synthetic:` are rendered once per session, also in commands that run in this process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SyntheticDrive, "_render", render_once)
         patch.setattr(SyntheticRig, "_scan", scan_once)
         patch.setattr(SyntheticRig, "_picture", picture_once)
         yield

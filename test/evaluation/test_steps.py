@@ -22,6 +22,7 @@ from calib_ros_evaluation.steps.cloud import Cloud
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 from calib_ros_evaluation.steps.pictures import VIRIDIS, RegisteredFrame, Scale, Step, busiest, class_histogram, enlarged
 from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_synthetic.rig import RigPair
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 SOURCE = "synthetic:seed=1,frames=2,rings=32,width=480,height=144"
@@ -249,12 +250,12 @@ def test_extrinsic_with_no_points_in_view(drive: SyntheticDrive) -> None:
 def test_an_empty_scan_is_one_line_and_no_page(
     drive: SyntheticDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = SyntheticDrive.__getitem__
+    whole = RigPair.__getitem__
 
-    def empty(self: SyntheticDrive, index: int) -> Frame:
+    def empty(self: RigPair, index: int) -> Frame:
         return dataclasses.replace(whole(self, index), cloud=PointCloud(np.full((5000, 3), np.nan, np.float32)))
 
-    monkeypatch.setattr(SyntheticDrive, "__getitem__", empty)
+    monkeypatch.setattr(RigPair, "__getitem__", empty)
     code, out, err = run(capsys, SOURCE, "--out", str(tmp_path / "out"))
     assert (code, out) == (2, "")
     assert len(err.splitlines()) == 1

@@ -8,8 +8,8 @@ import os
 import pickle
 import tempfile
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.config import Config, SearchConfig, SemanticsConfig, TrackerConfig
-from calib_ros.frame import Frame
+from calib_ros.datasets.recent import Recent
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
@@ -35,7 +35,7 @@ QUICK = Config(search=QUICK_SEARCH, semantics=SemanticsConfig(segmentation="none
 RENDERINGS = "CALIB_ROS_TEST_RENDERINGS"  # environment variable: folder of this run, for all of its processes
 
 
-_render, _scan, _picture = SyntheticDrive._render, SyntheticRig._scan, SyntheticRig._picture
+_scan, _picture = SyntheticRig._scan, SyntheticRig._picture
 
 
 def made_once(key: object, make: Callable[[], Any]) -> Any:
@@ -51,41 +51,35 @@ def made_once(key: object, make: Callable[[], Any]) -> Any:
     return pickle.loads(path.read_bytes())
 
 
-def render_once(drive: SyntheticDrive, index: int, T_camera_lidar: np.ndarray, age_s: float = 0.0) -> Frame:
-    """In place of SyntheticDrive._render. Not for tests of the renderer, nor for a drive with an empty stretch."""
-    options = {name: value for name, value in drive._parameters.items() if name != "frames"}  # no frame depends on their number
-    camera = drive.camera
-    lens = (camera.K.tolist(), camera.width, camera.height, camera.model, np.asarray(camera.D).tolist())
-    key = (sorted(options.items()), lens, index, np.asarray(T_camera_lidar).tolist(), age_s)
-    frame = made_once(key, lambda: _render(drive, index, T_camera_lidar, age_s))
-    return replace(frame, camera=camera, reference=T_camera_lidar)
-
-
 def scan_once(rig: SyntheticRig, lidar: str, index: int) -> Any:
-    """In place of SyntheticRig._scan."""
-    return made_once((rig.name, lidar, index), lambda: _scan(rig, lidar, index))
+    """In place of SyntheticRig._scan. Not for tests of the renderer, nor for a drive with an empty stretch."""
+    return made_once((_key(rig, *OF_PICTURES), lidar, index), lambda: _scan(rig, lidar, index))
 
 
-def picture_once(rig: SyntheticRig, camera: str, index: int) -> Any:
+def picture_once(rig: SyntheticRig, camera: str, index: int, hung: Any = None, age_s: float = 0.0) -> Any:
     """In place of SyntheticRig._picture."""
-    return made_once((rig.name, camera, index), lambda: _picture(rig, camera, index))
+    lens, where = rig.camera(camera), hung or rig._hung(camera, False)
+    key = (_key(rig), lens.K.tolist(), lens.width, lens.height, lens.model, np.asarray(lens.D).tolist())
+    key = (*key, camera, index, [T.tolist() for T in where], age_s)
+    return made_once(key, lambda: _picture(rig, camera, index, hung, age_s))
+
+
+OF_PICTURES = ("width", "height", "tilt_deg", "image_late_ms", "jitter_ms")  # what the scans of a pair do not depend on
+
+
+def _key(rig: SyntheticRig, *not_of: str) -> object:
+    """What measurements depend on: those of a pair not on their number."""
+    left_out = ("frames", *not_of) if rig.model.is_pair else ()
+    return sorted((name, value) for name, value in rig.parameters.items() if name not in left_out)
 
 
 class RenderedDrive(SyntheticDrive):
-    """A drive whose frames are rendered once in a run of the tests, see render_once."""
-
-    _render = render_once
+    """A drive whose frames are rendered once in a run of the tests, and all kept."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._rendered: dict[int, Frame] = {}
-
-    def __getitem__(self, index: int) -> Frame:
-        k = range(len(self))[index]
-        if k not in self._rendered:
-            self._rendered[k] = super().__getitem__(k)
-        frame = self._rendered[k]
-        return replace(deepcopy(frame), camera=frame.camera)  # a test may draw on its frame
+        self.rig._scan, self.rig._picture = partial(scan_once, self.rig), partial(picture_once, self.rig)  # type: ignore[method-assign]
+        self.rig._made = Recent(1000)
 
 
 def is_near(reference: np.ndarray, T: np.ndarray, deg: float, m: float) -> bool:

@@ -22,6 +22,7 @@ from calib_ros.datasets.rig_source import RigDescription, Sensor
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.initial_guess import nominal
+from calib_ros_synthetic.parameters import parsed
 from calib_ros_synthetic.rig import SyntheticRig
 
 TEXT = "synthetic:seed=3,frames=1,stride=4,width=96,noise=0.0,rig=two_lidars_three_cameras"
@@ -41,7 +42,7 @@ def lidar(topic: str = "", **more: Any) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def rig() -> SyntheticRig:
-    return SyntheticRig.from_text(TEXT)
+    return SyntheticRig(**parsed(TEXT))
 
 
 @pytest.fixture(scope="module")

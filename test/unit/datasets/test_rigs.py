@@ -12,10 +12,11 @@ from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as Label
-from calib_ros_synthetic import camera, lidar, rays, scanners, wide, windows
-from calib_ros_synthetic.conditions import CONDITIONS
+from calib_ros_synthetic import camera, lidar, rays, scanners, wide
+from calib_ros_synthetic.camera import CONDITIONS
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_synthetic.rigs import RIGS
+from calib_ros_synthetic.rig import RigPair
+from calib_ros_synthetic.rigs import PAIRS, RIGS
 from calib_ros_synthetic.scanners import MODELS, scanner
 from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Solids
@@ -74,7 +75,7 @@ def test_a_solid_state_scanner_looks_ahead_along_lines(name, channels, points, f
 
 @pytest.mark.parametrize("name", ["vlp16_narrow", "os1_64_robot"])
 def test_clouds_are_stored_as_the_driver_stores_them(name: str) -> None:
-    model = MODELS[RIGS[name].scanner]
+    model = MODELS[str(RIGS[name].sensors["lidar"].kind)]
     cloud = SyntheticDrive(1, 2, rig=name, width=96, noise=0)[1].cloud
     ring, time = cloud.ring, cloud.time
     assert ring is not None
@@ -88,13 +89,14 @@ def test_clouds_are_stored_as_the_driver_stores_them(name: str) -> None:
 QUICK = ("hdl32e_front", "os1_64_robot")
 
 
-@pytest.mark.parametrize("rig", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in RIGS])
+@pytest.mark.parametrize("rig", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in PAIRS])
 def test_points_fall_on_pixels_of_their_class_in_every_rig(rig: str) -> None:
-    scene = list(SCENES)[list(RIGS).index(rig) % 2]  # houses or woods: other scenes are beside each other below
+    scene = list(SCENES)[PAIRS.index(rig) % 2]  # houses or woods: other scenes are beside each other below
     drive = RenderedDrive(seed=2, frames=4, rig=rig, scene=scene, width=320, noise=0, speed=0)
     true = agreement(drive, drive.reference)
     # What stands between the two sensors is seen by one of them only.
-    apart = np.linalg.norm(RIGS[rig].lidar.pose()[:3, 3] - RIGS[rig].camera.pose()[:3, 3])
+    lidar, camera = (sensor.pose()[:3, 3] for sensor in RIGS[rig].sensors.values())
+    apart = np.linalg.norm(lidar - camera)
     assert true > (0.95 if apart < 0.5 else 0.89)
     for axis in np.eye(3):
         assert agreement(drive, se3.perturb(drive.reference, 3 * axis, np.zeros(3))) < true - 0.01
@@ -163,11 +165,11 @@ def test_source_text_with_names() -> None:
         cloud = SyntheticDrive(1, 1, rig="vlp16_narrow", width=64, fields=fields)[0].cloud
         assert [n for n in ("intensity", "ring", "time") if getattr(cloud, n) is not None] == names
     drive = open_dataset(text)
-    assert isinstance(drive, SyntheticDrive)
+    assert isinstance(drive, RigPair)
     assert drive.name == text
     assert "os1_128_windshield" in drive.describe()["rig"]
-    assert drive.speed == SCENES["park"].cruise
-    assert SyntheticDrive(rig="os1_64_robot").speed == RIGS["os1_64_robot"].top_speed
+    assert drive.rig.speed == SCENES["park"].cruise
+    assert SyntheticDrive(rig="os1_64_robot").rig.speed == RIGS["os1_64_robot"].top_speed
 
 
 PICTURE = {"width": 160, "seed": 2, "frames": 3, "rig": "vlp16_narrow"}
@@ -207,7 +209,7 @@ def test_the_rows_of_a_rolling_shutter_are_taken_one_after_the_other() -> None:
 
 def test_a_fisheye_sees_beside_and_behind_itself() -> None:
     drive = SyntheticDrive(1, 2, rig="os1_128_fisheye", width=240, noise=0, speed=0)
-    view = drive._installed.view(drive.camera)  # type: ignore[union-attr]
+    view = drive.rig.view("camera")
     assert isinstance(view, WideView)
     assert view.z.min() < 0
     norm = np.sqrt(view.x**2 + view.y**2 + view.z**2)
@@ -244,7 +246,7 @@ PLACES = [{"rig": "vlp16_narrow"}, {"rig": "mid360_90"}, {"rig": "os1_128_fishey
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: next(iter(place.values())))
 def test_trying_every_solid_on_every_ray_finds_no_more(place, monkeypatch: pytest.MonkeyPatch) -> None:
     """Solids are cast on the rays of their windows only."""
-    for module in (rays, windows, wide):
+    for module in (rays, scanners, wide):
         monkeypatch.setattr(module, "SMALLEST", 0.0)
     drive = {"seed": 4, "frames": 1, "width": 96, "noise": 0.0, **place}
     expected = SyntheticDrive(**drive)[0]

@@ -16,14 +16,12 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.frame import SemanticClass as Label
 from calib_ros_synthetic import rays
-from calib_ros_synthetic.camera import Scene, render
-from calib_ros_synthetic.conditions import CONDITIONS
+from calib_ros_synthetic.camera import CONDITIONS, Scene, render
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_synthetic.multi_rigs import MULTI_RIGS
 from calib_ros_synthetic.rays import Rays, intersect
 from calib_ros_synthetic.rig import open_drive
-from calib_ros_synthetic.rigs import RIGS
-from calib_ros_synthetic.scanners import PERIOD, plain_scanner
+from calib_ros_synthetic.rigs import PAIRS, RIGS
+from calib_ros_synthetic.scanners import PERIOD, scanner
 from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Builder, Kind, Solids
 from calib_ros_synthetic.street import Street
@@ -89,7 +87,7 @@ def test_a_cloud_is_sorted_as_in_kitti_and_its_time_follows_the_azimuth(rings: i
     assert ring is not None
     assert time is not None
     assert intensity is not None
-    model = plain_scanner(rings).model
+    model = scanner(str(rings)).model
     assert model.table is not None
     degrees = model.table()[0]
     assert len(cloud) > 0.4 * rings * model.firings
@@ -245,7 +243,8 @@ def test_texts_that_name_no_drive_are_refused(text: str, message: str) -> None:
 
 def test_the_page_lists_all_there_are() -> None:
     page = (ROOT / "docs" / "synthetic.md").read_text(encoding="utf-8")
-    for title, names in {"Rigs": RIGS, "Scenes": SCENES, "Conditions": CONDITIONS, "Rigs of several sensors": MULTI_RIGS}.items():
+    several = [name for name in RIGS if name not in PAIRS]
+    for title, names in {"Rigs": PAIRS, "Scenes": SCENES, "Conditions": CONDITIONS, "Rigs of several sensors": several}.items():
         section = page.partition(f"## {title}\n")[2].partition("\n## ")[0].partition("\n| parameter")[0]
         rows = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
         assert (rows or re.findall(r"`(\w+)`", section)) == list(names), title
@@ -253,11 +252,11 @@ def test_the_page_lists_all_there_are() -> None:
 
 def test_source_text_and_bad_parameters() -> None:
     drive = SyntheticDrive.from_text(" synthetic:seed=3, frames=16,rings=32,width=640,height=480,speed=0,noise=0.5 ")
-    assert (drive.seed, len(drive), drive.rings, drive.speed, drive.noise) == (3, 16, 32, 0.0, 0.5)
+    assert [drive.rig.parameters[k] for k in ("seed", "frames", "rings", "speed", "noise")] == [3, 16, 32, 0.0, 0.5]
     assert (drive.camera.width, drive.camera.height) == (640, 480)
     again = SyntheticDrive.from_text(drive.name)
     assert again.name == drive.name
-    assert again._parameters == drive._parameters
+    assert again.rig.parameters == drive.rig.parameters
     assert SyntheticDrive.from_text("synthetic").name == SyntheticDrive().name
     assert all(isinstance(k, str) and isinstance(v, str) for k, v in drive.describe().items())
     wrong = [("seed", -1), ("frames", 0), ("frames", 2.5), ("frames", True), ("rings", 48), ("width", 10), ("height", 0)]

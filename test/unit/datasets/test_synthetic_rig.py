@@ -9,9 +9,8 @@ from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
 from calib_ros.frame import NANOSECONDS, UNLABELLED
 from calib_ros.lidar.deskew import moved
-from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_synthetic.multi_rigs import MULTI_RIGS
 from calib_ros_synthetic.rig import RigPair, SyntheticRig, open_drive
+from calib_ros_synthetic.rigs import RIGS
 
 SIX = "six_cameras_one_lidar"
 
@@ -60,7 +59,7 @@ def test_points_fall_on_pixels_of_their_class_whatever_the_clocks_say(name: str,
 
 def test_every_sensor_has_its_own_rate_and_clock() -> None:
     rig, alike = small(), small(clocks=0)
-    for name, sensor in MULTI_RIGS[SIX].sensors.items():
+    for name, sensor in RIGS[SIX].sensors.items():
         stamps = rig.stamps(name)
         np.testing.assert_allclose(np.diff(stamps), NANOSECONDS / sensor.rate, atol=1)
         assert len(stamps) == pytest.approx(3 * sensor.rate, abs=1)
@@ -77,8 +76,8 @@ def test_every_sensor_has_its_own_rate_and_clock() -> None:
 
 def test_a_scan_is_rendered_once_for_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     rig, scans = small(width=96), []
-    counting = type(rig.trip).scan
-    monkeypatch.setattr(type(rig.trip), "scan", lambda own, *args: scans.append(args[2]) or counting(own, *args))
+    counting = rig._scan
+    monkeypatch.setattr(rig, "_scan", lambda name, index: scans.append(index) or counting(name, index))
     clouds = [rig.pair(camera, "lidar_top")[1].cloud for camera in ("front", "front_left", "back")]
     stamp, cloud = rig.scans("lidar_top")[scans[0]]
     assert len(scans) == 1
@@ -128,6 +127,6 @@ def test_a_pair_is_an_ordinary_source() -> None:
     np.testing.assert_array_equal(open_dataset(text, camera=3)[-1].image, pair[1].image)
     assert (pair.camera_frame, pair.lidar_frame) == ("back_left_optical", "lidar_top")
     assert "back_left (chosen)" in pair.describe()["cameras"]
-    assert isinstance(open_drive("synthetic:rig=os1_64_robot", 2), SyntheticDrive)
+    assert open_drive("synthetic:rig=os1_64_robot", 2).camera_frame == "camera"  # the only one
     with pytest.raises(IndexError):
         pair[2]

@@ -57,14 +57,14 @@ def test_earlier_points_are_where_they_would_have_been_measured(drive, frames, m
     T, expected = np.eye(4), []
     for k in range(NEWEST - 1, NEWEST - 5, -1):
         gap = (frames[k + 1].cloud_stamp - frames[k].cloud_stamp) / NANOSECONDS
-        twist = (drive.twist(k) + drive.twist(k + 1)) / 2
+        twist = (drive[k].twist + drive[k + 1].twist) / 2
         T = T @ se3.inverse(se3.exp(twist * gap))
-        expected.append(se3.transform(T, moved(frames[k].cloud.xyz, drive.twist(k), frames[k].cloud.time)))
+        expected.append(se3.transform(T, moved(frames[k].cloud.xyz, drive[k].twist, frames[k].cloud.time)))
     expected = np.concatenate(expected)
     found = merged.cloud.xyz[len(frames[NEWEST].cloud) :]
     near = np.linalg.norm(found, axis=1) < 15
     off = np.linalg.norm(found - expected, axis=1)[near]
-    gone = np.linalg.norm(drive.twist(NEWEST)[3:]) * 0.4
+    gone = np.linalg.norm(drive[NEWEST].twist[3:]) * 0.4
     assert gone > 0.3
     assert np.median(off) < 0.02
     assert np.percentile(off, 99) < 0.06
@@ -72,7 +72,7 @@ def test_earlier_points_are_where_they_would_have_been_measured(drive, frames, m
 
 def test_what_is_seen_grows_with_the_time(drive, frames, merged):
     calibrator = Calibrator(drive.camera, update(Config(), {"semantics": {"image_classes": "", "cloud_classes": ""}}))
-    alone, together = (calibrator.extract(frame).points for frame in (replace(frames[NEWEST], twist=drive.twist(NEWEST)), merged))
+    alone, together = (calibrator.extract(frame).points for frame in (replace(frames[NEWEST], twist=drive[NEWEST].twist), merged))
     assert len(together) > 2.5 * len(alone)
     # Edges of the sparse scan are among those of the dense one.
     distance, _ = cKDTree(together.xyz).query(alone.xyz)

@@ -83,7 +83,7 @@ class TestEstimate:
 
     def test_velocity_of_a_known_drive(self, drive):
         """By times and by azimuth, from a right and a wrong start, with lost returns, and backwards in time."""
-        mean = 0.5 * (drive.twist(1) + drive.twist(2))
+        mean = 0.5 * (drive[1].twist + drive[2].twist)
         lost = drive[2].cloud.xyz.copy()
         lost[::9], lost[1::9] = np.nan, 0
         with_lost = replace(drive[2], cloud=replace(drive[2].cloud, xyz=lost))
@@ -129,7 +129,7 @@ class TestEstimate:
         frames = [moving[i] for i in range(len(moving))]
         assert source.reads < 2 * len(drive) + 2
         for i, frame in enumerate(frames):
-            assert frame.twist[3:] == pytest.approx(drive.twist(i)[3:], abs=0.03 * SPEED)
+            assert frame.twist[3:] == pytest.approx(drive[i].twist[3:], abs=0.03 * SPEED)
             assert np.array_equal(frame.cloud.xyz, drive[i].cloud.xyz)
         assert np.allclose(moving[-1].twist, frames[-1].twist, atol=0.02)
         assert len(moving) == len(drive)
@@ -171,7 +171,7 @@ class TestEstimate:
         assert not recalibrator.ingest(bare[1])  # the same once more: no keyframe, no estimate, and gap 0 next
         recalibrator.selector.reset()
         assert recalibrator.ingest(drive[2])
-        assert np.array_equal(recalibrator.newest().twist, drive.twist(2))
+        assert np.array_equal(recalibrator.newest().twist, drive[2].twist)
 
     def test_keyframes_of_unknown_motion_are_left_out_while_the_vehicle_moves(self, drive):
         bare = Bare(drive)

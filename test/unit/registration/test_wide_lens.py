@@ -65,7 +65,9 @@ def test_a_fisheye_of_any_model_is_used_beyond_its_image_plane_and_finds_the_ext
     """OpenCV has maps for none but the first."""
     rig = RIGS["os1_128_fisheye"]
     if model != "equidistant":
-        rig = replace(rig, lens=replace(rig.lens, model=model, D=MODELS[model]))
+        camera = rig.sensors["camera"]
+        lens = replace(camera.kind, model=model, D=MODELS[model])
+        rig = replace(rig, sensors=rig.sensors | {"camera": replace(camera, kind=lens)})
     monkeypatch.setitem(RIGS, "os1_128_fisheye", rig)
     frame = open_dataset("synthetic:rig=os1_128_fisheye,seed=5,frames=1,width=480")[0]
     assert frame.camera.model == model
