@@ -142,6 +142,9 @@ setup(
             "evaluate = calib_ros_evaluation.cli:EVALUATE",
             "steps = calib_ros_evaluation.cli:STEPS",
         ],
+        "calib_ros.pages": [
+            "rig = calib_ros_check.report:rig_page",
+        ],
         "calib_ros.node_services": [
             "check = calib_ros_check.node.server:CheckServer",
             "keyframes = calib_ros_view.node.keyframes:KeyframeServer",

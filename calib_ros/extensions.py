@@ -11,6 +11,7 @@ The core imports none of them. What is not installed is missing as if it had nev
 ``calib_ros.classes``             what recognises classes of points and pixels: a `ClassModels` of registration/classes.py
 ``calib_ros.stages``              a stage of the configuration: a frozen dataclass made with `calib_ros.config.options`
 ``calib_ros.presets``             configurations by one word: the YAML files that they are made of, in this order
+``calib_ros.pages``               the page of a command's ``--report``: a callable, path -> what writes the page there
 ``calib_ros.node_services``       a service of the node, ``~/NAME``: a callable, node, pipeline, health -> `NodeService`
 ================================  ===========================================================================================
 """
@@ -26,7 +27,7 @@ from importlib.util import find_spec
 from typing import Any, Protocol
 
 COMMANDS, SOURCES, NODE_SERVICES = "calib_ros.commands", "calib_ros.sources", "calib_ros.node_services"
-RIGS = "calib_ros.rigs"
+RIGS, PAGES = "calib_ros.rigs", "calib_ros.pages"
 OBJECTIVES, CLASSES = "calib_ros.objectives", "calib_ros.classes"
 STAGES, PRESETS = "calib_ros.stages", "calib_ros.presets"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,9 +15,8 @@ from calib_ros.rig.description import read_rig
 from calib_ros_check.fleet.recordings import is_fleet
 from calib_ros_check.outcome import CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.recording import Checked, CheckOptions, check_source
-from calib_ros_check.report import check_report, write_report
+from calib_ros_check.report import check_report, write_report, write_rig_check
 from calib_ros_check.rig.check import RigCheck, check_recording
-from calib_ros_check.rig.page import write_rig_page
 
 Found = tuple[CheckResult | RigCheck, str, Callable[[str], None]]  # with what is printed, and what writes its page
 EXIT = {CheckVerdict.PASS: 0, CheckVerdict.FAIL: 1, CheckVerdict.INCONCLUSIVE: 3}
@@ -24,20 +24,10 @@ EXIT = {CheckVerdict.PASS: 0, CheckVerdict.FAIL: 1, CheckVerdict.INCONCLUSIVE: 3
 
 def options_of(args: argparse.Namespace) -> CheckOptions:
     """How to check, as given on the command line. BadInputError for a tolerance out of range."""
-    return CheckOptions(
-        args.extrinsic,
-        Tolerance(args.tolerance_deg, args.tolerance_m),
-        args.frames or "",
-        args.camera,
-        args.image_topic,
-        args.points_topic,
-        args.camera_info_topic,
-        args.clock,
-        args.incomplete,
-        configuration(args.config),
-        args.rig or "",
-        args.rectified,
-    )
+    as_given = ("extrinsic", "camera", "image_topic", "points_topic", "camera_info_topic", "clock", "incomplete", "rectified")
+    options = CheckOptions(**{name: getattr(args, name) for name in as_given}, config=configuration(args.config))
+    tolerance = Tolerance(args.tolerance_deg, args.tolerance_m)
+    return replace(options, tolerance=tolerance, frames=args.frames or "", rig=args.rig or "")
 
 
 def is_one(sources: Sequence[str], rig: str | None) -> bool:
@@ -69,7 +59,7 @@ def _pair(source: str, options: CheckOptions) -> Found:
 def _rig(source: str, options: CheckOptions) -> Found:
     with progress_bar("checking") as step:
         found = check_recording(source, options, lambda text, share: step(share))
-    return found, rig_summary(found), partial(write_rig_page, found=found, config=options.config)
+    return found, rig_summary(found), partial(write_rig_check, found=found, config=options.config)
 
 
 def summary(checked: Checked) -> str:

@@ -50,6 +50,9 @@ class Tolerance:
             if not 0 < value <= most:
                 raise BadInputError(f"the tolerance of the {part}, {value:g} {unit}, is out of range (0, {most:g}] {unit}")
 
+    def __str__(self) -> str:
+        return f"{self.deg:g} deg / {100 * self.m:g} cm"
+
     def covers(self, T: Transform, T_other: Transform) -> bool:
         """Whether two extrinsics (4, 4) are the same to within the tolerance."""
         return se3.rotation_error_deg(T, T_other) <= self.deg and se3.translation_error_m(T, T_other) <= self.m
@@ -68,6 +71,11 @@ class Deviation:
     low: float = math.nan
     high: float = math.nan
     words: str = ""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the scenes tell it."""
+        return math.isfinite(self.error)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +12,20 @@ import yaml
 from calib_ros.config import Config
 from calib_ros.errors import MissingDependencyError
 from calib_ros.io import write_atomically
-from calib_ros_check.outcome import Tolerance
 
 # Strings, so that they are installed with the code whatever installs it.
-STYLE = """\
-:root {
-  --paper: #fbfbfa; --card: #ffffff; --ink: #1c1e21; --soft: #5d636b; --line: #dcdfe3; --accent: #0b62a8;
-}
-@media (prefers-color-scheme: dark) {
-  :root { --paper: #131518; --card: #1c1f23; --ink: #e6e8ea; --soft: #9aa2ab; --line: #33383e; --accent: #6db3f2; }
-}
+# The colours of all pages. Blue, amber and purple stay apart for all kinds of colour vision, on both papers.
+LIGHT = (
+    "--paper: #fbfbfa; --card: #ffffff; --ink: #1c1e21; --soft: #5d636b; --line: #dcdfe3; --accent: #0b62a8; "
+    "--good: #0072b2; --doubtful: #a65f00; --bad: #a3246e; --neutral: #6b7178;"
+)
+DARK = (
+    "--paper: #131518; --card: #1c1f23; --ink: #e6e8ea; --soft: #9aa2ab; --line: #33383e; --accent: #6db3f2; "
+    "--good: #56b4e9; --doubtful: #e69f00; --bad: #f08ac0; --neutral: #9aa2ab;"
+)
+STYLE = (
+    f":root {{ {LIGHT} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {DARK} }} }}"
+    + """
 * { box-sizing: border-box; }
 html { scroll-behavior: smooth; }
 body {
@@ -69,6 +73,7 @@ pre {
   nav ol { column-count: 2; }
 }
 """
+)
 
 PAGE = (
     """\
@@ -122,9 +127,8 @@ def page_template(template: str, **filters: Callable[..., Any]) -> Any:
     return environment.get_template("page")
 
 
-def write_page(path: str | Path, template: Any, config: Config, tolerance: Tolerance, **values: Any) -> None:
-    """Write a page of a check, atomically. template: see `page_template`; values: what it shows, but for configuration and
-    tolerance. BadInputError if the folder cannot be written."""
-    values["facts"] = {"tolerance": f"{tolerance.deg:g} deg, {100 * tolerance.m:g} cm", **values["facts"]}
-    page = template.render(configuration=yaml.safe_dump(config.to_dict(), sort_keys=False), **values)
+def write_page(path: str | Path, template: Any, config: Config, facts: Mapping[str, str], **values: Any) -> None:
+    """Write a page, atomically. template: see `page_template`; values: what it shows, but for the configuration. BadInputError if
+    the folder cannot be written."""
+    page = template.render(configuration=yaml.safe_dump(config.to_dict(), sort_keys=False), facts=facts, **values)
     write_atomically(path, page.encode("utf-8", "backslashreplace"))

@@ -1,8 +1,14 @@
-"""The page of a check: the verdict, the size of the error along every axis, other causes, and frames to look at."""
+"""The page of a rig: of its check, with the verdict, the size of the error along every axis and other causes, or of its estimate;
+with its graph, and frames to look at. That of a pair is the short form, without a graph."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,13 +17,21 @@ from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.datasets.positions import spread_positions
+from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.io import check_output
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.overlay import render
+from calib_ros.result import VERSION
+from calib_ros.rig.description import CAMERA, LIDAR
+from calib_ros.rig.edges import RigMeasurer
+from calib_ros.rig.report import RigReport
 from calib_ros_check.outcome import CheckResult, Deviation, Tolerance
 from calib_ros_check.page import page_template, write_page
 from calib_ros_check.recording import Checked
+from calib_ros_check.rig import shown as html
+from calib_ros_check.rig.check import RigCheck
+from calib_ros_check.rig.shown import EdgeShown, LoopShown, RigShown, SensorShown
 from calib_ros_check.tolerance import Judgement, amount, signed
 
 PICTURES = 3
@@ -35,13 +49,13 @@ LONG_NAMES = {
 }
 STYLE = """\
 .verdict { display: inline-block; padding: .25rem .9rem; border-radius: 6px; color: #fff; font-weight: 700; font-size: 1.2rem; }
-.pass { background: #1d7a3a; } .fail { background: #b3261e; } .inconclusive { background: #8a6d00; }
+.pass { background: #0072b2; } .fail { background: #a3246e; } .inconclusive { background: #8a5000; }
 .said { font-size: 1.05rem; margin: .8rem 0 1.2rem; overflow-wrap: anywhere; }
 td.pass, td.fail, td.inconclusive { background: none; font-weight: 600; }
-td.pass { color: #1d7a3a; } td.fail { color: #d6453d; } td.inconclusive { color: #a98700; }
+td.pass { color: var(--good); } td.fail { color: var(--bad); } td.inconclusive { color: var(--doubtful); }
 td.words { white-space: normal; min-width: 13rem; }
 .bar { display: block; width: 15rem; height: 1.5rem; }
-.bar .tolerance { fill: #1d7a3a; opacity: .25; } .bar .interval { fill: var(--accent); } .bar .median { fill: var(--ink); }
+.bar .tolerance { fill: var(--good); opacity: .25; } .bar .interval { fill: var(--accent); } .bar .median { fill: var(--ink); }
 .bar line { stroke: var(--soft); stroke-width: 1; }
 .sheet { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
 .sheet .scroll { padding: .8rem .9rem; }
@@ -52,6 +66,9 @@ td.words { white-space: normal; min-width: 13rem; }
   .sheet td:nth-child(even) { text-align: right; } .sheet td.words, .sheet td.wide { grid-column: 1 / -1; text-align: left; }
   .bar { width: 100%; }
 }
+.part { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; padding: .7rem .9rem; }
+.rig .grid { margin: 0 0 1.2rem; } .rig figure svg { padding: .8rem .6rem .2rem; }
+.intro span { white-space: nowrap; }
 nav { display: none; }
 """
 # Of `rows`, see `deviation_rows`.
@@ -74,24 +91,22 @@ DEVIATIONS = """\
 SHEET = """\
 <div class="grid">
 {% for name, picture in pictures %}
-<figure class="wide"><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="frame {{ name }}">
-<figcaption><b>frame {{ name }}</b></figcaption></figure>
+<figure{{ ' class=wide' if pictures|length < 4 }}><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="{{ name }}">
+<figcaption><b>{{ name }}</b></figcaption></figure>
 {% endfor %}
 </div>
 """
 TEMPLATE = (
-    f"{{% block style %}}\n{STYLE}{{% endblock %}}"
+    f"{{% block style %}}\n{STYLE}{html.CSS}{{% endblock %}}"
     + """
-{% block main %}
-<p><span class="verdict {{ result.verdict.value }}">{{ result.verdict.value }}</span></p>
-<p class="said">{{ result.reason }}</p>
+{% macro judged(rows, causes, mended) %}
 <h2>Size of the error</h2>
-<p class="intro">The error of the extrinsic{{ " with what was found mended" if result.cause else "" }}, in the camera's axes:
-its median, and where it lies with 95 %. Green: the tolerance, {{ result.tolerance.deg }} deg and
-{{ "%g"|format(100 * result.tolerance.m) }} cm.</p>
+<p class="intro">The error of the extrinsic{{ " with what was found mended" if mended }}, in the camera's axes:
+its median, and where it lies with 95 %. Shaded: the tolerance, {{ facts.tolerance }}.</p>
 """
     + DEVIATIONS
-    + """<h2>Other causes</h2>
+    + """{% if causes %}
+<h2>Other causes</h2>
 <p class="intro">What else than the mount could be wrong, and was tried.</p>
 <div class="sheet"><div class="scroll"><table>
 <tr><th>cause</th><th>found</th><th></th></tr>
@@ -100,17 +115,41 @@ its median, and where it lies with 95 %. Green: the tolerance, {{ result.toleran
 <td class="words">{{ message }}</td></tr>
 {% endfor %}
 </table></div></div>
-{% if result.notes %}
-<h2>Notes</h2>
-<ul>{% for note in result.notes %}<li>{{ note }}</li>{% endfor %}</ul>
 {% endif %}
+{% endmacro %}
+{% block main %}
+{% if verdict %}
+<p><span class="verdict {{ verdict }}">{{ verdict }}</span></p>
+{% endif %}
+<p class="said">{{ said }}</p>
+{% if rig %}
+<p class="intro">{{ legend|safe }}</p>
+<div class="rig">
+<div class="grid">{% for drawing, caption in drawings %}<figure>{{ drawing|safe }}<figcaption>{{ caption }}</figcaption></figure>
+{% endfor %}</div>
+{% for caption, table in tables %}
+<div class="part"><h2>{{ caption }}</h2>{{ table|safe }}</div>
+{% endfor %}
+</div>
+{% for name, verdict, rows, causes, mended in parts %}
+<details><summary>{{ name }}: {{ verdict }}</summary>{{ judged(rows, causes, mended) }}</details>
+{% endfor %}
+{% else %}
+{{ judged(*parts[0][2:]) }}
+{% endif %}
+{% if notes %}
+<h2>Notes</h2>
+<ul>{% for note in notes %}<li>{{ note }}</li>{% endfor %}</ul>
+{% endif %}
+{% if pictures %}
 <h2>Frames</h2>
-<p class="intro">{{ "Before: as given. After: as the scenes show it." if both else "The extrinsic as given." }}
-Points are coloured by depth, near ones warm.</p>
+<p class="intro">{{ compared }} Points are coloured by depth, near ones warm.</p>
 """
     + SHEET
-    + "{% endblock %}\n"
+    + "{% endif %}\n{% endblock %}\n"
 )
+Part = tuple[str, str, list[dict[str, object]], list[tuple[str, str, str]], bool]  # name, verdict, rows, causes, what was mended
+SHOWS = "Before: as given. After: as the scenes show it."
 
 
 def write_report(path: str | Path, checked: Checked) -> None:
@@ -118,34 +157,100 @@ def write_report(path: str | Path, checked: Checked) -> None:
     be written."""
     result, frames, config = checked.result, checked.frames, checked.config
     facts = {
-        "recording": checked.source,
         "extrinsic": f"T_{result.camera_frame}_{result.lidar_frame}",
         "frames": f"{result.frames_used} of {len(result.frame_names)} used",
         "time": f"{result.elapsed_s:.1f} s ({result.cpu_s:.1f} s of CPU)",
         "checked": result.stamp,
+        "tolerance": str(result.tolerance),
     }
     shown = [frames[k] for k in spread_positions(PICTURES, len(frames))]
-    pictures = [(frame.name, picture_of(frame, result.T_checked, result.T_estimated, config)) for frame in shown]
-    write_page(
-        path,
-        page_template(TEMPLATE),
-        config,
-        result.tolerance,
-        command="check",
-        title=f"Check of {checked.source}",
-        facts=facts,
-        result=result,
-        rows=deviation_rows(result, result.tolerance),
-        causes=[(f.cause.words, f.state.value, f.message) for f in result.causes],
-        pictures=pictures,
-        both=result.T_estimated is not None,
-    )
+    pictures = [(f"frame {own.name}", picture_of(own, result.T_checked, result.T_estimated, config)) for own in shown]
+    part = _part("", result.verdict.value, result, result.tolerance)
+    more: dict[str, Any] = {
+        "compared": "The extrinsic as given." if result.T_estimated is None else SHOWS,
+        "verdict": result.verdict.value,
+    }
+    _write(path, checked.source, config, facts, pictures, said=result.reason, notes=result.notes, parts=[part], **more)
+
+
+def write_rig_check(path: str | Path, found: RigCheck, config: Config) -> None:
+    """The same of a rig: its sensors, its pairs one by one, and a frame of each camera with a LiDAR."""
+    sensors = []
+    for name, own in found.sensors.items():
+        kind, sizes = CAMERA if name in found.cameras else LIDAR, (own.judgement.rotation, own.judgement.translation)
+        error = ", ".join(size.words for size in sizes if size.is_known and size.words not in own.reason)
+        verdict = own.verdict.value
+        sensors.append(SensorShown(name, kind, found.given[name], verdict, own.reason, usable=None, error=error))
+    edges = []
+    for p in found.pairs:
+        rotation, translation = p.judgement.rotation, p.judgement.translation
+        size = (rotation.error, translation.error) if rotation.is_known else None
+        edges.append(EdgeShown(p.target, p.source, p.kind, p.verdict.value, html.LEVELS[p.verdict.value], p.reason, size))
+    loops = tuple(LoopShown(tuple(own.sensors), *own.size, own.p_value, own.closes) for own in found.solution.loops)
+    rig = RigShown(found.solution.reference, tuple(sensors), tuple(edges), loops, found.reason)
+    parts = [_part(f"{p.target} with {p.source}", p.verdict.value, p.check, found.tolerance) for p in found.pairs if p.check]
+    pictures = [
+        (f"{p.target} with {p.source}", picture_of(p.frame, p.check.T_checked, p.check.T_estimated, config))
+        for p in found.pairs
+        if p.frame is not None and p.check is not None
+    ]
+    more: dict[str, Any] = {"verdict": found.verdict.value, "compared": SHOWS, "notes": found.notes, "parts": parts}
+    _write(path, found.source, config, {"tolerance": str(found.tolerance)}, pictures, rig, **more)
+
+
+def write_rig(path: str | Path, report: RigReport, measurer: RigMeasurer) -> None:
+    """The page of a result of `calib-ros rig`, with a picture of every camera by the prior and by the solution."""
+    known, solution, pictures = measurer.solution([]), report.solution, []
+    for camera in report.cameras:
+        seen = [m.source for m in report.measured if m.target == camera]
+        with suppress(CalibrationError):  # the reason is in the table of edges
+            lidar = (seen or measurer.description.lidars)[0]
+            source = measurer.rig.pair(camera, lidar)
+            ends = known.between(camera, lidar)[0], solution.between(camera, lidar)[0]
+            pictures.append((f"{camera} with {lidar}", picture_of(source[len(source) // 2], *ends, measurer.config_of(camera))))
+    facts = {"tolerance": f"{report.limits.tolerance_deg:g} deg / {100 * report.limits.tolerance_m:g} cm"}
+    more: dict[str, Any] = {"compared": "Before: by the priors. After: as estimated.", "parts": [], "command": "rig", "notes": []}
+    _write(path, report.source, measurer.config, facts, pictures, html.of_report(report), **more)
+
+
+def rig_page(path: str | Path) -> Callable[[RigReport, RigMeasurer], None]:
+    """What writes the page of a result to `path`; raises as of `check_report`."""
+    check_report(path)
+    return partial(write_rig, path)
+
+
+def _write(
+    path: str | Path,
+    source: str,
+    config: Config,
+    facts: Mapping[str, str],
+    pictures: Sequence[tuple[str, bytes]],
+    rig: RigShown | None = None,
+    command: str = "check",
+    **shown: Any,
+) -> None:
+    facts = {"recording": source, **facts, "version": VERSION}
+    if rig is not None:
+        facts["sensors"] = f"{len(rig.cameras)} cameras, {len(rig.lidars)} LiDARs, in the frame of {rig.reference}"
+        captions = "what was measured between the sensors", "the sensors from above, and where each looks"
+        shown["drawings"] = list(zip((html.graph_svg(rig), html.plan_svg(rig)), captions, strict=True))
+        shown["tables"] = [("Sensors", html.sensors_html(rig)), ("Edges", html.edges_html(rig)), ("Loops", html.loops_html(rig))]
+        shown |= {"legend": html.legend(), "said": rig.text}
+    name = re.split("[:,]", source.rstrip("/").rpartition("/")[2])[0] or source  # of a synthetic one without its settings
+    title = f"{'Rig' if command == 'rig' else 'Check'} of {name}"
+    values = {"verdict": "", "command": command, "title": title, "pictures": pictures, "rig": rig, **shown}
+    write_page(path, page_template(TEMPLATE), config, facts, **values)
 
 
 def check_report(path: str | Path) -> None:
     """What `write_report` would find out too late: MissingDependencyError, or BadInputError for a file that cannot be written."""
     page_template(TEMPLATE)
     check_output(path, "--report")
+
+
+def _part(name: str, verdict: str, check: CheckResult, tolerance: Tolerance) -> Part:
+    causes = [(own.cause.words, own.state.value, own.message) for own in check.causes]
+    return name, verdict, deviation_rows(check, tolerance), causes, check.cause is not None
 
 
 def deviation_rows(found: CheckResult | Judgement, tolerance: Tolerance) -> list[dict[str, object]]:
@@ -156,7 +261,7 @@ def deviation_rows(found: CheckResult | Judgement, tolerance: Tolerance) -> list
 def _row(own: Deviation, tolerance: Tolerance) -> dict[str, object]:
     is_angle = own.name in ("rotation", "rx", "ry", "rz")
     limit = tolerance.deg if is_angle else tolerance.m
-    known, said = bool(np.isfinite(own.error)), amount if own.name in ("rotation", "translation") else signed
+    known, said = own.is_known, amount if own.name in ("rotation", "translation") else signed
     return {
         "name": LONG_NAMES[own.name],
         "verdict": own.verdict.value,

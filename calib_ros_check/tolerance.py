@@ -193,17 +193,16 @@ def reason_of(
     judgement: Judgement, tolerance: Tolerance, cause: CauseFinding | None, possible: Sequence[CauseFinding] = ()
 ) -> str:
     """The verdict in one line, for people."""
-    limits = f"{tolerance.deg:g} deg / {100 * tolerance.m:g} cm"
     sizes = f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
     if cause is not None:
-        return f"{cause.message}; {_THEN[judgement.verdict].format(limits=limits, sizes=sizes)}"
+        return f"{cause.message}; {_THEN[judgement.verdict].format(limits=tolerance, sizes=sizes)}"
     if judgement.verdict is CheckVerdict.PASS:
-        return f"right to within {limits}: {sizes}"
+        return f"right to within {tolerance}: {sizes}"
     axes = [axis.words for axis in _worst(judgement)]
     if judgement.verdict is CheckVerdict.FAIL:
-        return "; ".join([f"{'; '.join(axes) or sizes}: more than {limits}", *(f"or else {own.message}" for own in possible)])
+        return "; ".join([f"{'; '.join(axes) or sizes}: more than {tolerance}", *(f"or else {own.message}" for own in possible)])
     names = ", ".join(f"{axis.name} {axis.words}" for axis in _worst(judgement)) or sizes
-    return f"the scenes do not tell it to within {limits}: {names}; {MORE_FRAMES}"
+    return f"the scenes do not tell it to within {tolerance}: {names}; {MORE_FRAMES}"
 
 
 def amount(value: float, is_angle: bool) -> str:

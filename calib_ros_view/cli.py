@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -15,24 +18,27 @@ from calib_ros.datasets.rig import open_rig
 from calib_ros.errors import BadInputError
 from calib_ros.io import check_output
 from calib_ros.registration.progress import Progress
-from calib_ros.rig.description import read_rig
+from calib_ros.rig.description import RigDescription, read_rig
 from calib_ros.rig.edges import priors_of
 from calib_ros.rig.graph import solve
+from calib_ros.rig.report import load
 from calib_ros.runtime import return_freed_memory
+from calib_ros_check.rig.shown import RigShown, of_priors, of_result
 from calib_ros_view.session.rig_session import RigSession
-from calib_ros_view.session.rig_shown import of_priors, of_result
 from calib_ros_view.session.session import Session
-from calib_ros_view.web.server import Address, Pictures, listening, require_nicegui, serve
+from calib_ros_view.web.server import RIG, Address, Opened, Opening, Pictures, listening, require_nicegui, serve
 
 FRAMES = 10  # of a source, unless said otherwise
 OUT = "extrinsic.json"
 TITLE = "calib-ros view"
-PAIR = "/pair/{camera}/{lidar}"  # of a rig
 OF_ONE_PAIR = ("yaw_deg", "camera", "image_topic", "points_topic", "camera_info_topic", "rectified")
 OF_SOURCES = (
     *("source", "rig", "initial", "yaw_deg", "config", "frames", "out"),
     *("camera", "image_topic", "points_topic", "camera_info_topic", "rectified", "clock", "incomplete"),
 )
+
+
+Shown = tuple[str, Callable[[], None], Opening | None]  # title, builds the page for a browser, opens those of a rig's pairs
 
 
 def view(args: argparse.Namespace) -> None:
@@ -41,78 +47,84 @@ def view(args: argparse.Namespace) -> None:
         raise BadInputError("nothing to view: name a source (a recording), or a running node with --node /calib_ros")
     require_nicegui()
     return_freed_memory()  # before there are threads: pictures and features of many sizes left gaps of half a gigabyte
-    address = Address(args.host, args.port, args.token)
+    address, pictures = Address(args.host, args.port, args.token), Pictures()
     listening(address).close()  # before frames are read for nothing
-    if args.node is not None:
-        _view_node(args, address)
-        return
-    if args.rig is not None:
-        _view_rig(args, address)
-        return
-    session = _session(args)
-    from calib_ros_view.session.jobs import SessionJobs
-    from calib_ros_view.web.source_page import SourcePage
+    made = _of_node if args.node is not None else _of_rig if args.rig is not None else _of_source
 
-    jobs, pictures = SessionJobs(session), Pictures()
-    ready = partial(_ready, opened=args.open)
-    serve(lambda: SourcePage(session, jobs, pictures).build(), TITLE, address, pictures.routes, ready, jobs.close)
+    def ready(url: str) -> None:
+        print(f"open {url} (Ctrl-C ends)", flush=True)
+        if args.open and not webbrowser.open(url):
+            print("no browser found here", file=sys.stderr)
+
+    with made(args, pictures) as (title, page, opening):
+        serve(page, title, address, pictures, ready, opening)
 
 
-def _view_node(args: argparse.Namespace, address: Address) -> None:
-    """Serve the page of a running node."""
-    given = [name.replace("_", "-") for name in OF_SOURCES if getattr(args, name)]
-    if given:
-        raise BadInputError(f"--node watches a running node: leave out {', '.join(given)}, which only a source can have")
-    from calib_ros_view.node.rig_watch import RigWatch
+def _refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
+    """BadInputError where any of the options is given. why: with the place of their names."""
+    if given := [name.replace("_", "-") for name in options if getattr(args, name)]:
+        raise BadInputError(why.format(", ".join(given)))
+
+
+@contextmanager
+def _of_node(args: argparse.Namespace, pictures: Pictures) -> Iterator[Shown]:
+    """A running node, of a pair or a rig."""
+    _refuse(args, OF_SOURCES, "--node watches a running node: leave out {}, which only a source can have")
     from calib_ros_view.node.watch import Watch
-    from calib_ros_view.web.live_page import LivePage
-    from calib_ros_view.web.pair_pages import RIG, Opened, PairPages
-    from calib_ros_view.web.rig_page import RigPage
+    from calib_ros_view.web.live_page import Gallery, live_page
 
-    pictures = Pictures()
     with Watch(args.node) as watch:
-        feed = RigWatch(watch)
 
         def opening(camera: str, lidar: str) -> Opened:
-            if (camera, lidar) not in feed.pairs:
-                raise BadInputError(f"{feed.name} has no pair of {camera} and {lidar}; open one that its page lists")
-            own = Watch(f"{feed.name}/{camera}/{lidar}")
-            return LivePage(own, pictures, RIG).page, own.close
+            if (camera, lidar) not in watch.pairs:
+                raise BadInputError(f"{watch.name} has no pair of {camera} and {lidar}; open one that its page lists")
+            own = Watch(f"{watch.name}/{camera}/{lidar}")
+            return partial(live_page, own, pictures, Gallery(own, pictures), RIG), own.close
 
-        live, pairs = LivePage(watch, pictures, other=lambda: feed.rig is not None), PairPages(opening)
-        serve(
-            lambda: live.page() if feed.rig is None else RigPage(feed, pictures).build(),
-            *(f"{watch.name} · {TITLE}", address, pictures.routes, partial(_ready, opened=args.open), pairs.close),
-            others={PAIR: pairs.page},
-        )
+        yield f"{watch.name} · {TITLE}", partial(live_page, watch, pictures, Gallery(watch, pictures)), opening
 
 
-def _view_rig(args: argparse.Namespace, address: Address) -> None:
-    """Serve the page of a recording of several sensors."""
-    given = [name.replace("_", "-") for name in OF_ONE_PAIR if getattr(args, name)]
-    if given:
-        raise BadInputError(f"--rig says what {', '.join(given)} would: leave them out, and set them in {args.rig}")
+@contextmanager
+def _of_rig(args: argparse.Namespace, pictures: Pictures) -> Iterator[Shown]:
+    """A recording of several sensors."""
+    _refuse(args, OF_ONE_PAIR, f"--rig says what {{}} would: leave them out, and set them in {args.rig}")
     from calib_ros_view.session.jobs import SessionJobs
-    from calib_ros_view.web.pair_pages import RIG, Opened, PairPages
-    from calib_ros_view.web.rig_page import RigPage
+    from calib_ros_view.web.live_page import live_page
     from calib_ros_view.web.source_page import SourcePage
 
     config, description = configuration(args.config, preset_name=args.preset), read_rig(args.rig)
     out = Path(args.out or OUT)
     check_output(str(out), "--out")
-    rig = None if args.initial is None else of_result(args.initial, description)  # before frames are read for nothing
+    rig = None if args.initial is None else _result(args.initial, description)  # before frames are read for nothing
     source = open_rig(args.source, description, **bag_options(args))
     rig = rig or of_priors(description, solve([], priors_of(description, source), description.reference))
-    pictures, session = Pictures(), RigSession(source, description, rig, config, args.frames, out)
+    session = RigSession(source, description, rig, config, args.frames, out)
 
     def opening(camera: str, lidar: str) -> Opened:
         own = session.session(camera, lidar)
         jobs = SessionJobs(own)
         return lambda: SourcePage(own, jobs, pictures, RIG).build(), jobs.close
 
-    pairs, ready = PairPages(opening), partial(_ready, opened=args.open)
-    build, title = lambda: RigPage(session, pictures).build(), f"{source.name} · {TITLE}"
-    serve(build, title, address, pictures.routes, ready, pairs.close, {PAIR: pairs.page})
+    yield f"{source.name} · {TITLE}", partial(live_page, session, pictures), opening
+
+
+@contextmanager
+def _of_source(args: argparse.Namespace, pictures: Pictures) -> Iterator[Shown]:
+    """A recording of a pair."""
+    session = _session(args)
+    from calib_ros_view.session.jobs import SessionJobs
+    from calib_ros_view.web.source_page import SourcePage
+
+    with closing(SessionJobs(session)) as jobs:
+        yield TITLE, lambda: SourcePage(session, jobs, pictures).build(), None
+
+
+def _result(path: str, description: RigDescription) -> RigShown:
+    """What `calib-ros rig --json` wrote. BadInputError for another file, or one of other sensors."""
+    solution = load(path)
+    if set(solution.poses) != {sensor.name for sensor in description.sensors} or solution.reference != description.reference:
+        raise BadInputError(f"{path} is of {', '.join(solution.poses)}, not of the sensors of --rig; give a result of this rig")
+    return of_result(json.loads(Path(path).read_text(encoding="utf-8")), solution)
 
 
 def _session(args: argparse.Namespace) -> Session:
@@ -137,9 +149,3 @@ def _session(args: argparse.Namespace) -> Session:
     for line in session.scores.notes:
         note(line)
     return session
-
-
-def _ready(url: str, opened: bool) -> None:
-    print(f"open {url} (Ctrl-C ends)", flush=True)
-    if opened and not webbrowser.open(url):
-        print("no browser found here", file=sys.stderr)

@@ -8,9 +8,9 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from calib_ros import extensions
 from calib_ros.cli.arguments import BAD_INPUT, parser
 from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros.extensions import commands
 
 OK, NOT_CONVERGED = 0, 1
 # Libraries that only some commands need, and how to get them.
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(given: Sequence[str]) -> int:
     """The command that is given, or the version."""
-    others = commands()
+    others = extensions.commands()
     options = parser(others)
     args = options.parse_args(given)
     args.given = given
@@ -110,7 +110,7 @@ def _rig(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import configuration
     from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
     from calib_ros.datasets.rig import open_rig
-    from calib_ros.io import check_output, write_atomically
+    from calib_ros.io import check_output
     from calib_ros.rig.description import read_rig
     from calib_ros.rig.edges import RigMeasurer
     from calib_ros.rig.report import RigReport, check_out, load
@@ -122,8 +122,9 @@ def _rig(args: argparse.Namespace) -> int:
         raise BadInputError(f"--before {args.before} is of other sensors ({names}) than {args.rig}; give a result of this rig")
     config = configuration(args.config, args.seed)
     check_json(args.json)
-    if args.report is not None:
-        check_output(args.report, "--report")
+    if args.report is not None and "rig" not in extensions.names(extensions.PAGES):
+        raise BadInputError("--report needs calib_ros_check, which this installation leaves out")
+    write_page = None if args.report is None else extensions.load(extensions.PAGES, "rig")(args.report)
     for path in args.out:
         check_out(path)
         check_output(path, "--out")
@@ -133,8 +134,8 @@ def _rig(args: argparse.Namespace) -> int:
         measured = measurer.measure()
     report = RigReport.of(measurer, measured, before)
     print_or_save(report, report.text(), args.json)
-    if args.report is not None:
-        write_atomically(args.report, report.html().encode())
+    if write_page is not None:
+        write_page(report, measurer)
     for path in args.out:
         if remark := report.write(path):
             note(f"calib-ros: {remark}")

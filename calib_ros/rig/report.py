@@ -1,4 +1,4 @@
-"""What is told of a rig: the result as JSON, in words, as a page, and in the files of other tools."""
+"""What is told of a rig: the result as JSON, in words, and in the files of other tools."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import RefineConfig
 from calib_ros.errors import BadInputError
 from calib_ros.result import CONSUMERS_SIGMAS, CONVERGED, INSUFFICIENT, REFUSED, VERSION, Consumer
-from calib_ros.rig.description import CAMERA, RigDescription
+from calib_ros.rig.description import RigDescription
 from calib_ros.rig.edges import Measurement, RigMeasurer
 from calib_ros.rig.graph import PRIOR, Edge, Loop, RigSolution, at_sensor, joined_to, worst_sigmas
 from calib_ros.rig.moved import RigHypothesis, hypotheses, verdict
@@ -209,32 +208,6 @@ class RigReport:
             aligned = ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in [header, *rows]]
             lines += [caption, *aligned] if rows else []
         return "\n".join([*lines, *([] if self.before is None else [f"Since the former result: {self.changes[1]}"])])
-
-    def html(self) -> str:
-        """A page that needs nothing from elsewhere: the rig from above, and the tables."""
-        # The sensors from above, x of a LiDAR reference to the right, with edges and where each looks.
-        poses = self.solution.poses
-        xy = np.array([T[:2, 3] for T in poses.values()])
-        low, size = xy.min(axis=0) - 0.6, float(np.ptp(xy, axis=0).max()) + 1.2
-        at = {name: (100 * (T[:2, 3] - low) / size * [1, -1] + [0, 100]).round(2) for name, T in poses.items()}
-        lines = [(at[e.target], at[e.source], "#999") for e in self.solution.edges]
-        for name, T in poses.items():
-            ahead = T[:2, 2] if self.description[name].kind == CAMERA else T[:2, 0]
-            lines.append((at[name], (at[name] + 6 * ahead * [1, -1]).round(2), "#06c"))
-        svg = [f'<line x1="{a[0]}" y1="{a[1]}" x2="{b[0]}" y2="{b[1]}" stroke="{c}" stroke-width=".5"/>' for a, b, c in lines]
-        svg += [f'<circle cx="{p[0]}" cy="{p[1]}" r="1"/><text x="{p[0] + 2}" y="{p[1]}" font-size="3">{escape(n)}</text>'
-                for n, p in at.items()]  # fmt: skip
-        drawing = f'<svg viewBox="0 0 130 100" width="640" height="480">{"".join(svg)}</svg>'
-        parts = [f"<h1>Rig of {escape(self.source)}</h1>", drawing]
-        for caption, header, rows in self.tables():
-            cells = [
-                "".join(f"<{tag}>{escape(c)}</{tag}>" for c in row) for tag, row in [("th", header), *(("td", r) for r in rows)]
-            ]
-            parts.append(f"<h2>{escape(caption)}</h2><table>{''.join(f'<tr>{c}</tr>' for c in cells)}</table>")
-        if self.before is not None:
-            parts.append(f"<p>Since the former result: {escape(self.changes[1])}</p>")
-        style = "body{font-family:sans-serif;margin:2em}tr:first-child{font-weight:bold}td{padding:.2em .8em}"
-        return f'<!doctype html><meta charset="utf-8"><title>Rig</title><style>{style}</style>{"".join(parts)}\n'
 
     def has_changed(self, before: RigReport) -> bool:
         """Whether a sensor is elsewhere than before: by more than its standard deviation in one of the six directions."""

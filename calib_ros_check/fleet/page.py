@@ -194,10 +194,9 @@ def write_fleet_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Map
         path,
         page_template(TEMPLATE),
         checks.config,
-        checks.tolerance,
+        {"tolerance": str(checks.tolerance), "extrinsic": checks.extrinsic},
         command="certify" if certificates else "check",
         title=title,
-        facts={"extrinsic": checks.extrinsic},
         details={**_details(fleet, options.false_alarms), **facts},
         what=what,
         caption=caption,
@@ -237,7 +236,7 @@ def pictures_of(own: Certificate, options: CheckOptions) -> list[tuple[str, byte
         positions = positions_of(source, options)
         few = [positions[k] for k in spread_positions(PICTURES, len(positions))]
         frames = read_frames(source, few, options.config, lambda share: None, None)[0]
-        return [(frame.name, picture_of(frame, own.T_checked, own.T_found, options.config)) for frame in frames]
+        return [(f"frame {frame.name}", picture_of(frame, own.T_checked, own.T_found, options.config)) for frame in frames]
     except CalibrationError:
         return []
 

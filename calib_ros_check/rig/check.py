@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,8 @@ class RigCheck:
     solution: RigSolution
     blame: Blame
     source: str = ""
-    notes: Sequence[str] = field(default_factory=tuple)
+    notes: Sequence[str] = ()
+    cameras: Sequence[str] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, None for what is not known; docs/rig.md."""
@@ -218,7 +219,7 @@ def judged(
     notes += [f"{e.name} may be wrong: it cannot be told which of several pairs is" for e in solution.doubted]
     ordered = {s.name: sensors[s.name] for s in description.sensors}
     verdict, reason = _verdict(ordered, pairs, found, tolerance)
-    return RigCheck(verdict, reason, tolerance, known.poses, ordered, pairs, solution, found, source, notes)
+    return RigCheck(verdict, reason, tolerance, known.poses, ordered, pairs, solution, found, source, notes, description.cameras)
 
 
 def _check_pair(measurer: RigMeasurer, camera: str, lidar: str, known: RigSolution, tolerance: Tolerance) -> PairCheck:
@@ -310,7 +311,6 @@ def _of_anchor(anchor: str, others: Mapping[str, SensorCheck], wrong: str) -> Se
 def _verdict(
     sensors: Mapping[str, SensorCheck], pairs: Sequence[PairCheck], found: Blame, tolerance: Tolerance
 ) -> tuple[CheckVerdict, str]:
-    limits = f"{tolerance.deg:g} deg / {100 * tolerance.m:g} cm"
     failed = {name: own for name, own in sensors.items() if own.verdict is FAIL}
     if failed:
         told = [own.reason if own.reason in found.lines else f"{name}: {own.reason}" for name, own in failed.items()]
@@ -320,5 +320,5 @@ def _verdict(
         return INCONCLUSIVE, f"{', '.join(against)} alone would fail, but the other pairs contradict it; {MORE_FRAMES}"
     untold = [name for name, own in sensors.items() if own.verdict is INCONCLUSIVE]
     if untold:
-        return INCONCLUSIVE, f"the scenes do not tell to within {limits} whether {', '.join(untold)} is right; {MORE_FRAMES}"
-    return PASS, f"all {len(sensors)} sensors are right to within {limits}"
+        return INCONCLUSIVE, f"the scenes do not tell to within {tolerance} whether {', '.join(untold)} is right; {MORE_FRAMES}"
+    return PASS, f"all {len(sensors)} sensors are right to within {tolerance}"

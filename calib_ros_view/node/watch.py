@@ -1,68 +1,57 @@
-"""A client that watches one node and calls its services, for pages that show it. It survives the node's restart."""
+"""What one node says, of a pair or of a whole rig, for pages that show it; pictures and clouds only while somebody looks."""
 
 from __future__ import annotations
 
 import itertools
-import threading
+import re
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
-import rclpy
-from action_msgs.msg import GoalStatus
-from calib_ros_msgs.action import Calibrate
+import numpy as np
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
-from calib_ros_msgs.srv import Check, GetExtrinsic, GetKeyframes
+from calib_ros_msgs.msg import Rig
+from calib_ros_msgs.srv import GetKeyframes
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.action import ActionClient
-from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
+from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Image
-from std_srvs.srv import Trigger
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Image, PointCloud2
 
-from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros.messages import decode_image
+from calib_ros.arrays import Matrix
+from calib_ros.errors import CalibrationError
+from calib_ros.messages import decode_cloud, decode_image
+from calib_ros.result import CONVERGED, INITIAL, MOVED, Result
+from calib_ros.rig.description import CAMERA, LIDAR
+from calib_ros.rig.graph import at_sensor, worst_sigmas
 from calib_ros.ros.client import result_from_message
-from calib_ros.ros.conversions import advice_of
-from calib_ros.ros.dds import use_large_message_profile
-from calib_ros_view.session.live import BAD, GOOD, NEUTRAL, Diagnosis, LiveHistory, NodeState, Presence
+from calib_ros.ros.conversions import advice_of, covariance_from_ros, matrix_from_transform
+from calib_ros_check.rig.shown import (
+    BAD,
+    DOUBTED,
+    DOUBTFUL,
+    LEVELS,
+    REJECTED,
+    EdgeShown,
+    LoopShown,
+    RigShown,
+    SensorShown,
+    compared,
+)
+from calib_ros_view.node.calls import NodeClient
+from calib_ros_view.session.live import SILENT_S, Diagnosis, NodeState, Pair
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-CALIBRATE, RESET, SAVE, CAPTURE, CHECK, GET_EXTRINSIC, KEYFRAMES = (
-    "calibrate", "reset", "save", "capture", "check", "get_extrinsic", "keyframes"
-)  # fmt: skip
-# Service -> type, and s without an answer, or a sign of progress, after which it is taken for lost: a search or a check of 20
-# keyframes takes 20 s on a busy machine. ~/calibrate is an action here, which tells how far it is and can be stopped.
-SERVICES: dict[str, tuple[Any, float]] = {
-    CALIBRATE: (Calibrate, 120.0),
-    RESET: (Trigger, 10.0),
-    SAVE: (Trigger, 10.0),
-    CAPTURE: (Trigger, 60.0),
-    CHECK: (Check, 180.0),
-    GET_EXTRINSIC: (GetExtrinsic, 10.0),
-    KEYFRAMES: (GetKeyframes, 15.0),
-}
-QUIET = (GET_EXTRINSIC, KEYFRAMES)  # what pages ask by themselves is no event
-NOT_TAKEN = "the node takes no requests now: it is not active, or about to end"
-STOPPED = "stopped before the estimate was done"
-TOO_LATE = "~/calibrate could not be stopped any more: its estimate is done"
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+CLOUD = "sensor_msgs/msg/PointCloud2"
+KIND = "registration"
 OVERLAY_WIDTH, OVERLAY_QUALITY = 1600, 82  # px at most; of the JPEG
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What a service has said. response: its message, None without an answer."""
-
-    success: bool
-    message: str
-    response: Any = None
-    seconds: float = 0.0
+TILE_WIDTH = 480  # px
+VIEW_DEG = (32.0, 20.0)  # half of what a camera sees, across and upwards, where its intrinsics are not known
+PATIENCE_S = 10.0  # in which a picture or a cloud comes, or the next one's turn is
+LOOK_S = 4.0  # after which a page that does not say so again is not looked at any more
+NOT_HEARD = "The node is not heard any more; this is the last known."
 
 
 @dataclass(frozen=True)
@@ -74,290 +63,72 @@ class Overlay:
     number: int = 0
 
 
-@dataclass(eq=False)
-class _Call:
-    """future: of the client, once request or goal is sent. handle: of a goal that was taken. stage, share: how far it is, 0..1.
-    to_stop: as soon as it is taken."""
+class Watch(NodeClient):
+    """Subscribes to one node; what it says of a pair is in `history`. The overlay, which the node draws for subscribers only,
+    comes while somebody looks.
 
-    name: str
-    answer: Future[Answer]
-    began: float
-    deadline: float
-    future: Any = None
-    handle: Any = None
-    stage: str = ""
-    share: float = 0.0
-    to_stop: bool = False
-
-
-class Watch:
-    """Subscribes to one node on a thread of its own. Use as a context manager; everything but `history` is thread-safe, which is
-    to be read under `lock`.
-
-    node_name: fully qualified, as /calib_ros. The overlay is subscribed to only between look() and leave(), since the node draws
-    it only for subscribers. Answers that a page does not wait for any more become events of the history all the same.
+    rig: what a node with a rig says of its sensors, None for one of a pair. See `RigSession` for tiles, which are of pairs here,
+    clouds, version and problem. A tile is the newest keyframe of a pair, which the node draws on request; while somebody looks, a
+    second apart one of them is asked for, and one of the clouds that the node itself listens to is received.
     """
 
-    def __init__(self, node_name: str) -> None:
-        self.name = "/" + node_name.strip("/")
-        if self.name == "/" or not all(part.isidentifier() for part in self.name.strip("/").split("/")):
-            raise BadInputError(f"--node {node_name} is no name of a ROS node; write it as /calib_ros or /left/calib_ros")
-        use_large_message_profile()
-        self.lock = threading.RLock()
-        self.history = LiveHistory()
-        self.overlay = Overlay()
-        self.answers: dict[str, tuple[float, Answer]] = {}  # the newest of each service, and when it came
-        self._context = Context()
-        rclpy.init(context=self._context)
-        self.domain_id: int = self._context.get_domain_id()
-        self._node = rclpy.create_node(f"calib_ros_view_{time.time_ns() % 10**6}", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        node = self._node
-        node.create_subscription(ExtrinsicMsg, f"{self.name}/extrinsic", self._on_extrinsic, LATCHED)
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-        self._clients_of = {
-            name: node.create_client(kind, f"{self.name}/{name}") for name, (kind, _) in SERVICES.items() if name != CALIBRATE
-        }
-        self._calibrate: ActionClient[Any, Any, Any] = ActionClient(node, Calibrate, f"{self.name}/{CALIBRATE}")
-        node.create_timer(0.25, self._every_quarter)
+    def listen(self) -> None:
+        """See `NodeClient`."""
+        self.overlay, self.problem, self.version = Overlay(), "", 0
+        self.rig: RigShown | None = None
+        self.tiles: dict[str, bytes] = {}
+        self.clouds: dict[str, NDArray[np.float32]] = {}
         self._overlay_subscription: Any = None
-        self._lookers: set[int] = set()
-        self._ids = itertools.count(1)
-        self._calls: list[_Call] = []
-        self._jobs: list[Callable[[], None]] = []
-        self._closed = False
-        self._thread = threading.Thread(target=self._spin, name="calib_watch", daemon=True)
-        self._thread.start()
+        self._looked, self._heard = -LOOK_S, 0.0
+        self._message: Rig | None = None
+        self._pairs: dict[Pair, tuple[Result, bool] | None] = {}  # what each has said, and whether it is usable
+        self._clients: dict[Pair, Any] = {}
+        self._turns, self._cloud_turns = itertools.count(), itertools.count()
+        self._asked: tuple[Any, Any, float] | None = None  # client, future, since when
+        self._cloud: tuple[Any, float] | None = None  # subscription, since when
+        self._had_cloud = False
+        self._node.create_subscription(ExtrinsicMsg, f"{self.name}/extrinsic", self._on_extrinsic, LATCHED)
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self._node.create_subscription(Rig, f"{self.name}/rig", self._on_rig, LATCHED)
+        self._node.create_timer(1.0, self._every_second)
 
     def __enter__(self) -> Watch:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the thread and leave ROS; calls under way are answered that the viewer ends."""
-        with self.lock:
-            if self._closed:
-                return
-            self._closed = True
-            calls, self._calls = self._calls, []
-        for call in calls:
-            call.answer.set_result(Answer(False, "the viewer ends; the node goes on with what it was asked for"))
-        self._executor.shutdown(timeout_sec=1.0)
-        rclpy.try_shutdown(context=self._context)
-        self._thread.join(5.0)
-        with suppress(Exception):  # the context is gone, and with it what the node held
-            self._node.destroy_node()
-
-    # ---- pages --------------------------------------------------------------------------------------------------------
-
-    def look(self) -> int:
-        """Somebody looks at the overlay; returns what leave() needs."""
-        with self.lock:
-            looker = next(self._ids)
-            self._lookers.add(looker)
-            return looker
-
-    def leave(self, looker: int) -> None:
-        """That one does not look any more; more than once does no harm."""
-        with self.lock:
-            self._lookers.discard(looker)
-
     @property
-    def busy(self) -> frozenset[str]:
-        """Services that are being called."""
-        with self.lock:
-            return frozenset(call.name for call in self._calls)
+    def pairs(self) -> list[Pair]:
+        """Cameras and LiDARs that have been heard of."""
+        return list(self._pairs)
 
-    @property
-    def progress(self) -> tuple[str, float] | None:
-        """Stage of the calibration under way and the share of it that is done, 0..1; None if none is."""
-        with self.lock:
-            return next(((call.stage, call.share) for call in self._calls if call.name == CALIBRATE), None)
+    def pairs_of(self, tile: str) -> list[Pair]:
+        """See `RigSession`."""
+        return [pair for pair in self.pairs if "/".join(pair) == tile]
 
-    def stop(self) -> bool:
-        """Ask the node to stop the calibration that was asked for here; False if none is under way."""
-        with self.lock:
-            found = [call for call in self._calls if call.name == CALIBRATE]
-            if found:
-                self._jobs.append(lambda: self._stop(found[0]))
-        self._executor.wake()
-        return bool(found)
+    def corners(self, camera: str) -> Matrix:
+        """See `RigSession`; the node does not say what a camera sees."""
+        u, v = np.tan(np.deg2rad(VIEW_DEG))
+        return np.array([[-u, -v, 1.0], [u, -v, 1.0], [u, v, 1.0], [-u, v, 1.0]])
 
-    def nodes_seen(self) -> list[str]:
-        """Fully qualified names of other nodes in this domain, sorted."""
-        try:
-            found = self._node.get_node_names_and_namespaces()
-        except Exception:  # closed meanwhile
-            return []
-        names = {f"{space.rstrip('/')}/{name}" for name, space in found}
-        return sorted(name for name in names if not name.startswith("/calib_ros_view_") and not name.startswith("/_"))
+    def look(self) -> None:
+        """Somebody looks; to be called again within LOOK_S."""
+        self._looked = time.monotonic()
 
-    def call(self, name: str, request: Any = None) -> Future[Answer]:
-        """Call a service of SERVICES. The answer always comes, and is never an exception: a node that is gone, or says nothing in
-        time, is one too. A service that is being called already is not called again."""
-        answer: Future[Answer] = Future()
-        with self.lock:
-            running = [call for call in self._calls if call.name == name]
-            if running and name in QUIET and not self._closed:
-                return running[0].answer
-            if running or self._closed:
-                why = "the viewer ends" if self._closed else f"~/{name} is being called already; wait for it"
-                answer.set_result(Answer(False, why))
-                return answer
-            now = time.monotonic()
-            call = _Call(name, answer, now, now + SERVICES[name][1])
-            self._calls.append(call)
-            self._jobs.append(lambda: self._begin(call, request))
-        if name not in QUIET:
-            self._note(f"~/{name} called", NEUTRAL)
-        self._executor.wake()
-        return answer
+    # ---- the thread, of a pair ----------------------------------------------------------------------------------------
 
-    def keyframes(self, count: int = 0, width: int = 0) -> Future[Answer]:
-        """Ask for pictures of the newest `count` keyframes (0 = all), at most `width` px wide (0 = 320)."""
-        return self.call(KEYFRAMES, GetKeyframes.Request(max_keyframes=count, max_width=width))
-
-    def on_its_thread(self, do: Callable[[Node], None]) -> None:
-        """Do something with the watch's own ROS node, on the thread that serves it."""
-        with self.lock:
-            self._jobs.append(lambda: do(self._node))
-        self._executor.wake()
-
-    # ---- the executor's thread ----------------------------------------------------------------------------------------
-
-    def _spin(self) -> None:
-        with suppress(ExternalShutdownException):
-            while not self._closed and self._context.ok():
-                try:
-                    self._executor.spin_once(timeout_sec=0.25)
-                    self._work()
-                except ExternalShutdownException:
-                    raise
-                except Exception as error:  # a page that silently stands still would be worse
-                    if self._context.ok():
-                        self._note(f"unexpected {type(error).__name__}: {error}", BAD)
-
-    def _work(self) -> None:
-        with self.lock:
-            jobs, self._jobs = self._jobs, []
-            wanted = bool(self._lookers) and not self._closed
-        for job in jobs:
-            job()
+    def work(self) -> None:
+        """See `NodeClient`."""
+        wanted = time.monotonic() - self._looked < LOOK_S and not self._closed
         if wanted and self._overlay_subscription is None:
             self._overlay_subscription = self._node.create_subscription(Image, f"{self.name}/overlay", self._on_overlay, 1)
         elif not wanted and self._overlay_subscription is not None:
             self._node.destroy_subscription(self._overlay_subscription)
             self._overlay_subscription = None
 
-    @contextmanager
-    def _answering(self, call: _Call) -> Iterator[None]:
-        """Whatever is raised is the answer."""
-        try:
-            yield
-        except Exception as error:
-            self._finish(call, Answer(False, f"{self.name}/{call.name} failed: {error}"))
-
-    def _begin(self, call: _Call, request: Any) -> None:
-        with self._answering(call):
-            if not self._is_there(call.name):
-                where = f"{self.name}/{call.name}"
-                self._finish(call, Answer(False, f"{where} is not there: the node is gone, not started or not configured"))
-            elif call.name == CALIBRATE:
-                call.future = self._calibrate.send_goal_async(
-                    Calibrate.Goal(), feedback_callback=lambda fed: self._feed(call, fed)
-                )
-                call.future.add_done_callback(lambda sent: self._taken(call, sent))
-            else:
-                client = self._clients_of[call.name]
-                call.future = client.call_async(SERVICES[call.name][0].Request() if request is None else request)
-                call.future.add_done_callback(lambda done: self._answered(call, done))
-
-    def _answered(self, call: _Call, future: Any) -> None:
-        with self._answering(call):
-            response = future.result()
-            self._finish(call, Answer(bool(response.success), str(response.message), response))
-
-    def _is_there(self, name: str) -> bool:
-        return bool(self._calibrate.server_is_ready() if name == CALIBRATE else self._clients_of[name].service_is_ready())
-
-    def _feed(self, call: _Call, message: Any) -> None:
-        with self.lock:
-            call.stage, call.share = str(message.feedback.stage), float(message.feedback.progress)
-            call.deadline = time.monotonic() + SERVICES[CALIBRATE][1]
-
-    def _taken(self, call: _Call, future: Any) -> None:
-        with self._answering(call):
-            handle = future.result()
-            if not handle.accepted:
-                self._finish(call, Answer(False, NOT_TAKEN))
-                return
-            call.handle = handle
-            handle.get_result_async().add_done_callback(lambda done: self._ended(call, done))
-            if call.to_stop:
-                self._stop(call)
-
-    def _ended(self, call: _Call, future: Any) -> None:
-        with self._answering(call):
-            answer = future.result()
-            stopped = answer.status == GoalStatus.STATUS_CANCELED
-            message = STOPPED if stopped else str(answer.result.message)
-            self._finish(call, Answer(bool(answer.result.success), message), NEUTRAL if stopped else None)
-
-    def _stop(self, call: _Call) -> None:
-        def asked(future: Any) -> None:
-            # It may have ended meanwhile: then its outcome says so.
-            if future.exception() is None and not future.result().goals_canceling:
-                self._note(TOO_LATE, NEUTRAL)
-
-        call.to_stop = True
-        if call.handle is not None:
-            call.handle.cancel_goal_async().add_done_callback(asked)
-
-    def _finish(self, call: _Call, answer: Answer, level: str | None = None) -> None:
-        with self.lock:
-            if call not in self._calls:
-                return  # late, or the viewer ends
-            self._calls.remove(call)
-        answer = replace(answer, seconds=time.monotonic() - call.began)
-        if call.name not in QUIET:
-            with self.lock:
-                self.answers.pop(call.name, None)
-                self.answers[call.name] = time.time(), answer  # the newest comes last
-            self._note(f"~/{call.name}: {answer.message}", level or (GOOD if answer.success else BAD))
-        call.answer.set_result(answer)
-
-    def _every_quarter(self) -> None:
-        now = time.monotonic()
-        with self.lock:
-            self.history.tick(time.time())
-            gone, restarted = self.history.presence is Presence.GONE, time.monotonic() - time.time() + self.history.restarted
-            calls = list(self._calls)
-        for call in calls:
-            where, waited = f"{self.name}/{call.name}", now - call.began
-            if now > call.deadline:
-                self._drop(call, f"{where} did not answer within {waited:.0f} s; its answer is not waited for any more")
-            elif call.began < restarted:
-                self._drop(call, f"the node was started anew while {where} was under way; call it again")
-            elif call.future is not None and gone and not self._is_there(call.name):
-                self._drop(call, f"the node went away while {where} was under way; call it again once it is back")
-
-    def _drop(self, call: _Call, message: str) -> None:
-        if call.future is not None and call.name != CALIBRATE:
-            self._clients_of[call.name].remove_pending_request(call.future)
-        self._finish(call, Answer(False, message))
-
-    def _note(self, text: str, level: str) -> None:
-        with self.lock:
-            self.history.note(time.time(), text, level)
-
     def _on_extrinsic(self, message: ExtrinsicMsg) -> None:
         try:
             result = result_from_message(message)
         except CalibrationError as error:
-            self._note(f"an extrinsic that cannot be read: {error}", BAD)
+            self.note(f"an extrinsic that cannot be read: {error}", BAD)
             return
         age = message.data_age.sec + 1e-9 * message.data_age.nanosec
         age = age if age >= 0 else float("nan")
@@ -382,11 +153,132 @@ class Watch:
         try:
             picture: Any = decode_image(message)
         except CalibrationError as error:
-            self._note(f"an overlay that cannot be read: {error}", BAD)
+            self.note(f"an overlay that cannot be read: {error}", BAD)
             return
         scale = OVERLAY_WIDTH / picture.shape[1]
         if scale < 1:
             picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, OVERLAY_QUALITY])[1].tobytes()
-        with self.lock:
-            self.overlay = Overlay(jpeg, time.time(), self.overlay.number + 1)
+        self.overlay = Overlay(jpeg, time.time(), self.overlay.number + 1)
+
+    # ---- the thread, of a rig -----------------------------------------------------------------------------------------
+
+    def _on_rig(self, message: Rig) -> None:
+        self._heard, self._message = time.monotonic(), message
+        self._find_pairs()
+        self._show(message)
+
+    def _find_pairs(self) -> None:
+        own = re.compile(re.escape(self.name) + r"/(\w+)/(\w+)/extrinsic")
+        for topic, _ in self._node.get_topic_names_and_types():
+            if (found := own.fullmatch(topic)) and found.groups() not in self._pairs:
+                pair = found[1], found[2]
+                self._pairs = {**self._pairs, pair: None}  # another one, since pages read it
+                self._node.create_subscription(ExtrinsicMsg, topic, lambda m, p=pair: self._on_pair(p, m), LATCHED)
+                self._clients[pair] = self._node.create_client(GetKeyframes, f"{self.name}/{'/'.join(pair)}/keyframes")
+
+    def _on_pair(self, pair: Pair, message: ExtrinsicMsg) -> None:
+        try:
+            self._pairs[pair] = result_from_message(message), bool(message.usable)
+        except CalibrationError:
+            return  # the page of the pair says so
+
+    def _every_second(self) -> None:
+        if self._message is None:
+            return
+        self._find_pairs()
+        now = time.monotonic()
+        gone = now - self._heard > SILENT_S
+        if gone != bool(self.problem):
+            self.problem, self.version = NOT_HEARD if gone else "", self.version + 1
+        wanted = now - self._looked < LOOK_S and not gone
+        self._next_picture(wanted, now)
+        self._next_cloud(wanted, now)
+
+    def _next_picture(self, wanted: bool, now: float) -> None:
+        if self._asked is not None and now - self._asked[2] > PATIENCE_S:
+            self._asked[0].remove_pending_request(self._asked[1])
+            self._asked = None
+        if not wanted or self._asked is not None or not self._pairs:
+            return
+        pair = self.pairs[next(self._turns) % len(self._pairs)]
+        client = self._clients[pair]
+        if client.service_is_ready():
+            future = client.call_async(GetKeyframes.Request(max_keyframes=1, max_width=TILE_WIDTH))
+            self._asked = client, future, now
+            future.add_done_callback(lambda done: self._drawn("/".join(pair), done))
+
+    def _drawn(self, tile: str, future: Any) -> None:
+        self._asked = None
+        if future.exception() is None and future.result().keyframes:
+            self.tiles[tile] = bytes(future.result().keyframes[0].data)
+            self.version += 1
+
+    def _next_cloud(self, wanted: bool, now: float) -> None:
+        if self._cloud is not None:
+            if not self._had_cloud and wanted and now - self._cloud[1] < PATIENCE_S:
+                return
+            self._node.destroy_subscription(self._cloud[0])
+            self._cloud, self._had_cloud = None, False
+        if not wanted:
+            return
+        space, _, name = self.name.rpartition("/")
+        try:
+            heard = self._node.get_subscriber_names_and_types_by_node(name, space or "/")
+        except Exception:  # ROS lists the node no more
+            return
+        topics = sorted(topic for topic, kinds in heard if CLOUD in kinds)
+        if topics:
+            topic = topics[next(self._cloud_turns) % len(topics)]
+            self._cloud = self._node.create_subscription(PointCloud2, topic, self._on_cloud, NEWEST, raw=True), now
+
+    def _on_cloud(self, data: bytes) -> None:
+        """The first one; further ones until the subscription has gone cost next to nothing."""
+        if self._had_cloud or self._message is None:
+            return
+        self._had_cloud = True
+        message = deserialize_message(data, PointCloud2)
+        names = [own.name for own in self._message.sensors if own.transform.child_frame_id == message.header.frame_id]
+        try:
+            if names:
+                self.clouds[names[0]] = decode_cloud(message).finite().xyz
+                self.version += 1
+        except CalibrationError:
+            return  # the node says so
+
+    def _show(self, message: Rig) -> None:
+        """Put together what was heard."""
+        cameras = {camera for camera, _ in self._pairs}
+        sensors = []
+        for own in message.sensors:
+            T, C = matrix_from_transform(own.transform.transform), covariance_from_ros(own.covariance)
+            kind, moved = CAMERA if own.name in cameras else LIDAR, (own.moved_deg, own.moved_m)
+            sigma = None if C is None else worst_sigmas(at_sensor(T, C))
+            sensors.append(
+                SensorShown(own.name, kind, T, own.status, own.reason, own.usable, sigma, moved if any(moved) else None)
+            )
+        loops = tuple(
+            LoopShown(tuple(own.sensors), own.rotation_deg, own.translation_m, own.p_value, own.closes) for own in message.loops
+        )
+        rig = RigShown(message.reference, tuple(sensors), (), loops, message.text)
+        edges = [self._edge(pair, told, rig, message) for pair, told in self._pairs.items()]
+        for own in message.edges:
+            if own.kind != KIND:
+                edge = EdgeShown(own.target, own.source, own.kind, own.status, LEVELS.get(own.status, BAD), own.reason)
+                C = covariance_from_ros(own.covariance)
+                edges.append(edge if C is None else compared(edge, matrix_from_transform(own.transform), C, rig.poses))
+        self.rig, self.version = replace(rig, edges=tuple(edges)), self.version + 1
+
+    def _edge(self, pair: Pair, told: tuple[Result, bool] | None, rig: RigShown, message: Rig) -> EdgeShown:
+        if told is None:
+            return EdgeShown(*pair, KIND, INITIAL, LEVELS[INITIAL])
+        result, usable = told
+        fate, level = result.status, LEVELS.get(result.status, BAD)
+        level = DOUBTFUL if fate == CONVERGED and not usable else level
+        for wrong, how, edges in ((DOUBTED, DOUBTFUL, message.doubted), (REJECTED, BAD, message.rejected)):
+            if (*pair, KIND) in ((own.target, own.source, own.kind) for own in edges):
+                fate, level = wrong, how
+        edge = EdgeShown(*pair, KIND, fate, level, result.reason)
+        if result.covariance_with_intrinsics is None or result.status in (INITIAL, MOVED):
+            return edge
+        return compared(edge, result.T_camera_lidar, result.covariance_with_intrinsics, rig.poses)

@@ -21,7 +21,9 @@ from scipy.spatial.transform import Rotation
 from calib_ros import se3
 from calib_ros.arrays import Matrix
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Result
+from calib_ros_check.rig.shown import BAD, DOUBTFUL, GOOD, LEVELS, NEUTRAL
 
+Pair = tuple[str, str]  # camera, LiDAR
 HOUR = 3600.0
 MAX_EVENTS = 400
 NUMBER = re.compile(r"\d[\d.]*(e[-+]?\d+)?")
@@ -37,8 +39,6 @@ WORDS = {
     BLINDED: "A sensor shows nothing: covered lens, frozen image or empty cloud. The extrinsic is not checked any more.",
 }
 UNCHECKED = "The extrinsic was known when data last came; nothing checks it now."
-GOOD, DOUBTFUL, BAD, NEUTRAL = "good", "doubtful", "bad", "neutral"
-LEVELS = {CONVERGED: GOOD, TENTATIVE: NEUTRAL, INITIAL: NEUTRAL, REFUSED: DOUBTFUL, INSUFFICIENT: DOUBTFUL, SUSPECT: DOUBTFUL}
 
 
 class Presence(Enum):

@@ -19,9 +19,9 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.rig.description import CAMERA, RigDescription
 from calib_ros.rig.edges import SEEN, seen_share
-from calib_ros_view.session.live import NEUTRAL
+from calib_ros_check.rig.shown import NEUTRAL, EdgeShown, RigShown
+from calib_ros_view.session.live import Pair
 from calib_ros_view.session.picture import FramePicture, Look, encoded
-from calib_ros_view.session.rig_shown import EdgeShown, Pair, RigShown
 from calib_ros_view.session.session import Session
 
 FRAMES = 10  # of a recording, unless said otherwise

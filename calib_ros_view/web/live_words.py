@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib_ros_view.node.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Watch
-from calib_ros_view.session.live import BAD, DOUBTFUL, GOOD, NEUTRAL, Event, LiveHistory, Presence
+from calib_ros_check.rig.shown import BAD, DOUBTFUL, GOOD, NEUTRAL
+from calib_ros_view.node.calls import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Answer, NodeClient
+from calib_ros_view.session.live import Event, LiveHistory, Presence
 from calib_ros_view.session.motion import AXES
 from calib_ros_view.web.live_charts import COLOURS, GREY
 
@@ -44,34 +45,34 @@ ACTIONS = (
     Action(CAPTURE, "p", "Capture", "inventory_2", "Write the raw frames of the newest keyframes as a bag on the node's disk?"),
     Action(RESET, "r", "Reset", "restart_alt", "Forget all keyframes, and go back to the initial extrinsic?"),
 )  # fmt: skip
-KEYS = {action.key: f"{action.label}: ~/{action.service}" for action in ACTIONS} | {
+SHARED = {"d, t": "dark or light", "?": "these keys"}
+KEYS_OF_RIG = {"n / p": "next / previous moment of a recording", **SHARED}
+KEYS_OF_PAIR = {action.key: f"{action.label}: ~/{action.service}" for action in ACTIONS} | {
     "g": "draw the keyframes anew", "o": "overlay on or off", "1 2 3": "the last 5 min, 15 min, hour",
-    "d": "dark or light", "?": "these keys", "Enter, Esc": "yes or no to a question", "Esc": "stop the calibration",
+    "Enter, Esc": "yes or no to a question", "Esc": "stop the calibration", **SHARED,
 }  # fmt: skip
 CSS = """
-.live { max-width: 1400px; margin: 0 auto; width: 100%; gap: 12px; padding: 12px; }
-.live .box { border: 1px solid rgba(139,148,158,.3); border-radius: 10px; padding: 12px; width: 100%; min-width: 0; }
-.live .grid2 { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 12px; width: 100%; }
-.live .title { font-size: .8rem; letter-spacing: .04em; opacity: .7; font-weight: 600; }
+.live { display: grid; gap: .6rem; align-items: start; padding: .6rem; width: 100%; max-width: 1500px; margin: 0 auto;
+  grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); overflow-wrap: anywhere; }
+.live > .whole { grid-column: 1 / -1; }
+.live .charts { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 12px; width: 100%; }
 .live .badge { color: #fff; border-radius: 8px; padding: 4px 14px; font-size: 1.35rem; font-weight: 650; line-height: 1.5; }
-.live .numbers { display: grid; grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)); gap: 8px 16px; width: 100%; }
-.live .numbers b { display: block; font-size: 1.1rem; font-variant-numeric: tabular-nums;
-  font-weight: 600; overflow-wrap: anywhere; }
-.live .numbers span { font-size: .75rem; opacity: .7; }
+.live .numbers { margin: .6rem 0 .3rem; display: grid; gap: 8px 16px; width: 100%;
+  grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)); }
+.live .numbers b { display: block; font-size: 1.1rem; font-variant-numeric: tabular-nums; font-weight: 600; }
+.live .numbers span { font-size: .75rem; color: var(--soft); }
 .live .strip { height: 22px; border-radius: 6px; width: 100%; background-clip: padding-box; background-repeat: no-repeat;
-  cursor: crosshair; border: 1px solid rgba(139,148,158,.3); }
+  cursor: crosshair; border: 1px solid var(--line); }
 .live .tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(190px, 1fr)); gap: 10px; width: 100%; }
-.live .tiles figure { margin: 0; } .live .tiles img { width: 100%; border-radius: 6px; display: block; }
-.live .tiles figcaption { font-size: .75rem; opacity: .8; font-variant-numeric: tabular-nums; }
-.live .overlay { width: 100%; border-radius: 6px; display: block; }
-.live .events { max-height: 420px; overflow-y: auto; width: 100%; }
+.live .large { grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); }
+.live .tiles figure { margin: 0; } .live figcaption { font-size: .75rem; color: var(--soft); font-variant-numeric: tabular-nums; }
+.live .tiles img { width: 100%; border-radius: 6px; display: block; background: var(--line); min-height: 2.5rem; }
+.live .tiles a { color: var(--accent); } .live figcaption a { display: inline-block; margin-right: .8em; }
+.live .events { max-height: 420px; overflow-y: auto; }
 .live .events div { display: grid; grid-template-columns: 76px 1fr; gap: 8px; padding: 3px 0 3px 8px;
   border-left: 3px solid; font-size: .85rem; }
-.live .events time { opacity: .7; font-variant-numeric: tabular-nums; } .live .events p { margin: 0; overflow-wrap: anywhere; }
-.live p.muted { margin: 6px 0 0; }
-.live .muted { opacity: .7; font-size: .85rem; } .live .wrap { overflow-wrap: anywhere; }
-.live button:focus-visible, .live [tabindex]:focus-visible { outline: 3px solid #4a90e2; outline-offset: 2px; }
-@media (max-width: 800px) { .live .grid2 { grid-template-columns: minmax(0, 1fr); } .live { padding: 8px; } }
+.live .events time { color: var(--soft); font-variant-numeric: tabular-nums; } .live .events p { margin: 0; }
+@media (max-width: 800px) { .live, .live .charts { grid-template-columns: minmax(0, 1fr); } .live { padding: .4rem; } }
 """
 FIGURES = {
     "monitor p-value": "monitor p-value", "keyframes in the buffer": "keyframes",
@@ -99,7 +100,7 @@ class Said:
         return LEVEL_COLOURS[self.level] if self.badge == GONE else COLOURS.get(self.badge, LEVEL_COLOURS[self.level])
 
 
-def said_of(watch: Watch, now: float) -> Said:
+def said_of(watch: NodeClient, now: float) -> Said:
     """The status of the node, or where it is; to be called under the watch's lock."""
     history = watch.history
     state, presence = history.state, history.presence
@@ -146,7 +147,7 @@ def numbers_html(history: LiveHistory) -> str:
             cells.append(("clock offset, ms", _number(1000 * result.time_offset_s, 1)))
     cells += [(label, diagnosis.values[name]) for name, label in FIGURES.items() if name in diagnosis.values]
     notes = {"Monitor": diagnosis.values.get("monitor", "none"), "Last check": diagnosis.check}
-    check = "".join(f'<p class="muted">{name}: {_text(said)}</p>' for name, said in notes.items())
+    check = "".join(f'<p class="soft text-sm">{name}: {_text(said)}</p>' for name, said in notes.items())
     shown = "".join(f"<div><span>{_text(n)}</span><b>{_text(v)}</b></div>" for n, v in cells)
     return f'<div class="numbers">{shown}</div>{check}'
 
@@ -164,7 +165,7 @@ def event_html(event: Event) -> str:
     """An event with its time, and how often it came."""
     times = f" <b>×{event.count}</b>" if event.count > 1 else ""
     return (
-        f'<div style="border-color:{LEVEL_COLOURS.get(event.level, "#8b949e")}"><time>{clock(event.at)}</time>'
+        f'<div style="border-color:{LEVEL_COLOURS[event.level]}"><time>{clock(event.at)}</time>'
         f"<p>{_text(event.text)}{times}</p></div>"
     )
 
@@ -177,6 +178,12 @@ def tile_html(tile: KeyframePicture, address: str) -> str:
         f'<figure><img src="{address}" alt="keyframe, {age}" loading="lazy">'
         f"<figcaption>{age} · {score} · {tile.in_view} of {tile.edge_points} edge points</figcaption></figure>"
     )
+
+
+def words_of_answer(service: str, at: float, answer: Answer) -> str:
+    """What a service has answered, and what a check has found."""
+    text = f"{'✓' if answer.success else '✗'} {clock(at)} ~/{service} ({answer.seconds:.1f} s): {answer.message}"
+    return "\n".join([text, *(words_of_check(answer.response) if service == CHECK and answer.response is not None else ())])
 
 
 def words_of_check(response: Check.Response) -> list[str]:

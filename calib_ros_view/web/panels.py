@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.arrays import Matrix
 from calib_ros.errors import CalibrationError
+from calib_ros_check.rig.shown import RigShown
 from calib_ros_view.session.colored_cloud import MOST_POINTS, colored_cloud
 from calib_ros_view.session.jobs import SessionJob
 from calib_ros_view.session.motion import AXES
 from calib_ros_view.session.picture import COLORINGS, Look, encoded
 from calib_ros_view.session.plots import curve_plots, ellipse_plots, frame_bars
-from calib_ros_view.session.rig_shown import RigShown
 from calib_ros_view.session.session import Session, SessionState
 from calib_ros_view.web import theme
 from calib_ros_view.web.server import Pictures

@@ -16,11 +16,11 @@ import threading
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
-from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
+from calib_ros_view.session.live import Pair
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -38,6 +38,9 @@ TOKEN = re.compile(r"[A-Za-z0-9._-]+")
 REFUSED_ORIGIN = b"refused: this request comes from another page; open the address that calib-ros printed"
 REFUSED_TOKEN = b"refused: open the whole address that calib-ros printed, with its token"
 PICTURES_HELD = 256  # of all browsers together
+RIG = "/"  # address of the page of all sensors
+Opened = tuple[Callable[[], None], Callable[[], None]]  # builds the page for a browser; ends what runs for it
+Opening = Callable[[str, str], Opened]  # of a camera and a LiDAR
 PAGE_S = 300.0  # in which the frames of a pair are read and searched for edges
 FINISH_S = 2  # seconds that open connections get at the end
 
@@ -210,29 +213,50 @@ def serve(
     page: Callable[[], None],
     title: str,
     address: Address,
-    routes: Callable[[FastAPI], None],
+    pictures: Pictures,
     ready: Callable[[str], None],
-    ended: Callable[[], None] = lambda: None,
-    others: Mapping[str, Callable[..., Awaitable[None]]] = MappingProxyType({}),
+    opening: Opening | None = None,
 ) -> None:
     """Serve a page until Ctrl-C or SIGTERM.
 
-    routes: adds routes to the FastAPI application. ready: called with the address to open, once it can be. ended: called when no
-    more requests come. others: further pages by their paths, as "/pair/{name}", which may take PAGE_S to be built. Raises
-    BadInputError if the address cannot be used.
+    ready: called with the address to open, once it can be. opening: makes the page of a pair of a rig when it is opened first, of
+    which all browsers see the same; CalibrationError where there is none. Raises BadInputError if the address cannot be used.
     """
     import uvicorn
     from fastapi import FastAPI
-    from nicegui import ui
+    from nicegui import run, ui
 
     taken = listening(address)
     token = address.token or (None if address.is_local else secrets.token_urlsafe(TOKEN_BYTES))
     port = taken.getsockname()[1]
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-    routes(app)
+    pictures.routes(app)
     ui.page("/", title=title)(page)
-    for path, other in others.items():
-        ui.page(path, title=title, response_timeout=PAGE_S)(other)
+    opened: dict[Pair, Opened] = {}
+    one_at_a_time = threading.Lock()
+
+    def open_pair(pair: Pair) -> Opened:
+        assert opening is not None
+        with one_at_a_time:
+            if pair not in opened:
+                opened[pair] = opening(*pair)
+            return opened[pair]
+
+    async def pair_page(camera: str, lidar: str) -> None:
+        try:
+            found = await run.io_bound(open_pair, (camera, lidar))
+        except CalibrationError as error:
+            from calib_ros_view.web import theme
+
+            with theme.bar(f"{camera} with {lidar}", {}, RIG):
+                ui.space()
+            ui.label(str(error)).classes("p-4").props("role=alert")
+            return
+        if found is not None:  # else the server ends
+            found[0]()
+
+    if opening is not None:
+        ui.page("/pair/{camera}/{lidar}", title=title, response_timeout=PAGE_S)(pair_page)
     # Undelivered messages hold pictures of the past: few are kept.
     ui.run_with(app, title=title, dark=None, message_history_length=50, show_welcome_message=False)
     names = frozenset(LOCAL_NAMES) if address.is_local else None
@@ -250,4 +274,5 @@ def serve(
     except KeyboardInterrupt:  # uvicorn ends properly, and raises the signal again
         pass
     finally:
-        ended()
+        for _, end in opened.values():
+            end()

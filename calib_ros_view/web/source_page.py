@@ -71,11 +71,9 @@ class SourcePage:
 
     def build(self) -> None:
         """Lay the page out, and keep it up to date until the browser leaves."""
-        self._dark = theme.apply()
-        self._keys = theme.keys_dialog({_shown(key): what for key, what in KEYS.items()})
         self._copied = ui.dialog()
-        with ui.header(elevated=False).classes("bar items-center gap-1 px-2 py-1 wrap"):  # it wraps on a narrow screen
-            ui.label(self._session.name).classes("text-base font-semibold ellipsis").style("max-width: 45vw")
+        keys = {_shown(key): what for key, what in KEYS.items()}
+        with theme.bar(self._session.name, keys, self._back) as (self._switch, self._keys):
             self._actions()
         with ui.element("div").classes("w-full flex flex-col lg:flex-row flex-nowrap gap-2 p-2"):
             with ui.element("div").classes("grow min-w-0 flex flex-col flex-nowrap gap-2").style("flex-basis: 0"):
@@ -90,8 +88,6 @@ class SourcePage:
     # --- parts of the page
 
     def _actions(self) -> None:
-        if self._back:
-            theme.icon_button("hub", "all sensors of the rig", partial(ui.navigate.to, self._back))
         theme.icon_button("chevron_left", "previous frame", lambda: self._go(-1), "p")
         theme.icon_button("chevron_right", "next frame", lambda: self._go(1), "n")
         self._frame_label = ui.label().classes("figures text-sm")
@@ -109,8 +105,6 @@ class SourcePage:
         with ui.button("Copy", icon="content_copy").props("dense no-caps flat"), ui.menu():
             for form, title in FORMATS.items():
                 ui.menu_item(title, on_click=lambda form=form: self._tell(partial(self._copy, form)))
-        theme.icon_button("contrast", "light or dark", partial(theme.switch, self._dark))
-        theme.icon_button("help_outline", "keys", self._keys.open, "?")
 
     def _viewer(self) -> None:
         self._view.build_picture()
@@ -210,7 +204,7 @@ class SourcePage:
             "l": lambda: self._view.pan(1, 0),
             "b": self._view.compare_next,
             "g": self._view.switch_edges,
-            "t": partial(theme.switch, self._dark),
+            "t": self._switch,
             "?": self._keys.open,
         }
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 
 from nicegui import events, ui
 
+from calib_ros_check.page import DARK, LIGHT
+
 ACCENT = "#0b62a8"
-STYLE = """
-:root {
-  --paper: #fbfbfa; --card: #ffffff; --ink: #1c1e21; --soft: #5d636b; --line: #dcdfe3; --accent: #0b62a8; --mark: #c2410c;
-}
-.body--dark {
-  --paper: #131518; --card: #1c1f23; --ink: #e6e8ea; --soft: #9aa2ab; --line: #33383e; --accent: #6db3f2; --mark: #fb923c;
-}
+STYLE = (
+    f":root {{ {LIGHT} --mark: #c2410c; }}\n.body--dark {{ {DARK} --mark: #fb923c; }}"
+    + """
 body {
   background: var(--paper); color: var(--ink);
   font: 15px/1.45 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
@@ -34,6 +34,7 @@ kbd { background: var(--paper); border: 1px solid var(--line); border-radius: 4p
 .stays { position: sticky; top: calc(var(--bar, 3rem) + .4rem); z-index: 2; }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 """
+)
 # A tab, a slider or a button that was clicked would keep the arrow keys, which move the cloud. Whoever comes to it by the Tab key
 # (a click without detail) keeps it, and so do fields in which one types or chooses, until Escape.
 KEYS_AFTER_CLICK = """<script>
@@ -52,12 +53,33 @@ addEventListener('load', () => new ResizeObserver(([bar]) =>
 </script>"""
 
 
-def apply() -> ui.dark_mode:
-    """Style and colours of this page; as the system is set, until somebody chooses."""
+@contextmanager
+def bar(title: str, keys: Mapping[str, str], back: str = "") -> Iterator[tuple[Callable[[], None], ui.dialog]]:
+    """Style of a page, and its bar: title, way back to the rig, what is laid out inside the context, theme, list of the keys.
+    Gives what switches the theme, which is as the system's until then, and the list."""
     ui.colors(primary=ACCENT)
     ui.add_css(STYLE)
     ui.add_head_html(KEYS_AFTER_CLICK + HEIGHT_OF_BAR)
-    return ui.dark_mode(None)
+    dark = ui.dark_mode(None)
+
+    def switch() -> None:
+        dark.value = dark.value is not True
+
+    with ui.dialog() as listed, ui.card().classes("card"):
+        ui.label("Keys").classes("text-lg font-semibold")
+        with ui.grid(columns="max-content 1fr").classes("gap-x-4 gap-y-1"):
+            for key, what in keys.items():
+                ui.html(f"<kbd>{key}</kbd>", sanitize=False)
+                ui.label(what)
+        ui.button("Close", on_click=listed.close).props("flat dense no-caps autofocus")
+    with ui.header(elevated=False).classes("bar items-center gap-1 px-2 py-1 wrap"):  # it wraps on a narrow screen
+        if back:
+            icon_button("hub", "all sensors of the rig", partial(ui.navigate.to, back))
+        name = ui.label(title).classes("text-base font-semibold ellipsis").style("max-width: 45vw")
+        name.props("role=heading aria-level=1")
+        yield switch, listed
+        icon_button("contrast", "light or dark", switch, "t")
+        icon_button("help_outline", "keys", listed.open, "?")
 
 
 def icon_button(icon: str, hint: str, on_click: object, key: str = "") -> ui.button:
@@ -68,24 +90,7 @@ def icon_button(icon: str, hint: str, on_click: object, key: str = "") -> ui.but
     return button
 
 
-def switch(dark: ui.dark_mode) -> None:
-    """Between the light and the dark theme; at first it is as the browser has it."""
-    dark.value = dark.value is not True
-
-
 def pressed(event: events.KeyEventArguments, *dialogs: ui.dialog) -> str:
     """Name of the key that goes down; "" for none, with Ctrl, Alt or Meta, or behind an open dialog."""
     held = event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta
     return "" if not event.action.keydown or held or any(dialog.value for dialog in dialogs) else event.key.name
-
-
-def keys_dialog(keys: Mapping[str, str]) -> ui.dialog:
-    """What the keys do."""
-    with ui.dialog() as dialog, ui.card().classes("card"):
-        ui.label("Keys").classes("text-lg font-semibold")
-        with ui.grid(columns="max-content 1fr").classes("gap-x-4 gap-y-1"):
-            for key, what in keys.items():
-                ui.html(f"<kbd>{key}</kbd>", sanitize=False)
-                ui.label(what)
-        ui.button("Close", on_click=dialog.close).props("flat dense no-caps autofocus")
-    return dialog

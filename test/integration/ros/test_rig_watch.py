@@ -10,7 +10,6 @@ from ros_peer import cloud_message
 from waiting import until
 
 from calib_ros_synthetic.rig import SyntheticRig
-from calib_ros_view.node.rig_watch import RigWatch
 from calib_ros_view.node.watch import Watch
 from calib_ros_view.session.live import SILENT_S
 
@@ -22,8 +21,7 @@ CAMERAS, TOP = ("back_left", "back_right"), "lidar_top"
 def test_sensors_edges_pictures_and_clouds_are_heard_and_that_the_node_ends(tmp_path) -> None:
     rig = SyntheticRig("six_cameras_one_lidar", seed=3, frames=4, width=320, clocks=0.0, speed=4.0)
     items, file = measured(rig, CAMERAS, 3.0), describe(rig, CAMERAS, tmp_path / "rig.yaml")
-    with Watch("/calib_ros") as watch:
-        feed = RigWatch(watch)
+    with Watch("/calib_ros") as feed:
         with RigPeer(rig, CAMERAS, file) as peer:
             until(lambda: feed.rig is not None and len(feed.rig.edges) == 2, "the rig")
             assert {(e.fate, e.level) for e in feed.rig.edges} == {("initial", "neutral")}
@@ -48,4 +46,4 @@ def test_sensors_edges_pictures_and_clouds_are_heard_and_that_the_node_ends(tmp_
             assert not feed.problem
         until(lambda: feed.problem, f"silence of {SILENT_S} s")
         assert "not heard any more" in feed.problem
-        assert not any("unexpected" in event.text for event in watch.history.events)
+        assert not any("unexpected" in event.text for event in feed.history.events)

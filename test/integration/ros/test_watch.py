@@ -17,8 +17,10 @@ from waiting import LIMIT_S, until
 
 from calib_ros.errors import BadInputError
 from calib_ros.ros.conversions import image_message
-from calib_ros_view.node.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch
-from calib_ros_view.session.live import NEUTRAL, Presence
+from calib_ros_check.rig.shown import NEUTRAL
+from calib_ros_view.node.calls import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE
+from calib_ros_view.node.watch import LOOK_S, Watch
+from calib_ros_view.session.live import Presence
 from calib_ros_view.web.live_words import said_of, words_of_check
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -84,16 +86,10 @@ def test_keyframes_are_drawn_with_score_and_age(watch, peer, vehicle):
 def test_the_overlay_is_only_drawn_for_lookers(watch, peer, vehicle):
     publisher = peer.calibration.overlay.publisher
     assert publisher.get_subscription_count() == 0
-    lookers = [watch.look(), watch.look()]
-    until(publisher.get_subscription_count, "a subscription")
-    until(lambda: peer.publish(vehicle.frame()) or watch.overlay.number, "an overlay")
+    until(publisher.get_subscription_count, "a subscription", watch.look)
+    until(lambda: watch.overlay.number, "an overlay", lambda: (watch.look(), peer.publish(vehicle.frame())))
     assert cv2.imdecode(np.frombuffer(watch.overlay.jpeg, np.uint8), cv2.IMREAD_COLOR).ndim == 3
-    watch.leave(lookers[0])
-    watch.leave(lookers[0])
-    number = watch.overlay.number
-    until(lambda: peer.publish(vehicle.frame()) or watch.overlay.number > number, "another one for the looker who has stayed")
-    watch.leave(lookers[1])
-    until(lambda: publisher.get_subscription_count() == 0, "no subscription")
+    until(lambda: publisher.get_subscription_count() == 0, f"no subscription once nobody has looked for {LOOK_S} s")
 
 
 def test_services_answer_and_what_they_say_becomes_an_event(watch, peer):

@@ -15,9 +15,10 @@ from fastapi import FastAPI
 
 from calib_ros import se3
 from calib_ros.result import CONVERGED, MOVED, Result
-from calib_ros_view.node.watch import Answer
-from calib_ros_view.session.live import GOOD, MAX_EVENTS, Diagnosis, LiveHistory, NodeState, Presence, Ring, moment_of
-from calib_ros_view.web.live_page import LivePage
+from calib_ros_check.rig.shown import GOOD
+from calib_ros_view.node.calls import Answer
+from calib_ros_view.session.live import MAX_EVENTS, Diagnosis, LiveHistory, NodeState, Presence, Ring, moment_of
+from calib_ros_view.web.live_page import Gallery
 from calib_ros_view.web.live_words import numbers_html
 from calib_ros_view.web.server import Pictures
 
@@ -53,27 +54,26 @@ def test_a_converged_extrinsic_that_nothing_checks_any_more_is_not_said_to_be_ch
 
 
 def test_keyframes_are_drawn_again_whenever_there_are_twice_as_many() -> None:
-    page = LivePage(None, None)  # type: ignore[arg-type]
-    assert [n for n in (0, 1, 1, *range(1, 21), 20, 20) if page.is_due(n)] == [1, 2, 4, 8, 16]
-    assert [n for n in (0, 3, 3) if page.is_due(n)] == [3], "they were forgotten meanwhile"
+    page = Gallery(None, None)  # type: ignore[arg-type]
+    seen = (0, 1, 1, *range(1, 21), 20, 20, 0, 3, 3)  # they were forgotten in between
+    assert [n for n in seen if page.is_due(n)] == [1, 2, 4, 8, 16, 3]
 
 
 def test_keyframes_are_drawn_into_pictures_in_memory() -> None:
     facts = {"score": math.nan, "in_view": 8, "edge_points": 9}
-    drawn = [SimpleNamespace(data=data, age=age, **facts) for data, age in ((b"new", 0.0), (b"old", 2.0))]
+    drawn = [SimpleNamespace(data=b"new", age=0.0, **facts), SimpleNamespace(data=b"old", age=2.0, **facts)]
     answer: Future[Answer] = Future()
     answer.set_result(Answer(True, "", SimpleNamespace(keyframes=drawn, cpu=0.008)))
     app, pictures = FastAPI(), Pictures()
     pictures.routes(app)
-    page = LivePage(SimpleNamespace(name="/calib_ros", keyframes=lambda: answer), pictures)  # type: ignore[arg-type]
-    asyncio.run(page.draw_keyframes())
-    assert page.gallery_note == "2 keyframes, drawn in 8 ms of the node's CPU time"
-    assert re.findall('src="([^"]+)"', page.gallery) == [f"/picture/keyframe {k} calib_ros?v={k}" for k in (0, 1)]
+    page = Gallery(SimpleNamespace(name="/calib_ros", keyframes=lambda: answer), pictures)  # type: ignore[arg-type]
+    asyncio.run(page.draw())
+    assert page.note == "2 keyframes, drawn in 8 ms of the node's CPU time"
+    assert re.findall('src="([^"]+)"', page.content) == [f"/picture/keyframe {k} calib_ros?v={k}" for k in (0, 1)]
     serve = app.routes[-1].endpoint  # type: ignore[attr-defined]
     served = [serve(name) for name in ("keyframe 0 calib_ros", "keyframe 1 calib_ros", "overlay calib_ros")]
     assert [(own.status_code, own.body) for own in served] == [(200, b"new"), (200, b"old"), (404, b"")]
-    same = b"one"
-    assert pictures.put("rig/front", same) == pictures.put("rig/front", same) == "/picture/rig front?v=2"
+    assert pictures.put("rig/front", same := b"one") == pictures.put("rig/front", same) == "/picture/rig front?v=2"
     assert pictures.put("rig/front", b"another") == "/picture/rig front?v=3"
 
 
@@ -165,8 +165,7 @@ def test_statuses_are_events_with_their_reason_and_repetitions_are_counted() -> 
     history.add_extrinsic(T0 + 1, state())
     history.add_extrinsic(T0 + 2, state(status=MOVED, reason="searched anew", usable=False))
     assert history.newest_events()[0].text == "moved: searched anew"
-    assert history.state is not None
-    assert history.state.level == "bad"
+    assert history.state is not None and history.state.level == "bad"  # noqa: PT018
     for k in range(3):
         history.note(T0 + 3 + k, f"{k} % get lost")
     assert (history.newest_events()[0].count, history.newest_events()[0].at) == (3, T0 + 5)

@@ -10,23 +10,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from graphs import RIGS, edges
+from html_pages import Page
 from scenes import QUICK, RenderedDrive
 from two_halves import TwoHalves
 
 from calib_ros import se3
 from calib_ros.cli.main import main
 from calib_ros.errors import BadInputError
+from calib_ros.extensions import PAGES, load
 from calib_ros.result import Cause
 from calib_ros.rig.description import CAMERA, LIDAR, RigDescription, Sensor, prior_covariance
-from calib_ros.rig.edges import RigMeasurer
+from calib_ros.rig.edges import Measurement, RigMeasurer
 from calib_ros.rig.graph import Edge, RigSolution, solve
 from calib_ros.rig.report import RigReport
 from calib_ros_check.cli import rig_summary
 from calib_ros_check.fleet.history import row_of
 from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
+from calib_ros_check.report import write_rig_check
 from calib_ros_check.rig.check import PairCheck, RigCheck, as_given, as_row, check_rig, judged
-from calib_ros_check.rig.page import write_rig_page
 from calib_ros_check.tolerance import judge, unknown
 
 TOLERANCE = Tolerance(0.5, 0.1)
@@ -141,10 +143,10 @@ def test_result_and_page_hold_every_sensor_and_pair(tmp_path: Path) -> None:
     assert data["sensors"]["c0"]["rotation"]["error"] == pytest.approx(1.5, abs=0.2)
     assert [(p["target"], p["source"]) for p in data["pairs"]] == list(RIGS["loops"][1])
     assert all(loop["closes"] for loop in data["loops"])
-    write_rig_page(tmp_path / "check.html", found, QUICK)
+    write_rig_check(tmp_path / "check.html", found, QUICK)
     page = (tmp_path / "check.html").read_text()
-    assert all(f'<td class="words">{name}</td>' in page for name in found.sensors)
-    assert "<h2>Loops</h2>" in page
+    assert all(f"<tr><td>{name}</td>" in page for name in found.sensors)
+    assert (page.count("<svg"), page.count("<h2>Loops</h2>")) == (2, 1)
 
 
 def test_a_fleet_shows_the_worst_pair_of_a_rig() -> None:
@@ -180,6 +182,17 @@ def test_two_cameras_are_checked_around_their_lidar(drive: RenderedDrive) -> Non
     assert [pair.check is not None for pair in found.pairs] == [True, True]
     assert {n: own.verdict for n, own in found.sensors.items()} == {"top": PASS, "left": PASS, "right": FAIL}, rig_summary(found)
     assert found.reason.startswith("right is off by ")
+
+
+def test_the_page_of_an_estimated_rig_shows_every_camera(drive: RenderedDrive, tmp_path: Path) -> None:
+    description = RigDescription((Sensor("top", LIDAR), Sensor("left", CAMERA), Sensor("right", CAMERA)), "top")
+    measurer = RigMeasurer(TwoHalves(drive), description, QUICK, 3)
+    report = RigReport.of(measurer, [Measurement("left", "top", "registration", None, "too <dark>")])
+    load(PAGES, "rig")(str(tmp_path / "rig.html"))(replace(report, source="synthetic:seed=1,frames=4"), measurer)
+    page = Page((tmp_path / "rig.html").read_text())
+    assert [caption.strip() for caption in page.captions][-len(page.sources) :] == ["left with top", "right with top"]
+    for told in ("Rig of synthetic\n", "synthetic:seed=1,frames=4", "2 cameras, 1 LiDARs", "1 of 3 sensors usable", "too <dark>"):
+        assert told in page.text, told
 
 
 RIG = "reference: lidar_left\nsensors:\n  lidar_left: {kind: lidar}\n  front: {kind: camera}\n"

@@ -14,9 +14,8 @@ from calib_ros.rig.description import RigDescription, Sensor
 from calib_ros.rig.edges import Measurement
 from calib_ros.rig.graph import at_sensor, solve, worst_sigmas
 from calib_ros.rig.report import RigReport
-from calib_ros_view.session.live import BAD, DOUBTFUL, GOOD, NEUTRAL
-from calib_ros_view.session.rig_shown import EdgeShown, RigShown, compared, of_priors, of_result
-from calib_ros_view.web.rig_words import edges_html, graph_svg, loops_html, sensors_html
+from calib_ros_check.rig import shown as html
+from calib_ros_check.rig.shown import BAD, DOUBTFUL, GOOD, NEUTRAL, EdgeShown, RigShown, compared, of_priors, of_report
 
 POSES = rig(2, 3)
 PAIRS = [("c0", "l0"), ("c1", "l0"), ("c0", "l1"), ("c1", "l1"), ("l1", "l0")]
@@ -24,16 +23,13 @@ DESCRIPTION = RigDescription(tuple(Sensor(n, "lidar" if n[0] == "l" else "camera
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> RigShown:
+def shown() -> RigShown:
     """By a result in which l1-l0 is 3 deg off, and nothing is measured of c2."""
     rng = np.random.default_rng(0)
     measured = edges(POSES, PAIRS, rng)
     measured[4] = replace(measured[4], T=se3.perturb(measured[4].T, [0, 0, 3.0], [0, 0, 0]))
     out = [Measurement(e.target, e.source, "", e) for e in measured] + [Measurement("c2", "l0", "", None, "too <dark>")]
-    report = RigReport(DESCRIPTION, solve(measured, priors(POSES, rng), "l0"), out, dict.fromkeys(POSES, ""), {})
-    path = tmp_path_factory.mktemp("rig") / "rig.json"
-    report.save(str(path))
-    return of_result(path, DESCRIPTION)
+    return of_report(RigReport(DESCRIPTION, solve(measured, priors(POSES, rng), "l0"), out, dict.fromkeys(POSES, ""), {}))
 
 
 def test_a_result_is_shown_with_what_contradicts_it(shown: RigShown) -> None:
@@ -71,7 +67,11 @@ def test_priors_are_shown_with_their_spread_and_are_not_usable() -> None:
 
 
 def test_the_graph_names_all_sensors_and_tells_levels_without_colour(shown: RigShown) -> None:
-    svg = ElementTree.fromstring(graph_svg(shown))
+    svg = ElementTree.fromstring(html.graph_svg(shown))
+    plan = ElementTree.fromstring(html.plan_svg(shown))
+    places = [(own.get("text-anchor"), own.get("y")) for own in plan.iter("text")]
+    assert len(set(places)) == len(places) == 5, "names do not lie on each other"
+    assert [own.get("class") for own in plan.iter("g") if own.find("path") is not None] == [e.level for e in shown.edges]
     texts = [own.text for own in svg.iter("text")]
     assert texts.count("✕") == 1, "the mark of the wrong edge"
     assert {"l0", "l1", "c0", "c1", "c2", "insufficient, not usable"} <= set(texts)
@@ -81,18 +81,13 @@ def test_the_graph_names_all_sensors_and_tells_levels_without_colour(shown: RigS
     assert {x for x, _ in boxes} == {0.0, 248.0}
 
 
-def test_long_names_are_cut_in_the_graph_and_whole_in_the_table(shown: RigShown) -> None:
-    sensors = tuple(replace(own, name=own.name + "_with_a_very_long_name") for own in shown.sensors)
-    longer = replace(shown, sensors=sensors, edges=(), reference="l0_with_a_very_long_name")
-    assert ">c0_with_a_very_lo…<" in graph_svg(longer)
-    assert "c0_with_a_very_long_name" in sensors_html(longer)
-
-
-def test_tables_escape_what_they_are_told(shown: RigShown) -> None:
-    table = ElementTree.fromstring(edges_html(shown))
+def test_tables_escape_what_they_are_told_and_have_whole_names(shown: RigShown) -> None:
+    table = ElementTree.fromstring(html.edges_html(shown))
     rows = [[("".join(cell.itertext())) for cell in row] for row in table.iter("tr")]
-    assert rows[0] == ["edge", "", "by", "residual", "why"]
+    assert rows[0] == ["edge", "", "1σ", "residual", "why"]
     assert rows[6][0] == "c2 – l0"
     assert rows[6][4] == "too <dark>"
-    assert loops_html(shown).count("does not close") == sum(not loop.closes for loop in shown.loops)
-    assert ElementTree.fromstring(sensors_html(shown)) is not None
+    assert html.loops_html(shown).count("does not close") == sum(not loop.closes for loop in shown.loops)
+    longer = replace(shown, sensors=tuple(replace(own, name=own.name + "_with_a_very_long_name") for own in shown.sensors))
+    assert ">c0_with_a_very_lo…<" in html.graph_svg(longer)
+    assert "c0_with_a_very_long_name" in ElementTree.fromstring(html.sensors_html(longer)).itertext()
