@@ -258,7 +258,7 @@ class RigPair:
     """One camera and one LiDAR of a rig as a source: up to rig.frames frames, rig.step seconds apart."""
 
     def __init__(self, rig: SyntheticRig, camera: str, lidar: str) -> None:
-        self._rig, self._names = rig, (camera, lidar)
+        self._rig, self._names, self.cameras = rig, (camera, lidar), rig.cameras
         self.name = f"{rig.name},camera={camera},lidar={lidar}"
         self.camera = rig.camera(camera)
         self.camera_frame, self.lidar_frame = rig.frame_id(camera), rig.frame_id(lidar)
