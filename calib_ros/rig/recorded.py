@@ -39,15 +39,13 @@ def recorded_rig(text: str) -> tuple[RigDescription, RigSource, Remarks]:
         if not names:
             raise BadInputError(f"{text} has no {kind} that can be read; {'; '.join([*remarks, 'give --rig a description'])}")
     rig = open_rig(text, RigDescription(tuple(sensors), kinds[LIDAR][0]))
-    poses = {own.name: rig.reference(own.name) if own.prior is None else own.prior for own in sensors}
-    seen = {lidar: _cameras_with(rig, lidar, poses) for lidar in kinds[LIDAR]} if len(kinds[LIDAR]) > 1 else {}
-    reference = max(kinds[LIDAR], key=lambda name: len(seen.get(name, ())))
+    several = len(kinds[LIDAR]) > 1
+    poses = {lidar: _poses(rig, sensors, lidar) for lidar in kinds[LIDAR]}
+    reference = max(kinds[LIDAR], key=lambda lidar: _cameras_with(rig, lidar, poses[lidar]) if several else 0)
     rig.reference_sensor = reference
-    base = poses[reference]
-    known = {name: se3.inverse(base) @ T for name, T in poses.items() if T is not None} if base is not None else {}
-    named = [replace(own, prior=known.get(own.name) if own.name != reference else None) for own in sensors]
+    named = [replace(own, prior=None if own.name == reference else poses[reference][own.name]) for own in sensors]
     cameras, lidars = (", ".join(kinds[kind]) for kind in (CAMERA, LIDAR))
-    why = ", with which most cameras share a view" if seen else ""
+    why = ", with which most cameras share a view" if several else ""
     remarks.append(f"as recorded: cameras {cameras}; LiDARs {lidars}; poses are relative to {reference}{why}")
     return RigDescription(tuple(named), reference), rig, remarks
 
@@ -63,17 +61,24 @@ def joined(description: RigDescription, text: str) -> tuple[RigDescription, Rema
     return replace(description, sensors=known), left
 
 
-def _cameras_with(rig: RigSource, lidar: str, poses: dict[str, Transform | None]) -> list[str]:
-    """The cameras that share a view with a LiDAR, by its middle scan."""
-    scans, base = rig.scans(lidar), poses[lidar]
-    if base is None or not len(scans):
-        return []
+def _poses(rig: RigSource, sensors: Sequence[Sensor], reference: str) -> dict[str, Transform | None]:
+    """T_reference_sensor (4, 4) of all sensors by what is believed of them, else as recorded; None where that is not said."""
+    rig.reference_sensor = reference
+    base = next((own.prior for own in sensors if own.name == reference), None)
+    if base is None:
+        return {own.name: rig.reference(own.name) for own in sensors}
+    return {own.name: None if own.prior is None else se3.inverse(base) @ own.prior for own in sensors}
+
+
+def _cameras_with(rig: RigSource, lidar: str, poses: dict[str, Transform | None]) -> int:
+    """How many cameras share a view with a LiDAR, by its middle scan. poses: (4, 4) relative to it."""
+    scans = rig.scans(lidar)
+    if not len(scans):
+        return 0
     xyz = scans[len(scans) // 2][1].xyz
     points = xyz[np.isfinite(xyz).all(axis=1)].astype(float)
-    at = {camera: poses[camera] for camera in rig.cameras}
-    return [
-        name for name, T in at.items() if T is not None and seen_share(rig.camera(name), se3.inverse(T) @ base, points) >= SEEN
-    ]
+    at = ((name, poses[name]) for name in rig.cameras)
+    return sum(T is not None and seen_share(rig.camera(name), se3.inverse(T), points) >= SEEN for name, T in at)
 
 
 def _sensors_of(text: str) -> tuple[list[Sensor], Remarks]:
@@ -106,26 +111,23 @@ def _of_bag(path: Path) -> tuple[list[Sensor], Remarks]:
     images = pictures(bag)
     first = {topic: data for own in (*images, *clouds(bag)) for topic, _, data in islice(bag.raw([own]), 1)}
     frames = {topic: peek_header(data)[1] for topic, data in first.items()}
-    # What comes later is kept rather than what comes from the same frame before.
-    kept = sorted(first, key=lambda t: (t in images, is_rectified(t) if t in images else len(first[t])))
     infos = {topic: info_beside(bag, topic) for topic in images}
     if len(images) == 1:
         infos[images[0]] = choose_camera_info(bag, None, images[0])
-    remarks = []
-    for topic in list(kept):
-        same = [t for t in kept if t != topic and frames[t] == frames[topic] != "" and (t in images) == (topic in images)]
-        why = f"{same[-1]} is of the same frame" if same else ""
-        if topic in images and not infos[topic]:
-            why = "no CameraInfo is beside it"
-        elif frames[topic] in NO_SENSORS:
-            why = f"{frames[topic]} is no frame of a sensor, as merged clouds have"
-        if why:
-            kept.remove(topic)
-            remarks.append(f"{topic} is left out: {why}")
+    left = {topic: "no CameraInfo is beside it" for topic in images if not infos[topic]}
+    left |= {t: f"{frame} is no frame of a sensor, as merged clouds have" for t, frame in frames.items() if frame in NO_SENSORS}
+    best: dict[tuple[bool, str], str] = {}  # topic of what comes from a frame
+    for topic in sorted(first.keys() - left.keys(), key=lambda t: (is_rectified(t) if t in images else len(first[t]), t)):
+        of = topic in images, frames[topic] or topic
+        if of in best:
+            left[best[of]] = f"{topic} is of the same frame"
+        best[of] = topic
+    kept = [topic for topic in first if topic not in left]
     kept.sort(key=lambda topic: (topic in images, topic))
     names, used = _names(kept), Counter(frames[topic] for topic in kept)
     own = {topic: frames[topic] if used[frames[topic]] == 1 else "" for topic in kept}  # "" as recorded
-    return [Sensor(names[t], CAMERA if t in images else LIDAR, t, infos[t] if t in images else "", own[t]) for t in kept], remarks
+    sensors = [Sensor(names[t], CAMERA if t in images else LIDAR, t, infos.get(t, ""), own[t]) for t in kept]
+    return sensors, [f"{topic} is left out: {why}" for topic, why in left.items()]
 
 
 def _of_folders(folders: Sequence[Path]) -> Iterator[Sensor]:
