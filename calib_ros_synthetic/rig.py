@@ -380,7 +380,7 @@ class RigPair:
     """One camera and one LiDAR of a rig as a source: up to rig.frames frames, rig.step seconds apart."""
 
     def __init__(self, rig: SyntheticRig, camera: str, lidar: str) -> None:
-        self.rig = rig
+        self.rig, self.cameras = rig, rig.cameras
         self._names = (
             named("camera", camera, {own: own for own in rig.cameras}),
             named("lidar", lidar, dict.fromkeys(rig.lidars, lidar)),

@@ -127,7 +127,10 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
 
     command = add("rig", "estimate the extrinsics of several cameras and LiDARs together", source=False)
     command.add_argument("source", help=SOURCE)
-    command.add_argument("--rig", required=True, metavar="YAML", help="its sensors and where they are believed to be")
+    command.add_argument(
+        "--rig", metavar="YAML", help="its sensors and where they are believed to be (default: all, as the recording states them)"
+    )
+    command.add_argument("--write-rig", metavar="YAML", help="write what was assumed without --rig, to be edited")
     command.add_argument("--frames", default="all", help="of every pair: all, 0,4,8 or 0:100:5")
     command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON; - = standard output")

@@ -94,6 +94,10 @@ def _calibrate(args: argparse.Namespace) -> int:
     args.initial = initial_of(args, config)
     check_camera_info(args.camera_info, config.camera)
     source = open_named_source(args, config)
+    cameras = getattr(source, "cameras", ())
+    if len(cameras) > 1 and args.camera is None:
+        names = ", ".join(cameras)
+        note(f"calib-ros: the recording has cameras {names}; --camera chooses one, calib-ros rig estimates all together")
     result = calibrate(
         *(source, args.frames, args.initial, args.yaw_deg, config),
         *(args.search_deg, args.search_m, args.overlay),
@@ -110,16 +114,14 @@ def _rig(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import configuration
     from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
     from calib_ros.datasets.rig import open_rig
-    from calib_ros.io import check_output
+    from calib_ros.datasets.rig_source import rig_yaml
+    from calib_ros.io import check_output, write_atomically
     from calib_ros.rig.description import read_rig
     from calib_ros.rig.edges import RigMeasurer
+    from calib_ros.rig.recorded import joined, recorded_rig
     from calib_ros.rig.report import RigReport, check_out, load
 
-    description = read_rig(args.rig)
     before = None if args.before is None else load(args.before)
-    if before is not None and set(before.poses) != {sensor.name for sensor in description.sensors}:
-        names = ", ".join(before.poses)
-        raise BadInputError(f"--before {args.before} is of other sensors ({names}) than {args.rig}; give a result of this rig")
     config = configuration(args.config, args.seed)
     check_json(args.json)
     if args.report is not None and "rig" not in extensions.names(extensions.PAGES):
@@ -128,7 +130,24 @@ def _rig(args: argparse.Namespace) -> int:
     for path in args.out:
         check_out(path)
         check_output(path, "--out")
-    rig = open_rig(args.source, description)
+    if args.rig is not None:
+        if args.write_rig is not None:
+            raise BadInputError(f"--write-rig {args.write_rig} writes what is assumed without --rig; leave one of them out")
+        description = read_rig(args.rig)
+        rig = open_rig(args.source, description)
+    else:
+        description, rig, remarks = recorded_rig(args.source)
+        if args.write_rig is not None:
+            check_output(args.write_rig, "--write-rig")
+            write_atomically(args.write_rig, rig_yaml(description).encode())
+        description, left = joined(description, args.source)
+        for remark in (*remarks, *left):
+            note(f"calib-ros: {remark}")
+    if before is not None and set(before.poses) != {sensor.name for sensor in description.sensors}:
+        names = ", ".join(before.poses)
+        raise BadInputError(
+            f"--before {args.before} is of other sensors ({names}) than {args.rig or args.source}; give a result of this rig"
+        )
     with progress_bar("measuring") as step:
         measurer = RigMeasurer(rig, description, config, args.frames, lambda text, share: step(share))
         measured = measurer.measure()

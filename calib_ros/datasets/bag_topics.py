@@ -23,37 +23,47 @@ REMEDIES = {
     "LaserScan": "a scan of one plane has no edges to calibrate by; record a 3-D LiDAR",
 }
 MOST_NAMED = 40  # topics that an error names
+SEVERAL = ("--image-topic", "--points-topic")  # options that choose one of a rig's sensors
 DEPTH = "/compressedDepth"  # how image_transport names the topics of depth images
 
 
 def choose_image(bag: BagFile, requested: str | None, option: str = "--image-topic") -> str:
     """The image topic: the requested one, or the only one. A raw image wins over its compressed transport. option: what to set,
     if it is not there."""
-    candidates = _with_type(bag, IMAGE, COMPRESSED)
-    if requested is None:
-        transports = {f"{name}/compressed" for name in candidates}
-        candidates = [name for name in candidates if not name.endswith(DEPTH) and name not in transports]
-    if requested is not None or not candidates:
-        candidates += _with_type(bag, *VIDEO)
+    candidates = pictures(bag) if requested is None else _with_type(bag, IMAGE, COMPRESSED, *VIDEO)
     return _choose(bag, requested, candidates, "Image, CompressedImage or video", option)
+
+
+def pictures(bag: BagFile) -> list[str]:
+    """Topics of images, but for depth images and further forms of the same topic; of video where there are no others."""
+    found = _with_type(bag, IMAGE, COMPRESSED)
+    transports = {f"{name}/compressed" for name in found}
+    return [name for name in found if not name.endswith(DEPTH) and name not in transports] or _with_type(bag, *VIDEO)
 
 
 def choose_points(bag: BagFile, requested: str | None, option: str = "--points-topic") -> str:
     """The cloud topic: the requested one, or the only one. option: what to set, if it is not there."""
-    candidates = _with_type(bag, POINTS)
-    if requested is not None or not candidates:
-        candidates += _with_type(bag, *LIVOX, COMPRESSED_POINTS)
+    candidates = clouds(bag) if requested is None else _with_type(bag, POINTS, *LIVOX, COMPRESSED_POINTS)
     return _choose(bag, requested, candidates, "PointCloud2", option)
+
+
+def clouds(bag: BagFile) -> list[str]:
+    """Topics of scanners, in other forms where there is no PointCloud2."""
+    return _with_type(bag, POINTS) or _with_type(bag, *LIVOX, COMPRESSED_POINTS)
 
 
 def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str, option: str = "--camera-info-topic") -> str:
     """The requested CameraInfo topic, or the one beside the image (image_transport's rule), or the only one. option: what to set,
     if it is not there."""
-    candidates = _with_type(bag, CAMERA_INFO)
-    beside = re.sub(r"/(compressed|ffmpeg|foxglove)$", "", image_topic).rpartition("/")[0] + "/camera_info"
-    if requested is None and beside in candidates:
-        return beside
-    return _choose(bag, requested, candidates, "CameraInfo", option)
+    if requested is None and (found := info_beside(bag, image_topic)):
+        return found
+    return _choose(bag, requested, _with_type(bag, CAMERA_INFO), "CameraInfo", option)
+
+
+def info_beside(bag: BagFile, image_topic: str) -> str:
+    """The CameraInfo topic that image_transport looks for; "" if the bag has none there."""
+    name = re.sub(r"/(compressed|ffmpeg|foxglove)$", "", image_topic).rpartition("/")[0] + "/camera_info"
+    return name if name in _with_type(bag, CAMERA_INFO) else ""
 
 
 def is_rectified(image_topic: str) -> bool:
@@ -78,6 +88,7 @@ def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: st
     if candidates:
         raise BadInputError(
             f"bag {bag.path} has {len(candidates)} topics of type {kind}: {_named(candidates)}; choose one with {option}"
+            + (", or estimate all sensors together with calib-ros rig" if option in SEVERAL else "")
         )
     others = _named([f"{topic.name} ({topic.type})" for topic in bag.topics.values()]) or "nothing at all"
     names = dict.fromkeys(topic.type.rpartition("/")[2] for topic in bag.topics.values() if topic.messages)

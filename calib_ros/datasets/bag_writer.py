@@ -10,7 +10,6 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -19,7 +18,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets.bag_file import TF_STATIC
 from calib_ros.datasets.bag_messages import typestore
-from calib_ros.datasets.rig_source import CAMERA, RecordedRig
+from calib_ros.datasets.rig_source import CAMERA, LIDAR, RecordedRig, RigDescription, Sensor, rig_yaml
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud
@@ -32,7 +31,6 @@ BAG_VERSION: Final = 8  # what every ROS 2 release from Humble on reads
 STORAGE = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 DATATYPES = {"<f4": 7, "<u2": 4}  # of sensor_msgs/PointField, by numpy's
 DESCRIPTION = ".rig.yaml"  # beside the bag of a rig
-SHOWN_DIGITS = 6  # of priors: micrometres
 Progress = Callable[[int, int], None]  # called with how much is written, and how much there is
 Message = tuple[int, str, Any]  # stamp in ns, topic, message object of rosbags
 _FOREVER = QosTime(9223372036, 854775807)
@@ -74,18 +72,12 @@ def write_rig_bag(
     if described.exists():
         raise BadInputError(f"{described} exists already and is not overwritten; remove it or give another path")
     _write(_of_rig(rig, progress), path, storage)
-    sensors: dict[str, Any] = {}
+    sensors = []
     for name in (*rig.lidars, *rig.cameras):
-        is_camera = name in rig.cameras
-        own = {"kind": CAMERA, "topic": f"/{name}/image", "camera_info": f"/{name}/camera_info"} if is_camera else {}
-        own = own or {"kind": "lidar", "topic": f"/{name}/points"}
-        sensors[name] = own | {"frame": rig.frame_id(name)}
-        if name != rig.reference_sensor:
-            T = rig.prior(name)
-            parts = {"translation_m": T[:3, 3], "quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3])}
-            sensors[name]["prior"] = {key: [round(float(v), SHOWN_DIGITS) for v in values] for key, values in parts.items()}
-    description = {"reference": rig.reference_sensor, "sensors": sensors}
-    text = yaml.safe_dump(description, sort_keys=False, default_flow_style=None, width=200)
+        of_camera = CAMERA, f"/{name}/image", f"/{name}/camera_info"
+        kind, topic, info = of_camera if name in rig.cameras else (LIDAR, f"/{name}/points", "")
+        sensors.append(Sensor(name, kind, topic, info, rig.frame_id(name), rig.prior(name)))
+    text = rig_yaml(RigDescription(tuple(sensors), rig.reference_sensor))
     write_atomically(described, text.encode())
     return path, described
 

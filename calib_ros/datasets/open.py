@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.datasets.capture import CaptureSource, is_capture
-from calib_ros.datasets.folder import EXPECTED_FOLDER, FolderSource, is_folder_dataset
+from calib_ros.datasets.folder import CLOUDS, EXPECTED_FOLDER, IMAGES, FolderSource, is_folder_dataset
 from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
 from calib_ros.datasets.nuscenes import EXPECTED_NUSCENES, NuScenesSource, split_scene, tables_folder
 from calib_ros.datasets.once import EXPECTED_ONCE, OnceSource, is_once
@@ -75,6 +75,12 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     if path.is_file():
         raise BadInputError(f"{text} is not a dataset; give a .mcap, .db3 or .bag file, a bag folder or a KITTI folder")
     names = sorted(child.name for child in path.iterdir())
+    cameras = [name for name in names if (path / name / IMAGES).is_dir()]
+    if cameras:
+        raise BadInputError(
+            f"{text} holds folders of cameras: {', '.join(cameras)}; give one that has {CLOUDS}/ as well, or estimate all "
+            "sensors together with calib-ros rig"
+        )
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "nothing"
     raise BadInputError(
         f"{text} is not a dataset; looked for metadata.yaml, *.mcap, *.db3 or *.bag (bag), {EXPECTED_FOLDERS}, "

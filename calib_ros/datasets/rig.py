@@ -13,8 +13,6 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.camera_files import camera_file
 from calib_ros.datasets.folder import CLOUDS, IMAGES, FolderSource
-from calib_ros.datasets.kitti import KittiSource
-from calib_ros.datasets.nuscenes import NuScenesSource
 from calib_ros.datasets.open import is_bag, open_dataset
 from calib_ros.datasets.recent import Recent, Timed
 from calib_ros.datasets.rig_source import (
@@ -100,7 +98,7 @@ class ChosenSensors(ByDescription):
 
 
 class OneLidarRig(ByDescription):
-    """KITTI or nuScenes: several cameras around one LiDAR."""
+    """KITTI, nuScenes, ONCE: several cameras around one LiDAR; or any source of one camera and one LiDAR."""
 
     def __init__(self, text: str, description: RigDescription) -> None:
         super().__init__(text, description)
@@ -109,42 +107,53 @@ class OneLidarRig(ByDescription):
                 f"{text} has one LiDAR, but the description has {len(self.lidars)} and {len(self.cameras)} cameras; "
                 "list the LiDAR and one camera or more"
             )
-        recent = Recent(KEPT_CLOUDS)
-        self._sources: dict[str, KittiSource | NuScenesSource] = {}
+        recent, several = Recent(KEPT_CLOUDS), len(self.cameras) > 1
+        self._sources: dict[str, Any] = {}
         for name in self.cameras:
-            source = open_dataset(text, self.sensors[name].topic or name)
-            if not isinstance(source, (KittiSource, NuScenesSource)):
-                raise BadInputError(
-                    f"{text} is no recording of a rig; give a bag, KITTI, nuScenes, synthetic:rig=NAME, or folders of cameras"
-                )
-            source.recent = recent
+            try:
+                source: Any = open_dataset(text, self.sensors[name].topic or name)
+            except BadInputError:
+                source = None if several or self.sensors[name].topic else open_dataset(text)
+                if source is None or len(getattr(source, "cameras", ())) > 1:  # the only one needs no name
+                    raise
+            if several and len(getattr(source, "cameras", ())) < 2:
+                raise BadInputError(f"{text} has one camera, but the description has {', '.join(self.cameras)}; list that one")
+            if hasattr(source, "recent"):
+                source.recent = recent
             self._sources[name] = source
 
     def camera(self, name: str) -> Camera:
         """As of any rig."""
-        return self._sources[name].camera
+        camera: Camera = self._sources[name].camera
+        return camera
 
     def frame_id(self, name: str) -> str:
         """As of any rig."""
         own = self._first.lidar_frame if name in self.lidars else self._sources[name].camera_frame
-        return self.sensors[name].frame or own
+        return self.sensors[name].frame or str(own)
 
     def reference(self, name: str) -> Transform | None:
         """As of any rig; of nuScenes and KITTI objects, of the first frames."""
         base, own = (np.eye(4) if of in self.lidars else self._sources[of].reference for of in (self.reference_sensor, name))
-        return np.asarray(base @ se3.inverse(own))
+        return None if base is None or own is None else np.asarray(base @ se3.inverse(own))
 
     def pair(self, camera: str, lidar: str) -> Source:
         """As of any rig."""
         self.lidars.index(lidar)
-        return self._sources[camera]
+        source: Source = self._sources[camera]
+        return source
 
     def scans(self, lidar: str) -> Timed:
         """As of any rig."""
-        return self._first.scans()
+        source = self._first
+        if hasattr(source, "scans"):
+            own: Timed = source.scans()
+            return own
+        stamps = np.array([source[k].moment_of_cloud for k in range(len(source))], np.int64)
+        return Timed(stamps, lambda k: source[k].cloud)
 
     @property
-    def _first(self) -> KittiSource | NuScenesSource:
+    def _first(self) -> Any:
         return self._sources[self.cameras[0]]
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations, product
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import yaml
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
@@ -18,6 +19,7 @@ CAMERA, LIDAR = KINDS = "camera", "lidar"  # of sensors
 # As the default search box of the registration: what mounting by a drawing leaves open.
 SIGMA_DEG, SIGMA_M = 3.0, 0.2
 KEPT_CLOUDS = 32  # about 100 MB
+SHOWN_DIGITS = 6  # of priors: micrometres
 
 
 class RigSource(Protocol):
@@ -111,6 +113,22 @@ class RigDescription:
     def camera_pairs(self) -> list[tuple[str, str]]:
         """The pairs of a camera and a LiDAR, whether they share a view or not where no pairs are given."""
         return [pair for pair in self.pairs or product(self.cameras, self.lidars) if self[pair[0]].kind == CAMERA]
+
+
+def rig_yaml(description: RigDescription) -> str:
+    """rig.yaml of a description. A sensor without a prior is to be looked up in the recording."""
+    sensors: dict[str, Any] = {}
+    for own in description.sensors:
+        texts = {key: getattr(own, key) for key in ("kind", "topic", "camera_info", "frame", "mask")}
+        sensors[own.name] = {key: value for key, value in texts.items() if value}
+        if own.prior is not None and own.name != description.reference:
+            parts = {"translation_m": own.prior[:3, 3], "quaternion_xyzw": se3.quaternion_from_rotation(own.prior[:3, :3])}
+            sensors[own.name]["prior"] = {key: [round(float(v), SHOWN_DIGITS) for v in values] for key, values in parts.items()}
+        sigmas = {"sigma_deg": (own.sigma_deg, SIGMA_DEG), "sigma_m": (own.sigma_m, SIGMA_M)}
+        sensors[own.name] |= {key: value for key, (value, usual) in sigmas.items() if value != usual}
+    pairs = {} if description.pairs is None else {"pairs": [list(pair) for pair in description.pairs]}
+    content = {"reference": description.reference, "sensors": sensors, **pairs}
+    return str(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200))
 
 
 def prior_covariance(T: Transform, sigma_deg: float, sigma_m: float) -> Covariance:

@@ -219,6 +219,8 @@ def test_not_converged_is_exit_code_1(bag: Path, quick: list[str], tmp_path: Pat
         (["rig", "synthetic:rig=two_lidars_three_cameras", "--rig", "{tmp}/nothing.yaml"], "nothing.yaml"),
         (["rig", "synthetic:rig=two_lidars_three_cameras", "--rig", "{rig}", "--out", "x.txt"], "the ending tells the format"),
         (["rig", "synthetic:rig=two_lidars_three_cameras,frames=2", "--rig", "{rig}", "--frames", "7"], "position 7 is outside"),
+        (["rig", "synthetic:", "--rig", "{rig}", "--write-rig", "x"], "leave one of them out"),
+        (["rig", "{tmp}/nowhere"], "nowhere does not exist"),
         (["dance"], "dance"),
     ],
 )  # fmt: skip

@@ -10,18 +10,21 @@ import numpy as np
 import pytest
 import sample_sources
 import yaml
+from bag_recorder import START, Recorder
 
 from calib_ros import se3
 from calib_ros.cli.main import main
-from calib_ros.datasets import bag, kitti, nuscenes
+from calib_ros.datasets import bag, kitti, nuscenes, open_dataset
 from calib_ros.datasets.bag_file import BagFile
 from calib_ros.datasets.bag_rig import BagRig
 from calib_ros.datasets.recent import Recent
 from calib_ros.datasets.rig import open_rig
-from calib_ros.datasets.rig_source import RigDescription, Sensor
+from calib_ros.datasets.rig_source import RigDescription, Sensor, rig_yaml
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.initial_guess import nominal
+from calib_ros.rig.description import read_rig
+from calib_ros.rig.recorded import joined, recorded_rig
 from calib_ros_synthetic.parameters import parsed
 from calib_ros_synthetic.rig import SyntheticRig
 
@@ -212,9 +215,10 @@ def test_plain_folders_with_lidars_and_a_calibration_beside_them(tmp_path: Path)
 
 
 def test_what_is_no_recording_of_a_rig_is_said(tmp_path: Path, written: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for text in ("synthetic:frames=1,rig=os1_64_robot", str(tmp_path / "none")):
-        with pytest.raises(BadInputError, match=r"is no recording of a rig|does not exist"):
-            open_rig(text, described("l", l=lidar(), c=camera()))
+    with pytest.raises(BadInputError, match=r"does not exist"):
+        open_rig(tmp_path / "none", described("l", l=lidar(), c=camera()))
+    with pytest.raises(BadInputError, match=r"has one camera, but the description has c, d"):
+        open_rig("synthetic:frames=1,width=96", described("l", l=lidar(), c=camera(), d=camera()))
     assert main(["convert", TEXT, str(written), "--frames", "0:2"]) == 2
     assert main(["convert", TEXT, str(written)]) == 2
     assert "drive.rig.yaml exists already" in capsys.readouterr().err
@@ -228,3 +232,75 @@ def test_the_newest_are_kept() -> None:
     for key in (1, 2, 1, 3, 1, 2):
         assert recent(key, lambda key=key: made.append(key) or key) == key  # type: ignore[misc]
     assert made == [1, 2, 3, 2]
+
+
+def test_a_pair_is_a_rig_of_one() -> None:
+    text = "synthetic:frames=2,width=96,seed=2"
+    description, opened, _ = recorded_rig(text)
+    (eye,), (scanner,) = description.cameras, description.lidars
+    source = open_dataset(text)
+    assert (description.reference, opened.frame_id(eye)) == (scanner, source.camera_frame)
+    np.testing.assert_allclose(description[eye].prior, se3.inverse(source.reference), atol=1e-12)
+    assert [stamp for stamp, _ in opened.scans(scanner)] == [source[k].moment_of_cloud for k in range(2)]
+
+
+def test_a_bag_states_its_rig(written: Path, rig: SyntheticRig, tmp_path: Path) -> None:
+    description, opened, remarks = recorded_rig(str(written))
+    assert set(description.cameras) == set(rig.cameras)
+    assert set(description.lidars) == set(rig.lidars)
+    assert description["left"].topic == "/left/image"
+    reference = rig.reference(description.reference)
+    for name in {*rig.cameras, *rig.lidars} - {description.reference}:
+        expected = se3.inverse(reference) @ rig.reference(name)
+        np.testing.assert_allclose(description[name].prior, expected, atol=1e-9)
+        np.testing.assert_allclose(opened.reference(name), expected, atol=1e-9)
+    assert f"poses are relative to {description.reference}, with which most cameras share a view" in remarks[-1]
+    # What was assumed reads back as the same rig.
+    file = tmp_path / "rig.yaml"
+    file.write_text(rig_yaml(description))
+    again = read_rig(file)
+    assert [(own.name, own.kind, own.topic, own.frame) for own in again.sensors] == [
+        (own.name, own.kind, own.topic, own.frame) for own in description.sensors
+    ]
+    np.testing.assert_allclose(again["front"].prior, description["front"].prior, atol=1e-5)
+
+
+def test_topics_of_one_frame_are_one_sensor_and_merged_clouds_are_none(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "bag") as bag:
+        for topic in ("/front/image_raw", "/front/image_rect", "/rear/image_raw"):
+            bag.image(START, topic, frame=topic.split("/")[1])
+        bag.info(START, "/front/camera_info")
+        for topic, frame in (("/top/points_raw", "top"), ("/merged/points", "base_link")):
+            bag.cloud(START, topic, frame=frame)
+    description, _, remarks = recorded_rig(str(tmp_path / "bag"))
+    assert [(own.name, own.topic) for own in description.sensors] == [("top", "/top/points_raw"), ("front", "/front/image_rect")]
+    left = "\n".join(remarks)
+    for words in ("/front/image_raw is left out: /front/image_rect is of", "base_link is no frame of", "/rear/image_raw is left"):
+        assert words in left
+    with pytest.raises(BadInputError, match=r"does not state where front are relative to top; record /tf_static, or set"):
+        joined(description, "bag")
+
+
+def test_folders_of_sensors_are_a_rig(tmp_path: Path) -> None:
+    for name in ("front", "left"):
+        sample_sources.plain(tmp_path / name)
+    description, opened, _ = recorded_rig(str(tmp_path))
+    assert (description.lidars, description.cameras) == (("lidar",), ("front", "left"))  # the same clouds twice are one LiDAR
+    assert len(opened.pair("left", "lidar")) == len(opened.pair("front", "lidar"))
+    cloud = next((tmp_path / "left/clouds").iterdir())
+    cloud.write_bytes(cloud.read_bytes() + b"0 0 0")
+    assert set(recorded_rig(str(tmp_path))[0].lidars) == {"front_lidar", "left_lidar"}
+    with pytest.raises(BadInputError, match=r"holds folders of cameras: front, left; .*calib-ros rig"):
+        open_dataset(tmp_path)
+
+
+def test_nuscenes_and_kitti_state_their_rig(tmp_path: Path) -> None:
+    sample_sources.nuscenes(tmp_path / "nuscenes")
+    description, _, _ = recorded_rig(str(tmp_path / "nuscenes"))
+    assert (description.reference, description.cameras) == ("LIDAR_TOP", ("CAM_FRONT",))
+    sample_sources.kitti(tmp_path / "kitti", "odometry", sample_sources.frames())
+    description, opened, _ = recorded_rig(str(tmp_path / "kitti"))
+    assert description.cameras == ("camera_2",)
+    np.testing.assert_allclose(
+        description["camera_2"].prior, se3.inverse(opened.pair("camera_2", "velo_link").reference), atol=1e-9
+    )
