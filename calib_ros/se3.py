@@ -11,7 +11,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError
@@ -75,7 +74,8 @@ def log(T: ArrayLike) -> Matrix:
     a, b, c = 0.5 * (r21 - r12), 0.5 * (r02 - r20), 0.5 * (r10 - r01)  # the axis times the sine of the angle
     angle = math.atan2(math.sqrt(a * a + b * b + c * c), 0.5 * (r00 + r11 + r22 - 1))
     if angle > 3.0:  # near half a turn the sine does not determine the axis
-        a, b, c = Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist()
+        q = quaternion_from_rotation(T[:3, :3])
+        a, b, c = (2 * math.atan2(float(np.linalg.norm(q[:3])), q[3]) / np.linalg.norm(q[:3]) * q[:3]).tolist()
     else:
         sine = _series(angle)[0]
         a, b, c = a / sine, b / sine, c / sine
@@ -131,15 +131,40 @@ def from_parts(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
     return T
 
 
+def rotation_from_vector(vector: ArrayLike) -> Matrix:
+    """Rotation vector (3,) in rad -> (3, 3)."""
+    return np.asarray(exp([*np.asarray(vector, float), 0.0, 0.0, 0.0])[:3, :3])
+
+
+def rotation_vector(R: ArrayLike) -> Matrix:
+    """(3, 3) -> rotation vector (3,) in rad, of an angle in [0, pi]."""
+    return log(from_parts(R, np.zeros(3)))[:3]
+
+
 def rotation_from_euler(yaw: float, pitch: float, roll: float) -> Matrix:
     """Intrinsic z-y-x Euler angles (alpha, beta, gamma) in rad -> (3, 3), eq. 2.7."""
-    return np.asarray(Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix())
+    (sy, sp, sr), (cy, cp, cr) = np.sin([yaw, pitch, roll]), np.cos([yaw, pitch, roll])
+    return np.array([
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ])  # fmt: skip
 
 
 def quaternion_from_rotation(R: ArrayLike) -> Matrix:
     """(3, 3) -> unit quaternion (x, y, z, w) with w >= 0; ROS order (eq. 2.14 writes the real part first)."""
-    x, y, z, w = q = Rotation.from_matrix(np.asarray(R, float)).as_quat()
-    return np.asarray(q if (w, x, y, z) > (0, 0, 0, 0) else -q)  # as canonical=True of SciPy 1.11; Ubuntu 22.04 has 1.8
+    R = np.asarray(R, float)
+    # From its largest part, which no difference of nearly equal numbers makes (Shepperd 1978).
+    trace, k = float(np.trace(R)), int(np.argmax([*np.diag(R), np.trace(R)]))
+    if k == 3:
+        q = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1 + trace])
+    else:
+        i, j = (k + 1) % 3, (k + 2) % 3
+        q = np.empty(4)
+        q[[k, i, j, 3]] = 1 - trace + 2 * R[k, k], R[i, k] + R[k, i], R[j, k] + R[k, j], R[j, i] - R[i, j]
+    q /= np.linalg.norm(q)
+    x, y, z, w = q.tolist()
+    return q if (w, x, y, z) > (0, 0, 0, 0) else -q
 
 
 def rotation_from_quaternion(xyzw: ArrayLike) -> Matrix:
@@ -147,13 +172,14 @@ def rotation_from_quaternion(xyzw: ArrayLike) -> Matrix:
     q = np.asarray(xyzw, float)
     if q.shape != (4,) or not np.isfinite(q).all() or np.linalg.norm(q) < 1e-9:
         raise BadInputError(f"quaternion {q.tolist()} is no rotation; give x, y, z, w with a norm of 1")
-    return np.asarray(Rotation.from_quat(q).as_matrix())
+    S, w = skew(q[:3]), q[3]
+    return np.asarray(np.eye(3) + 2 * (w * S + S @ S) / (q @ q))
 
 
 def rotation_error_deg(R_reference: ArrayLike, R: ArrayLike) -> float:
     """Angle of R_refᵀ R in degrees, eq. 2.19; (4, 4) transforms are accepted too."""
     A, B = np.asarray(R_reference, float)[:3, :3], np.asarray(R, float)[:3, :3]
-    return float(np.rad2deg(Rotation.from_matrix(A.T @ B).magnitude()))
+    return float(np.rad2deg(np.linalg.norm(rotation_vector(A.T @ B))))
 
 
 def translation_error_m(T_reference: ArrayLike, T: ArrayLike) -> float:
@@ -195,5 +221,5 @@ def as_transform(value: ArrayLike, what: str = "transform") -> Matrix:
 
 def perturb(T: ArrayLike, rotation_deg: ArrayLike, translation_m: ArrayLike) -> Matrix:
     """Left perturbation by a rotation vector in degrees (3,) and a shift in metres (3,), both in the target frame."""
-    D = from_parts(Rotation.from_rotvec(np.deg2rad(np.asarray(rotation_deg, float))).as_matrix(), translation_m)
+    D = from_parts(rotation_from_vector(np.deg2rad(np.asarray(rotation_deg, float))), translation_m)
     return np.asarray(D @ np.asarray(T, float))

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from calib_ros import se3
@@ -143,7 +142,7 @@ def _nearest_within(error: Matrix, covariance: Covariance, half: Matrix) -> Matr
 def deviation(T_checked: Transform, T_estimated: Transform, covariance: Covariance) -> tuple[Matrix, Matrix]:
     """Error (6,) of T_checked against T_estimated (4, 4) as `CheckResult.axes`, rad and m, and its covariance (6, 6), from that
     of a left twist of T_estimated."""
-    turn = Rotation.from_matrix(T_checked[:3, :3] @ T_estimated[:3, :3].T).as_rotvec()
+    turn = se3.rotation_vector(T_checked[:3, :3] @ T_estimated[:3, :3].T)
     error = np.concatenate([turn, T_checked[:3, 3] - T_estimated[:3, 3]])
     A = se3.parts_jacobian(T_estimated)
     return error, A @ covariance @ A.T

@@ -63,7 +63,7 @@ class ScoreConfig(Stage):
 
 @dataclass(frozen=True)
 class SearchConfig(Stage):
-    """The global search: a box around the prior, Sobol starts, successive halving. Rounds are small: most need one or two."""
+    """The global search: a box around the prior, even starts, successive halving. Rounds are small: most need one or two."""
 
     rotation_deg: float = option(3.0, "half width of the search box per rotation axis, deg; 0 = refine only", low=0.0, high=45.0)
     translation_m: float = option(0.3, "half width of the search box per translation axis, m; 0 = refine only", low=0.0, high=3.0)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
@@ -153,7 +152,7 @@ def lidar_twist(values: Matrix, T_velo_imu: Transform) -> Matrix:
     """Numbers of an oxts file (30,) -> twist (6,) of the LiDAR in its own frame, rad/s and m/s."""
     # vf, vl, vu are level with the ground (dataformat.txt), wx, wy, wz in the body's frame: roll and pitch separate the two.
     roll, pitch = values[ATTITUDE]
-    R_level_body = Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix()
+    R_level_body = se3.rotation_from_euler(0.0, pitch, roll)
     R, t = T_velo_imu[:3, :3], T_velo_imu[:3, 3]
     turn = R @ values[RATES]
     # Lever arm: the LiDAR's origin is at -R' t in the IMU's frame.

@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
+from calib_ros import se3
 from calib_ros.arrays import Matrix as Floats
-from calib_ros.lidar.segmentation import fit_ground
+from calib_ros.lidar.segmentation import fit_ground, neighbours_of
 from calib_ros.se3 import skew
 
 # Points of the two rounds of the fit, the first by far ones: errors are below 0.02 deg and 1 cm on all scanners tried.
@@ -52,7 +51,7 @@ class ScannerPose:
     @staticmethod
     def given(position_m: Sequence[float], rpy_deg: Sequence[float]) -> ScannerPose:
         """Position (3,) in m, and roll, pitch, yaw (3,) in deg about fixed x, y, z, as in URDF and TF."""
-        return ScannerPose(np.array(position_m, float), Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix())
+        return ScannerPose(np.array(position_m, float), se3.rotation_from_euler(*np.deg2rad(rpy_deg)[::-1]))
 
     @property
     def is_cloud_frame(self) -> bool:
@@ -135,7 +134,7 @@ def pose_by_neighbours(xyz: NDArray[np.floating]) -> ScannerPose | None:
     """The pose at which neighbouring points of (n, 3) have the same elevation, without knowing any ring; None if there is none.
     Good to 0.2 deg and 0.2 m, from which rings can be told apart and fitted."""
     # Points are denser along rings than across: most of a point's neighbours are of its ring, of the rest half are above.
-    tree = KDTree(xyz, balanced_tree=False, compact_nodes=False)
+    tree = neighbours_of(xyz, balanced_tree=False, compact_nodes=False)
     some = np.arange(0, len(xyz), max(len(xyz) // PAIR_POINTS, 1) | 1)
     near = tree.query(xyz[some], np.arange(2, 2 + NEIGHBOURS))[1]
     P = np.concatenate([np.repeat(xyz[some], NEIGHBOURS, axis=0), xyz[near.ravel()]]).astype(np.float64)

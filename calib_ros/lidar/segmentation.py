@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 Floats = NDArray[np.float32]
 BATCH = 32  # planes tested at a time; their distances to all points of a scan take some 15 MB
@@ -102,15 +100,25 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
     return rank[labels]
 
 
+def neighbours_of(points: NDArray[Any], **options: bool) -> Any:
+    """A KD-tree of points (n, k), imported where it is used: of scipy, most processes need its special functions alone."""
+    from scipy.spatial import KDTree
+
+    return KDTree(points, **options)
+
+
 def connected_parts(pairs: NDArray[np.intp], n: int) -> NDArray[np.intp]:
     """Number of the connected component of each of n nodes. pairs: (m, 2) of connected ones."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.intp)
 
 
 def _dbscan(points: Floats, weight: NDArray[np.float64], eps: float, min_points: int) -> NDArray[np.intp]:
     """Cluster (n,) of points (n, 3) that stand for so many each, numbered by their first core points; NOISE."""
-    n, pairs = len(points), KDTree(points).query_pairs(eps, output_type="ndarray")
+    n, pairs = len(points), neighbours_of(points).query_pairs(eps, output_type="ndarray")
     first, second = np.ascontiguousarray(pairs.T)
     core = weight + np.bincount(first, weight[second], n) + np.bincount(second, weight[first], n) >= min_points
     found = np.full(n, NOISE, np.intp)
@@ -142,4 +150,4 @@ def _neighbours(points: Floats, eps: float) -> float:
     if len(points) <= MAX_NEIGHBOURS**0.5:
         return 0.0
     sample = points[:: len(points) // NEIGHBOUR_SAMPLE + 1]
-    return float(np.mean(KDTree(points).query_ball_point(sample, eps, return_length=True)) * len(points))
+    return float(np.mean(neighbours_of(points).query_ball_point(sample, eps, return_length=True)) * len(points))

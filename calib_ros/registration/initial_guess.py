@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
@@ -34,8 +33,11 @@ def nominal_start(yaw_deg: float = 0.0) -> Result:
 def poses(yaw: Matrix, pitch: Matrix, roll: Matrix, centre: Matrix) -> Matrix:
     """T_camera_lidar (k, 4, 4) of cameras at centre (k, 3) m in the LiDAR frame that look along its +x axis, turned left by yaw,
     then up by pitch, then clockwise by roll; (k,) rad each."""
-    turned = Rotation.from_euler("ZX", np.stack([-roll, -pitch], axis=1)).as_matrix()
-    R = turned @ nominal()[:3, :3] @ Rotation.from_rotvec(np.multiply.outer(-yaw, [0.0, 0, 1])).as_matrix()
+    X, Z = np.eye(6)[[0, 2]]
+    rolled, pitched, turned = (
+        se3.exp_many(np.multiply.outer(-a, axis))[:, :3, :3] for a, axis in ((roll, Z), (pitch, X), (yaw, Z))
+    )
+    R = rolled @ pitched @ nominal()[:3, :3] @ turned
     T = np.tile(np.eye(4), (len(R), 1, 1))
     T[:, :3, :3] = R
     T[:, :3, 3] = -np.einsum("kij,kj->ki", R, centre)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import scipy.stats.qmc  # noqa: F401 - half a second, for which the first search would wait
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rclpy.parameter import Parameter

@@ -14,7 +14,7 @@ from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.classes import PoseHypothesis
 from calib_ros.registration.initial_guess import MAX_DISTANCE_M, MAX_TILT_DEG, allowed, poses, rotation_distance_deg
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.starts import Sobol
+from calib_ros.registration.starts import EvenPoints
 from calib_ros_semantics.first_guess.centroids import agreed_poses, find_pairs
 from calib_ros_semantics.first_guess.score import (
     AROUND_DEG,
@@ -31,7 +31,7 @@ Matrix = NDArray[np.float64]
 # Hypotheses.
 CANDIDATES = 5  # hypotheses kept, best first; the right one is hardly ever a later one
 CENTROIDS, SWEEP = "centroids", "sweep"
-SWEEP_POSES = 4096  # a power of two, as Sobol's sequence wants it
+SWEEP_POSES = 4096
 SWEEP_POINTS, COARSE_POINTS, FINE_POINTS = 1000, 2000, 12000
 STARTS, FOLLOWED = 40, 15  # of all hypotheses, those optimised on the coarsest level, and of these those that go on
 SAME_DEG = (6.0, 2.0, 1.0)  # hypotheses nearer than this are one: at first, after the coarsest level, at the end
@@ -83,7 +83,7 @@ def _margin(T: Matrix, values: Matrix) -> float:
 
 def _sweep(score: PointScore, seed: int) -> Matrix:
     """The best of many allowed extrinsics, by the coarsest level (k, 4, 4)."""
-    unit = Sobol(6, seed=seed).next(SWEEP_POSES)
+    unit = EvenPoints(6, seed=seed).next(SWEEP_POSES)
     tilt, reach = np.deg2rad(MAX_TILT_DEG), MAX_DISTANCE_M / np.sqrt(3)
     transforms = poses(np.pi * unit[:, 0], tilt * unit[:, 1], tilt * unit[:, 2], reach * unit[:, 3:])
     transforms = transforms[allowed(transforms)]

@@ -19,7 +19,7 @@ from calib_ros.registration.score.point_score import PointScore, SmoothScore
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, Prior
 from calib_ros.registration.search.optimizers import levenberg_marquardt
-from calib_ros.registration.starts import Sobol
+from calib_ros.registration.starts import EvenPoints
 from calib_ros_semantics.first_guess.view import MATCHED, ClassView
 
 Matrix = NDArray[np.float64]
@@ -189,7 +189,7 @@ def _ranked_scores(view: InViewScore, ends: Matrix) -> Matrix:
 
 def around(T: Matrix, seed: int) -> Matrix:
     """T (4, 4), and extrinsics of about the same viewing direction from anywhere near the LiDAR (k, 4, 4)."""
-    unit = Sobol(6, seed=seed).next(AROUND)
+    unit = EvenPoints(6, seed=seed).next(AROUND)
     out = se3.exp_many(np.pad(np.deg2rad(AROUND_DEG) * unit[:, :3], ((0, 0), (0, 3)))) @ se3.from_parts(T[:3, :3], np.zeros(3))
     out[:, :3, 3] = -np.einsum("kij,kj->ki", out[:, :3, :3], MAX_DISTANCE_M / np.sqrt(3) * unit[:, 3:])
     out[0] = T

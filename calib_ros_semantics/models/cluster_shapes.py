@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
-from calib_ros.lidar.segmentation import cluster, connected_parts
+from calib_ros.lidar.segmentation import cluster, connected_parts, neighbours_of
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.intp]
@@ -64,7 +63,7 @@ def surface_shape(xyz: Floats) -> Surfaces:
     """
     member, n = cell_numbers(xyz, (SURFACE_CELL, SURFACE_CELL, SURFACE_CELL))
     middle = group_means(xyz, member, n)
-    far, near = KDTree(middle).query(middle, NEIGHBOURS, distance_upper_bound=MAX_NEIGHBOUR_DISTANCE)
+    far, near = neighbours_of(middle).query(middle, NEIGHBOURS, distance_upper_bound=MAX_NEIGHBOUR_DISTANCE)
     there = np.isfinite(far)
     near = np.where(there, near, 0)
     weight = (there / there.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -89,7 +88,7 @@ def find_poles(xyz: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArr
     at = group_means(xyz, cell, n)
     layer = np.floor(at[:, 2] / SLICE).astype(np.intp)
     sliced = np.column_stack([at[:, :2], layer * SLICE_SEPARATION])
-    tree = KDTree(sliced)
+    tree = neighbours_of(sliced)
     part = connected_parts(tree.query_pairs(SLICE_GAP, output_type="ndarray"), n)
     slabs = _slabs(xyz, part[cell], layer, part)
     thin = slabs.size[:, 0] <= MAX_POLE_WIDTH
@@ -134,7 +133,7 @@ def _slabs(xyz: Floats, part: Numbers, layer: Numbers, part_of_cell: Numbers) ->
     return Slabs(middle, np.hypot(middle[:, 0], middle[:, 1]), slices, np.sort(np.stack(sides, 1), axis=1)[:, ::-1])
 
 
-def _is_isolated(slabs: Slabs, chosen: Numbers, tree: KDTree, cells: Numbers) -> NDArray[np.bool_]:
+def _is_isolated(slabs: Slabs, chosen: Numbers, tree: Any, cells: Numbers) -> NDArray[np.bool_]:
     """Whether the surroundings of each of the chosen slabs are empty in its slice."""
     around = 0.5 * slabs.size[chosen, 0] + CLEARANCE + CLEARANCE_SHARE * slabs.distance[chosen]
     centre = np.column_stack([slabs.middle[chosen], slabs.slice[chosen] * SLICE_SEPARATION])
@@ -145,7 +144,7 @@ def _stack_numbers(slabs: Slabs, chosen: Numbers) -> Numbers:
     """Number of the stack of slabs above each other that each of the chosen slabs belongs to."""
     if len(chosen) == 0:
         return chosen
-    pairs = KDTree(slabs.middle[chosen]).query_pairs(MAX_SLICE_OFFSET, output_type="ndarray")
+    pairs = neighbours_of(slabs.middle[chosen]).query_pairs(MAX_SLICE_OFFSET, output_type="ndarray")
     a, b = chosen[pairs].T
     apart = np.abs(slabs.slice[a] - slabs.slice[b]) * SLICE
     return connected_parts(pairs[apart <= MAX_STACK_GAP + MAX_STACK_GAP_SHARE * slabs.distance[a]], len(chosen))
@@ -166,7 +165,7 @@ def _poles_and_trunks(
     if upright.any() and wide.any():
         foot = group_means(slabs.middle[chosen], stack, n)
         xy, z = at[wide, :2], at[wide, 2]
-        tree = KDTree(xy)
+        tree = neighbours_of(xy)
         for k in np.nonzero(upright)[0]:
             near = np.array(tree.query_ball_point(foot[k], CROWN_RADIUS), np.intp)
             above = near[(z[near] > high[k]) & (z[near] < high[k] + SLICE + CROWN_HEIGHT)]

@@ -14,7 +14,6 @@ from itertools import permutations, product
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
@@ -215,6 +214,8 @@ def _of_raw(camera: Camera, alpha: float) -> Matrix | None:
 
     best, (fx, fy), centre = None, np.diag(camera.K)[:2], camera.K[:2, 2]
     for start in np.geomspace(0.5 * min(fx, fy), 3 * max(fx, fy), STARTS):  # of a lens that folds, it has several solutions
+        from scipy.optimize import least_squares
+
         found = least_squares(off, [start, *centre], x_scale=[fx, fx, fx], max_nfev=ROUNDS)
         best = found if best is None or found.cost < best.cost else best
     if best is None or np.abs(best.fun).max() > SAME_K or np.abs([fx, fy] - best.x[0]).max() < SAME_K * fx:

@@ -15,7 +15,6 @@ from itertools import product
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.special import fdtri, ndtri
 
 from calib_ros import se3
@@ -49,7 +48,7 @@ from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, unlimited
 from calib_ros.registration.search.optimizers import JointView, ascend_jointly, linearised
-from calib_ros.registration.starts import Sobol
+from calib_ros.registration.starts import EvenPoints
 
 LEVELS = (2, 3, 4)  # blurred as far as a lens that is 5 % off moves the border of a picture
 NODES = (65, 49)  # across and down, at which the effect on rays is computed; between, it is smooth
@@ -311,7 +310,7 @@ def _main(part: Matrix, explanation: LensHypothesis) -> int:
 @cache
 def _draws(n: int) -> Matrix:
     """(n, k) of a standard normal distribution, evenly spread."""
-    return np.asarray(ndtri(0.5 + 0.5 * Sobol(n, 0).next(DRAWS)).T)
+    return np.asarray(ndtri(0.5 + 0.5 * EvenPoints(n, 0).next(DRAWS)).T)
 
 
 def _beyond(mean: Matrix, covariance: Matrix) -> float:
@@ -384,7 +383,7 @@ def estimate_lens(
     begun = (GROSS, -GROSS, -stated) if abs(stated) > GROSS else (GROSS, -GROSS)
     starts += [(T, value * radial, LEVELS) for value in begun if radial.any()]
     if turned is not None:
-        across = Rotation.from_matrix(T[:3, :3] @ turned[:3, :3].T).as_rotvec()[:2] * score.camera.K[0, 0] / score.camera.width
+        across = se3.rotation_vector(T[:3, :3] @ turned[:3, :3].T)[:2] * score.camera.K[0, 0] / score.camera.width
         looks = {CENTRE[0]: across[1], CENTRE[1]: -across[0]}
         change = np.array([looks.get(own.name, 0.0) for own in unknowns])
         starts.append((se3.from_parts(turned[:3, :3], T[:3, 3]), change, LEVELS))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
@@ -111,7 +110,7 @@ def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> Mot
     fits = solver.hypotheses(HYPOTHESES)
     motions = solver.motions()
     # Root mean square about every axis between two pictures.
-    turns = np.sqrt((Rotation.from_matrix(motions[:, :3, :3]).as_rotvec() ** 2).mean())
+    turns = np.sqrt(np.mean([se3.rotation_vector(R) ** 2 for R in motions[:, :3, :3]]))
     wrong, turn = np.rad2deg([fits[0].turn_error, float(turns)])
     if fits[0].unexplained > MAX_UNEXPLAINED or (wrong > MAX_TURN_ERROR_DEG and wrong > MAX_TURN_SHARE * turn):
         raise TooFewFeaturesError(
@@ -141,7 +140,7 @@ def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> Mot
 def _path(runs: Sequence[Run]) -> tuple[float, float]:
     """Largest distance in m and turn in rad of the LiDAR from where a run began."""
     poses = np.concatenate([run.poses for run in runs])
-    turns = Rotation.from_matrix(poses[:, :3, :3]).magnitude()
+    turns = np.array([np.linalg.norm(se3.rotation_vector(R)) for R in poses[:, :3, :3]])
     return float(np.linalg.norm(poses[:, :3, 3], axis=1).max()), float(turns.max())
 
 
@@ -161,7 +160,7 @@ def _with_upright(solver: HandEye, fit: Fit) -> Fit:
     if len(hidden):  # turned about it so that the LiDAR's z axis points up in the image as far as it can
         axis, z = hidden[0], R[:, 2]
         angle = np.arctan2(up @ np.cross(axis, z), up @ z - (axis @ z) * (axis @ up))
-        R = np.asarray(Rotation.from_rotvec(angle * axis).as_matrix() @ R)
+        R = np.asarray(se3.rotation_from_vector(angle * axis) @ R)
     else:
         up = UPRIGHT[np.argmax(UPRIGHT @ R[:, 2])]
         reach = np.deg2rad(SIGMAS * np.hypot(UPRIGHT_DEG, WEAK_DEG)) + SIGMAS * np.sqrt(np.linalg.eigvalsh(own)[-1])

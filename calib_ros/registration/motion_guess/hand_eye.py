@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
@@ -119,7 +118,7 @@ class HandEye:
             step = -np.linalg.solve(information + 1e-6 * np.eye(7), gradient)
             step *= min(1.0, 0.3 / max(float(np.linalg.norm(step[:3])), 1e-9))
             errors, spread = errors_at(step)
-            R, centre, wrong = Rotation.from_rotvec(step[:3]).as_matrix() @ R, centre + step[3:6], wrong + errors
+            R, centre, wrong = se3.rotation_from_vector(step[:3]) @ R, centre + step[3:6], wrong + errors
             clock = float(np.clip(clock + step[6], CLOCKS_S[0], CLOCKS_S[-1]))
             # As expectation maximisation has it: the spread of the errors found, and what is left open of each.
             found = np.sqrt([np.mean(wrong[:, s] ** 2 + spread[:, s]) for s in (slice(0, 3), slice(3, 6))])
@@ -169,7 +168,7 @@ class HandEye:
             information, gradient = _normal(r, J, 1 / (scale**2 + (r * r).sum(axis=1)))
             step = -np.linalg.solve(information + 1e-3 * np.diag(np.diag(information)) + 1e-9 * np.eye(3), gradient)
             step *= min(1.0, 0.3 / max(float(np.linalg.norm(step)), 1e-9))
-            R = Rotation.from_rotvec(step).as_matrix() @ R
+            R = se3.rotation_from_vector(step) @ R
             if np.abs(step).max() < 1e-4:
                 break
         return R
@@ -191,7 +190,7 @@ class HandEye:
         return np.asarray(np.arccos(np.clip((tracks.first * tracks.second).sum(axis=1), -1, 1)))
 
 
-_TURNS = Rotation.from_rotvec(STEP * np.eye(3)).as_matrix()
+_TURNS = np.array([se3.rotation_from_vector(axis) for axis in STEP * np.eye(3)])
 
 
 def _residuals(R: Matrix, centre: Matrix, motions: Matrix, tracks: Tracks) -> Matrix:
@@ -240,9 +239,8 @@ def _all_rotations(n: int) -> Matrix:
     s = np.arange(n) + 0.5
     r, q = np.sqrt(s / n), np.sqrt(1 - s / n)
     alpha, beta = 2 * np.pi * s / phi, 2 * np.pi * s / psi
-    return np.asarray(
-        Rotation.from_quat(np.c_[r * np.sin(alpha), r * np.cos(alpha), q * np.sin(beta), q * np.cos(beta)]).as_matrix()
-    )
+    quaternions = np.c_[r * np.sin(alpha), r * np.cos(alpha), q * np.sin(beta), q * np.cos(beta)]
+    return np.array([se3.rotation_from_quaternion(own) for own in quaternions])
 
 
 def distinct(rotations: Matrix, costs: Matrix, least_deg: float) -> list[int]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.starts import Sobol
+from calib_ros.registration.starts import EvenPoints
 
 NEIGHBOURS = 128
 HALF_WIDTH = np.array([np.deg2rad(6.0)] * 3 + [0.5] * 3)  # rad, m; edges move by tens of pixels: nothing matches but by chance
@@ -72,7 +72,7 @@ def null_extrinsics(T: Transform) -> Matrix:
 
 @cache
 def _twists() -> Matrix:
-    return se3.exp_many(Sobol(6, seed=0).next(NEIGHBOURS) * HALF_WIDTH)
+    return se3.exp_many(EvenPoints(6, seed=0).next(NEIGHBOURS) * HALF_WIDTH)
 
 
 def p_value(z_score: float, decoy_z: float | None, rounds: int = 1) -> float:

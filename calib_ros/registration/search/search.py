@@ -1,4 +1,4 @@
-"""Global search in a box around the prior: Sobol starts in all six degrees of freedom, successive halving, in rounds.
+"""Global search in a box around the prior: evenly spread starts in all six degrees of freedom, successive halving, in rounds.
 
 A round: starts of every seeding strategy -> their optima on the coarse levels -> the best polished by simplex -> the best of
 these refined with all points -> the neighbourhood of the best one. Rounds go on until independent starts agree on the best
@@ -21,7 +21,7 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.search.optimizers import levenberg_marquardt, nelder_mead
 from calib_ros.registration.search.parallel import SERIAL, Workers
-from calib_ros.registration.starts import Sobol
+from calib_ros.registration.starts import EvenPoints
 
 # What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
 # Seeding. Levels where starts are ranked and optimised first: the two coarsest find 49 of 80 KITTI frames, all three 66; in wide
@@ -160,7 +160,7 @@ class Optimum:
 
 
 class Rounds:
-    """A search, round by round: the box, the score on fewer and fewer points, the Sobol sequence that all starts are drawn from,
+    """A search, round by round: the box, the score on fewer and fewer points, the sequence that all starts are drawn from,
     and the optima so far.
 
     strategies: by the edges on every seed level, and by the guide if there is one. optimised: starts followed to the end. nearby:
@@ -192,7 +192,7 @@ class Rounds:
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
         self.user_prior, self._inverse_prior = user_prior, se3.inverse(T_prior)
-        self._sobol = Sobol(6, seed=config.seed)
+        self._points = EvenPoints(6, seed=config.seed)
         self.optimised = self._rounds = 0
         self._all: list[Optimum] = []
         self._polished: list[Optimum] = []
@@ -203,11 +203,11 @@ class Rounds:
         return score.subset(points, np.random.default_rng(self.config.seed))
 
     def _draw(self) -> Matrix:
-        """The next starts (n, 6) in units of the box, -1..1; n a power of two, at which Sobol's sequence is balanced."""
+        """The next starts (n, 6) in units of the box, -1..1."""
         searched = self.half > 0
         times = float(np.sqrt(np.prod(self.half[searched] / BASE_BOX[searched])))
         n = int(self.config.starts * np.clip(times, 1, MOST_TIMES))
-        return self._sobol.next(1 << (n - 1).bit_length())
+        return self._points.next(1 << (n - 1).bit_length())
 
     def penalty(self, T: Transform) -> float:
         """Of leaving the box, and the cost of the user's prior."""
@@ -318,7 +318,7 @@ class Rounds:
         """Something better near the best finalist (4, 4), beyond a ridge, else itself; and all optima that were met."""
         best, ends = top, [top]
         half = np.where(self.half > 0, NEARBY, 0.0)
-        candidates = se3.exp_many(Sobol(6, seed=self.config.seed).next(NEARBY_STARTS) * half) @ top
+        candidates = se3.exp_many(EvenPoints(6, seed=self.config.seed).next(NEARBY_STARTS) * half) @ top
         order = np.argsort(-self.coarse.values(candidates, 2), kind="stable")
 
         def optimum_from(k: int) -> tuple[Matrix, float]:

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import sample_sources
 import yaml
 from paths import ROOT
 
@@ -479,15 +480,24 @@ def test_summary_reports_deskewing(street: list) -> None:
     assert "motion.deskew: off" in motion(street, MotionConfig(deskew="off"))
 
 
-def test_help_does_not_wait_for_heavy_libraries() -> None:
+def loaded(modules: set[str], *arguments: str) -> str:
+    """Which of these modules a command has imported when it is done."""
     code = (
         "import sys; from calib_ros.cli.main import main\n"
-        "try: main(['--help'])\n"
+        f"try: main({list(arguments)})\n"
         "except SystemExit: pass\n"
-        "print('LOADED', sorted({'numpy', 'scipy', 'cv2', 'yaml', 'rclpy'} & set(sys.modules)))"
+        f"print('LOADED', sorted({modules} & set(sys.modules)))"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.splitlines()[-1] == "LOADED []"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()[-1]
+
+
+def test_commands_do_not_wait_for_heavy_libraries(street: list, tmp_path: Path) -> None:
+    assert loaded({"numpy", "scipy", "cv2", "yaml", "rclpy"}, "--help") == "LOADED []"
+    sample_sources.kitti(tmp_path, "odometry", street[:2])
+    heavy = {f"scipy.{part}" for part in ("stats", "optimize", "spatial", "sparse")} | {"matplotlib", "rosbags", "onnxruntime"}
+    files = str(tmp_path), "--initial", "reference", "--search-deg", "1", "--json", str(tmp_path / "found.json")
+    assert loaded(heavy, "calibrate", *files) == "LOADED []"
+    assert json.loads((tmp_path / "found.json").read_text())["score"] is not None  # it has searched
 
 
 def test_a_missing_library_is_named_with_the_command_that_installs_it(

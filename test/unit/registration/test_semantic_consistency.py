@@ -44,7 +44,7 @@ def test_semantic_consistency_is_highest_at_the_truth(source, features):
     """Without common classes nothing is said about it."""
     consistency = consistency_score([f.view for f in features])
     assert semantic_likelihood_ratio(consistency, source.reference) == RATIO_CONSISTENT
-    assert semantic_likelihood_ratio(consistency, se3.exp(OFF) @ source.reference) == RATIO_INCONSISTENT
+    assert semantic_likelihood_ratio(consistency, se3.exp(-OFF) @ source.reference) == RATIO_INCONSISTENT
     assert consistency_score([]) is None
     blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
     assert consistency_score([blank]) is None
