@@ -360,10 +360,10 @@ class CastorenaScore:
 
     def value(self, T: Matrix) -> float:
         """At T_camera_lidar (4, 4)."""
-        return -float(np.mean([self._misfit(T, xyz, weights) for xyz, weights in self._frames]))
-
-    def _misfit(self, T: Matrix, xyz: Map, weights: Map) -> float:
-        u, v, points = project(xyz, T, self.camera)
-        depth = xyz[points] @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
-        pixels, x, y = slopes_at_points((self.camera.height, self.camera.width), self._sigma, u, v, depth)
-        return misfit((weights[0][pixels], weights[1][pixels]), (x, y))
+        found = []
+        for xyz, weights in self._frames:
+            u, v, points = project(xyz, T, self.camera)
+            depth = xyz[points] @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
+            pixels, x, y = slopes_at_points((self.camera.height, self.camera.width), self._sigma, u, v, depth)
+            found.append(misfit((weights[0][pixels], weights[1][pixels]), (x, y)))
+        return -float(np.mean(found))

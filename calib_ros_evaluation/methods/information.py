@@ -77,16 +77,14 @@ def density(counts: NDArray[np.number], bandwidth: tuple[float, float]) -> Matri
     bandwidth: along rows and columns, in bins. The histogram is mirrored at its ends, so that no mass leaves it; the marginals
     of the result are those of the histogram, smoothed alike.
     """
-    down, across = (_kernel(h) for h in bandwidth)
+    kernels = []
+    for h in bandwidth:
+        r = int(np.ceil(TAIL * h))
+        weight = np.exp(-0.5 * (np.arange(-r, r + 1) / max(h, 1e-9)) ** 2)
+        kernels.append(np.asarray((weight / weight.sum())[:, None], np.float32))
+    down, across = kernels
     smooth = cv2.sepFilter2D(counts.astype(np.float32), cv2.CV_32F, across, down, borderType=cv2.BORDER_REFLECT)
     return np.asarray(smooth / smooth.sum(dtype=np.float64), np.float64)
-
-
-def _kernel(bandwidth: float) -> NDArray[np.float32]:
-    """Gaussian (2 r + 1, 1) of a standard deviation in bins, sum 1."""
-    r = int(np.ceil(TAIL * bandwidth))
-    weight = np.exp(-0.5 * (np.arange(-r, r + 1) / max(bandwidth, 1e-9)) ** 2)
-    return np.asarray((weight / weight.sum())[:, None], np.float32)
 
 
 def known_reflectivity(view: PointFeatures, frame_name: str) -> NDArray[np.float32]:
@@ -178,13 +176,12 @@ class DistanceScore:
 
     def value(self, T: Matrix) -> float:
         """At T_camera_lidar (4, 4); a frame without a point in the image has a distance of 1."""
-        return -float(np.mean([_distance(frame, T) for frame in self.frames]))
-
-
-def _distance(frame: PointFeatures, T: Matrix) -> float:
-    u, v, points = project(frame.xyz, T, frame.camera)
-    counts = joint_counts(frame.value[points], frame.image[v, u], NID_BINS)
-    return normalised_information_distance(counts / len(points)) if len(points) else 1.0
+        distances = []
+        for frame in self.frames:
+            u, v, points = project(frame.xyz, T, frame.camera)
+            counts = joint_counts(frame.value[points], frame.image[v, u], NID_BINS)
+            distances.append(normalised_information_distance(counts / len(points)) if len(points) else 1.0)
+        return -float(np.mean(distances))
 
 
 def unhidden(frame: PointFeatures, T: Matrix, tolerance: float) -> NDArray[np.intp]:

@@ -177,12 +177,11 @@ class MulfeatScore:
 
     def value(self, T: Matrix) -> float:
         """At T_camera_lidar (4, 4). A frame without LiDAR edges in the image adds 0."""
-        return sum(self._of_frame(f, T) for f in self.frames) / len(self.frames)
-
-    def _of_frame(self, f: PointFeatures, T: Matrix) -> float:
-        u, v, inside = project(f.xyz, T, f.camera)
-        P, E = f.value[inside], f.image[v, u]
-        is_edge = self.lidar_edge <= P
-        n_edges = int(np.count_nonzero(is_edge))
-        n_matched = int(np.count_nonzero(is_edge & (self.image_edge <= E)))
-        return n_matched / max(n_edges, 1) * float(P @ E)
+        total = 0.0
+        for f in self.frames:
+            u, v, inside = project(f.xyz, T, f.camera)
+            P, E = f.value[inside], f.image[v, u]
+            is_edge = self.lidar_edge <= P
+            n_matched = int(np.count_nonzero(is_edge & (self.image_edge <= E)))
+            total += n_matched / max(int(np.count_nonzero(is_edge)), 1) * float(P @ E)
+        return total / len(self.frames)

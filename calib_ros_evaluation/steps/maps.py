@@ -25,7 +25,6 @@ from calib_ros_evaluation.steps.pictures import (
     VIRIDIS,
     WRONG_DEG,
     WRONG_M,
-    Image,
     Matrix,
     RegisteredFrame,
     Scale,
@@ -91,34 +90,32 @@ def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
             f"Figure 3.13. {text} {shown.mean():.1%} of the pixels are filled.",
             draw(levels / DEPTH_UNITS, shown),
         )
+    h, w = sparse_depth.shape
+    window = busiest(scene.maps.discontinuity, max(h // 3, 2), max(w // 8, 2))
+    pictures = [
+        inverted.palette[np.where(levels[window] != EMPTY, inverted.levels(levels[window] / DEPTH_UNITS), 0)]
+        for levels in stages.values()
+    ]
     yield wide_step(
         "Completion, magnified",
         "Figure 3.13 on the part of the picture with the strongest jumps, pixel by pixel: from single points to a surface. "
         "The last step but the inversion back is a median blur, which takes away what sticks out of a surface.",
-        _magnified(stages, scene.maps.discontinuity, inverted),
+        inverted.below(tiles(pictures, list(stages), 3, w)),
     )
-
-
-def _magnified(stages: dict[str, Levels], interest: NDArray[np.float32], scale: Scale) -> Image:
-    h, w = interest.shape
-    window = busiest(interest, max(h // 3, 2), max(w // 8, 2))
-    pictures = [
-        scale.palette[np.where(levels[window] != EMPTY, scale.levels(levels[window] / DEPTH_UNITS), 0)]
-        for levels in stages.values()
-    ]
-    return scale.below(tiles(pictures, list(stages), 3, w))
 
 
 def map_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Discontinuity, sparse maps, completion, dense maps, edges."""
-    lidar = scene.maps.lidar
-    size = lidar.occupied.size
+    lidar, points, camera = scene.maps.lidar, scene.thesis.points, scene.frame.camera
+    u, v, inside = project(points.xyz, scene.T, camera)
+    depth = np.zeros((camera.height, camera.width), np.float32)
+    depth[v, u] = points.depth[inside]  # far ones first
     yield step(
         "Scan on the image",
         "All points that pass the filters, by eq. 2.30 with the extrinsic of this page, coloured by depth. "
         f"{np.count_nonzero(lidar.occupied)} pixels "
         f"({lidar.occupied.mean():.1%}) hold a point; where several fall on one, the nearest counts.",
-        _points(scene),
+        depth_scale(points.depth[inside]).over(scene.gray, depth, depth > 0),
     )
     D = scene.maps.discontinuity
     jumps = scene.thesis.points.discontinuity
@@ -131,18 +128,8 @@ def map_steps(scene: RegisteredFrame) -> Iterator[Step]:
     )
     yield from _sparse(scene)
     yield from completion_steps(scene)
-    yield from _dense(scene, size)
+    yield from _dense(scene)
     yield from _edges(scene)
-
-
-def _points(scene: RegisteredFrame) -> NDArray[np.uint8]:
-    """The image with its points coloured by depth, far ones beneath."""
-    points, camera = scene.thesis.points, scene.frame.camera
-    u, v, inside = project(points.xyz, scene.T, camera)
-    scale = depth_scale(points.depth[inside])
-    depth = np.zeros((camera.height, camera.width), np.float32)
-    depth[v, u] = points.depth[inside]
-    return scale.over(scene.gray, depth, depth > 0)
 
 
 def _depth_scale(lidar: EdgeMaps) -> Scale:
@@ -174,7 +161,7 @@ def _sparse(scene: RegisteredFrame) -> Iterator[Step]:
     )
 
 
-def _dense(scene: RegisteredFrame, size: int) -> Iterator[Step]:
+def _dense(scene: RegisteredFrame) -> Iterator[Step]:
     config, lidar = thesis_of(scene.config), scene.maps.lidar
     shown = lidar.dense_depth != EMPTY
     yield step(
@@ -201,7 +188,7 @@ def _dense(scene: RegisteredFrame, size: int) -> Iterator[Step]:
     yield step(
         "Objects closed",
         f"Figure 3.15c: the object map after a closing by {config.closing} px, which joins the points of an object and keeps its "
-        f"size. {np.count_nonzero(lidar.dense_object) / size:.1%} of the pixels belong to an object.",
+        f"size. {(lidar.dense_object > 0).mean():.1%} of the pixels belong to an object.",
         NAMES[lidar.dense_object],
     )
 
