@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
@@ -206,6 +206,8 @@ def _share(success: pd.Series) -> tuple[float, float, float]:
 
 def frames(trials: dict[str, pd.DataFrame], styles: Styles) -> Plot:
     """Errors against the number of frames."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     figure = empty_figure(13, 5.2)
     numbers, by_number = groups(trials, "n")
     labels = {"rotation_deg": "rotation error, deg", "cm": "translation error, cm"}
@@ -218,8 +220,12 @@ def frames(trials: dict[str, pd.DataFrame], styles: Styles) -> Plot:
         axes.axhline(limit, color="0.5", linewidth=1, linestyle=(0, (2, 3)), zorder=1)
         _side_by_side(axes, found, styles, [str(n) for n in numbers])
         axes.set_yscale("log")
-        decimal(axes.yaxis)
-        axes.set_ylim(*_seen(found.values(), limit))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=30))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        shown = np.concatenate([[limit], *(np.ravel(values) for values in found.values())])
+        shown = shown[np.isfinite(shown) & (shown > 0)]
+        axes.set_ylim(max(shown.min() / 1.3, 1e-4), 1.3 * shown.max())
         axes.set(xlabel="frames", ylabel=f"{labels[column]} (logarithmic)")
     method_legend(figure, trials, styles)
     caption = "Median over all trials, bars from quartile to quartile; dotted: the limit of success."
@@ -239,19 +245,3 @@ def _side_by_side(axes: Any, found: Mapping[str, Sequence[Sequence[float]]], sty
         axes.errorbar(place[kept], y[kept], off, markersize=6, elinewidth=1, capsize=2.5, **styles[method])
     axes.set_xticks(places, labels)
     axes.grid(axis="y", color="0.9")
-
-
-def _seen(drawn: Iterable[Sequence[Sequence[float]]], limit: float) -> tuple[float, float]:
-    """Range of a logarithmic axis that shows all that is drawn, and the limit of success."""
-    kept = np.concatenate([limit * np.ones(1), *(np.ravel(values) for values in drawn)])
-    kept = kept[np.isfinite(kept) & (kept > 0)]
-    return float(max(kept.min() / 1.3, 1e-4)), float(1.3 * kept.max())
-
-
-def decimal(axis: Any) -> None:
-    """Ticks at 1, 2 and 5, written out."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=30))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
