@@ -150,7 +150,13 @@ def boxes(trials: Mapping[str, pd.DataFrame], styles: Styles) -> Plot:
     for axis, label in enumerate(AXES):
         axes = figure.add_subplot(2, 3, axis + 1)
         columns = [E[:, axis] for E in own.values()]
-        half = _half_range(columns, LIMITS[axis // 3])
+        # To where the whiskers of half of the methods end, so that one that is far off does not flatten all the others.
+        ends = []
+        for values in columns:
+            low, high = np.quantile(values, [0.25, 0.75])
+            beyond = 1.5 * (high - low)
+            ends.append(np.abs(values[(values >= low - beyond) & (values <= high + beyond)]).max())
+        half = max(1.15 * float(np.median(ends)), 2 * LIMITS[axis // 3])
         drawn = axes.boxplot(columns, patch_artist=True, widths=0.6, flierprops={"marker": ".", "markersize": 4, "alpha": 0.5})
         for part, median, method in zip(drawn["boxes"], drawn["medians"], own, strict=True):
             part.set(facecolor=styles[method]["color"], alpha=0.75, linewidth=1.6 if method == OURS else 0.9)
@@ -169,17 +175,6 @@ def boxes(trials: Mapping[str, pd.DataFrame], styles: Styles) -> Plot:
         '"out": so many trials lie outside the drawn range. Grey band: the limit of success.'
     )
     return finished(figure, "single_boxes", "Errors of single frames per axis", caption)
-
-
-def _half_range(columns: Sequence[Matrix], limit: float) -> float:
-    """Half the drawn range: where the whiskers of half of the methods end, so that one that is far off does not flatten all the
-    others; at least twice the limit of success."""
-    ends = []
-    for values in columns:
-        low, high = np.quantile(values, [0.25, 0.75])
-        inside = values[(values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))]
-        ends.append(float(np.abs(inside).max()))
-    return max(1.15 * float(np.median(ends)), 2 * limit)
 
 
 def starts(trials: dict[str, pd.DataFrame], styles: Styles) -> Plot:

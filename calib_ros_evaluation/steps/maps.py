@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -16,6 +15,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.score.point_score import Score, project
 from calib_ros_evaluation.curves import AXES, Curves, curves
+from calib_ros_evaluation.methods.method import MeanScore
 from calib_ros_evaluation.steps.cloud import REFLECTIVITY, depth_scale
 from calib_ros_evaluation.steps.pictures import (
     GREYS,
@@ -36,6 +36,7 @@ from calib_ros_evaluation.steps.pictures import (
     tiles,
 )
 from calib_ros_thesis.config import thesis_of
+from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import (
     BLUR,
     DEPTH_STEP,
@@ -215,21 +216,6 @@ def _edges(scene: RegisteredFrame) -> Iterator[Step]:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Both:
-    """J of eq. 3.12 as a score, which notes the normalised one on the way: both come from the same maps."""
-
-    score: ThesisScore
-    normalized: list[float] = field(default_factory=list)
-
-    def value(self, T: Matrix) -> float:
-        """J at T (4, 4), at the last smoothing."""
-        pixels, _, edges = self.score.shown(T)[0]
-        J = float(np.sum(edges * self.score.features[0].image_edges[-1].ravel()[pixels], dtype=np.float64))
-        self.normalized.append(J / max(float(np.sum(edges, dtype=np.float64)), 1e-12))
-        return J
-
-
 def score_steps(scene: RegisteredFrame, samples: int) -> Iterator[Step]:
     """D, W, J at the right and at a wrong extrinsic, curves with `samples` values per axis."""
     config, maps = thesis_of(scene.config), scene.maps
@@ -318,13 +304,22 @@ def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score |
 def _curve_steps(scene: RegisteredFrame, fast: Score | None, samples: int) -> Iterator[Step]:
     found: dict[str, Curves] = {}
     try:
-        both = Both(ThesisScore([scene.thesis], scene.T, scene.config))
+        score = ThesisScore([scene.thesis], scene.T, scene.config)
     except TooFewFeaturesError as error:
         yield score_step("Loss curves", f"No curves: {error}.")
         return
-    raw = curves(both, scene.T, ROTATION_DEG, TRANSLATION_M, samples)
+    normalized: list[float] = []
+
+    def both(features: ThesisFeatures, T: Matrix) -> float:
+        """J of eq. 3.12 at T (4, 4), at the last smoothing; the normalised one is noted: both come from the same maps."""
+        pixels, _, edges = score.shown(T)[0]
+        J = float(np.sum(edges * features.image_edges[-1].ravel()[pixels], dtype=np.float64))
+        normalized.append(J / max(float(np.sum(edges, dtype=np.float64)), 1e-12))
+        return J
+
+    raw = curves(MeanScore(score.features, both), scene.T, ROTATION_DEG, TRANSLATION_M, samples)
     found["J, eq. 3.12"] = raw
-    found["J / LiDAR edges"] = dataclasses.replace(raw, values=np.reshape(both.normalized, raw.values.shape))
+    found["J / LiDAR edges"] = dataclasses.replace(raw, values=np.reshape(normalized, raw.values.shape))
     if fast is not None:
         found["fast score"] = curves(fast, scene.T, ROTATION_DEG, TRANSLATION_M, samples)
     missing = "" if fast is not None else " The scan shows too few edge points for the fast score."
