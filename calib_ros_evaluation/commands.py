@@ -24,11 +24,10 @@ from calib_ros_evaluation.compare import as_text, compare
 from calib_ros_evaluation.evaluate import Experiments, Study, evaluate
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, labels
-from calib_ros_evaluation.methods.registry import NAMES
+from calib_ros_evaluation.methods.own import NAMES
 from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, PROTOCOLS, TRIALS
 from calib_ros_evaluation.protocols.definitions import NAMES as PROTOCOL_NAMES
-from calib_ros_evaluation.protocols.detection import Detection, read_perturbations
-from calib_ros_evaluation.protocols.trials import Calibrations
+from calib_ros_evaluation.protocols.trials import Calibrations, Detection, read_perturbations
 from calib_ros_evaluation.results import read_trials
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +81,9 @@ def compare(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0, resamples: int = 20
     if not (both.which == "both").any():
         raise BadInputError(f"the tables have no trial in common: {_apart(a, b)}; evaluate both with the same options")
     # By number: 2 before 10.
-    both = both.sort_values(list(IDENTITY), key=lambda c: c.map(_positions) if c.name == "frames" else c)
+    both = both.sort_values(
+        list(IDENTITY), key=lambda c: c.map(lambda text: tuple(map(int, text.split()))) if c.name == "frames" else c
+    )
     found = []
     for (experiment, method), own in both.groupby(["experiment", "method"]):
         pairs = own[own.which == "both"]
@@ -94,10 +96,6 @@ def compare(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0, resamples: int = 20
         more = pairs.success_b - pairs.success_a
         found.append(Comparison(experiment, method, *counts, int((more > 0).sum()), int((more < 0).sum()), estimates))
     return found
-
-
-def _positions(frames: str) -> tuple[int, ...]:
-    return tuple(map(int, frames.split()))
 
 
 def paired_change(
@@ -135,13 +133,11 @@ def _apart(a: pd.DataFrame, b: pd.DataFrame) -> str:
     n = next(n for n in range(len(IDENTITY)) if a.merge(b, on=list(IDENTITY[: n + 1])).empty)
     before, name = list(IDENTITY[:n]), IDENTITY[n]
     common = a.merge(b, on=before)[before] if before else None
-    in_a, in_b = (_some((own if common is None else own.merge(common))[name]) for own in (a, b))
-    return f"{name} is {in_a} in A, {in_b} in B"
-
-
-def _some(values: Iterable[object], most: int = 3) -> str:
-    texts = sorted(set(map(str, values)))
-    return (", ".join(texts[:most]) or "missing") + (f" and {len(texts) - most} more" if len(texts) > most else "")
+    said, most = [], 3
+    for own in (a, b):
+        texts = sorted(set(map(str, (own if common is None else own.merge(common))[name])))
+        said.append((", ".join(texts[:most]) or "missing") + (f" and {len(texts) - most} more" if len(texts) > most else ""))
+    return f"{name} is {said[0]} in A, {said[1]} in B"
 
 
 def as_text(comparisons: Sequence[Comparison], name_a: str, name_b: str) -> str:

@@ -14,15 +14,13 @@ from calib_ros import __version__
 from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.journal import Journal
 from calib_ros_check.jobs.pool import run
-from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, code_fingerprint, inspect_sources
 from calib_ros_evaluation.experiments.trial import run_jobs
-from calib_ros_evaluation.methods.registry import NAMES, methods
-from calib_ros_evaluation.report.page import check_report, write_report
-from calib_ros_evaluation.report.sections import Section, sections
+from calib_ros_evaluation.methods.own import NAMES, methods
+from calib_ros_evaluation.report.page import Section, check_report, sections, write_report
 from calib_ros_evaluation.report.tables import summary
-from calib_ros_evaluation.results import TRIALS, Answers, collect_results, write_table
+from calib_ros_evaluation.results import TRIALS, Answers, EvaluationJob, collect_results, job, write_table
 from calib_ros_semantics.models.segmentation import SegmentationModels
 
 Progress = Callable[[str, int, int], None]  # called with the stage (frames, trials), done and total

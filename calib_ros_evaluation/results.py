@@ -1,5 +1,5 @@
-"""Results of an evaluation, read from the answers of its jobs: the table of trials, also as a CSV file, and what other
-experiments measured. Tables and plots need nothing else."""
+"""What an evaluation does piece by piece, its jobs: a method, or all of them, on frames of a source; and its results, read from
+their answers: the table of trials, also as a CSV file, and what other experiments measured. Tables and plots need no more."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.experiments.job import EvaluationJob
 
 T = TypeVar("T")
 Matrix = NDArray[np.float64]
@@ -45,6 +44,37 @@ TRIALS = "trials.csv"
 TEXTS = ("experiment", "method", "scene", "frames", "status", "reason")
 WHOLE = ("seed", "success", "evaluations")
 ADVICE = "give the trials.csv of an evaluation"
+
+
+@dataclass(frozen=True)
+class EvaluationJob:
+    """experiment: what it belongs to. method: name of a Method, empty where none is asked. scene: which source, by the label that
+    it has in the evaluation. frames: positions in it. options: further numbers and texts, by name, in the order of their names.
+    """
+
+    experiment: str
+    method: str
+    scene: str
+    frames: tuple[int, ...]
+    options: tuple[tuple[str, float | int | str], ...] = ()
+
+    @property
+    def key(self) -> str:
+        """The same for the same piece of work, whoever makes it up; no other has it."""
+        frames = ",".join(map(str, self.frames))
+        options = " ".join(f"{name}={value}" for name, value in self.options)
+        return f"{self.experiment}|{self.method}|{self.scene}|{frames}|{options}"
+
+    def option(self, name: str) -> Any:
+        """Value of an option; KeyError if it has none of that name."""
+        return dict(self.options)[name]
+
+
+def job(
+    experiment: str, method: str, scene: str, frames: Sequence[int], options: Mapping[str, float | int | str] | None = None
+) -> EvaluationJob:
+    """A job with its options in order."""
+    return EvaluationJob(experiment, method, scene, tuple(frames), tuple(sorted((options or {}).items())))
 
 
 def trials_table(rows: Sequence[Mapping[str, Any]], limit_deg: float = SUCCESS_DEG, limit_m: float = SUCCESS_M) -> pd.DataFrame:

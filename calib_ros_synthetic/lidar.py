@@ -13,7 +13,7 @@ from calib_ros import se3
 from calib_ros.frame import PointCloud
 from calib_ros_synthetic.materials import REFLECTIVITY, Bytes, Part
 from calib_ros_synthetic.rays import ORIGIN, OWN, SKY, Ints, Jobs, Rays, cast, cast_ground, unmet
-from calib_ros_synthetic.rigs import Fields, Intensity, Rig
+from calib_ros_synthetic.rigs import BYTE, FIELDS, SIGNAL, WIDE, Rig
 from calib_ros_synthetic.scanners import SpinningScanner
 from calib_ros_synthetic.solids import Float32, Floats, Solids
 from calib_ros_synthetic.street import Street
@@ -23,7 +23,7 @@ At = tuple[NDArray[np.intp], ...]  # rows and columns
 OwnReturns = tuple[Float32, Bytes, Float32, Float32]  # see own_returns
 DROPPED = 0.004  # share of returns that are lost for no reason
 MIXED = 0.15  # share of returns at an edge that fall between foreground and background
-SIGNAL, BRIGHTEST = 2000.0, 70_000.0  # photons from a white wall 10 m away; of a retro-reflector, where intensity is WIDE
+PHOTONS, BRIGHTEST = 2000.0, 70_000.0  # from a white wall 10 m away; of a retro-reflector, where intensity is WIDE
 MIXED_STEP = 2.0  # m; across larger steps the two echoes are told apart
 
 
@@ -144,7 +144,7 @@ def _scatter(t: Float32, at: At, part: Bytes, clock: float, noise: float, rng: n
 
 
 def delivered(
-    rig: Rig, T_base_lidar: Floats, cloud: PointCloud, twist: Floats, fields: Fields, rng: np.random.Generator
+    rig: Rig, T_base_lidar: Floats, cloud: PointCloud, twist: Floats, fields: str, rng: np.random.Generator
 ) -> tuple[PointCloud, NDArray[np.intp]]:
     """A scan as the driver or the data set hands it out, and which of its points (n,) are left.
 
@@ -152,12 +152,12 @@ def delivered(
     """
     assert cloud.intensity is not None
     xyz, intensity = cloud.xyz.astype(float), cloud.intensity
-    if rig.intensity is Intensity.BYTE:
+    if rig.intensity == BYTE:
         intensity = np.rint(255 * intensity).astype(np.float32)
-    elif rig.intensity is Intensity.SIGNAL:
-        photons = SIGNAL * 100.0 * intensity / np.maximum(np.square(cloud.xyz).sum(axis=1), 1.0)
+    elif rig.intensity == SIGNAL:
+        photons = PHOTONS * 100.0 * intensity / np.maximum(np.square(cloud.xyz).sum(axis=1), 1.0)
         intensity = np.asarray(rng.poisson(np.minimum(photons, 60_000.0)), np.float32)
-    elif rig.intensity is Intensity.WIDE:
+    elif rig.intensity == WIDE:
         bright = BRIGHTEST * rng.random(len(intensity)) ** 3
         intensity = np.asarray(np.where(intensity > 0.97, bright, intensity), np.float32)
     if rig.compensated and cloud.time is not None and twist.any() and len(xyz):  # to where they are at time 0
@@ -167,6 +167,6 @@ def delivered(
         xyz = np.einsum("nij,nj->ni", at[:, :, :3], xyz) + at[:, :, 3]
     base = se3.transform(T_base_lidar, xyz)
     keep = np.flatnonzero(np.abs(base[:, 1]) <= rig.crop)
-    left_out = ("time", "ring", "intensity")[: list(Fields).index(fields)]
+    left_out = ("time", "ring", "intensity")[: FIELDS.index(fields)]
     whole = replace(cloud, xyz=(base if rig.base_frame else xyz).astype(np.float32), intensity=intensity)
     return replace(whole, **dict.fromkeys(left_out)).select(keep), keep  # type: ignore[arg-type]

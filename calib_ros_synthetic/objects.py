@@ -38,12 +38,12 @@ def sign(b: Builder, rng: Rng) -> None:
     b.cylinder(Label.POLE, (0, 0, height / 2 + 0.2), (0.035, 0.035, height / 2 + 0.2), (0.4, 0.4, 0.4), Surface.METAL)
     colour = [(0.08, 0.05, 0.7), (0.6, 0.25, 0.05), (0.1, 0.6, 0.8), (0.8, 0.8, 0.8)][rng.integers(4)]
     wide = size * (1.0 if rng.random() < 0.7 else 1.7)
-    b.box(Label.SIGN, (-0.06, 0, height), (0.015, wide, size), colour, Surface.SIGN, style=rng.random(4))
+    b.box(Label.SIGN, (-0.06, 0, height), (0.015, wide, size), colour, Surface.SIGN, style=rng)
 
 
 def clump(b: Builder, rng: Rng, centre: Numbers, half: Numbers, green: Numbers) -> None:
     """Some leaves."""
-    b.ellipsoid(Label.VEGETATION, centre, half, green, Surface.LEAF, style=rng.random(4))
+    b.ellipsoid(Label.VEGETATION, centre, half, green, Surface.LEAF, style=rng)
 
 
 def tree(b: Builder, rng: Rng) -> None:
@@ -71,13 +71,11 @@ def border(b: Builder, rng: Rng, length: float) -> None:
     """Hedge, wall or fence along the pavement, centred on the frame's origin."""
     kind = rng.integers(3)
     if kind == 0:
-        b.box(Label.VEGETATION, (0, 0, 0.6), (length / 2, 0.35, rng.uniform(0.5, 0.9)), (0.06, 0.2, 0.1), Surface.LEAF,
-              style=rng.random(4))  # fmt: skip
+        b.box(Label.VEGETATION, (0, 0, 0.6), (length / 2, 0.35, rng.uniform(0.5, 0.9)), (0.06, 0.2, 0.1), Surface.LEAF, style=rng)
     elif kind == 1:
         b.box(Label.BUILDING, (0, 0, 0.45), (length / 2, 0.12, rng.uniform(0.35, 0.6)), pick_colour(rng, WALL_PAINTS))
     else:
-        b.box(Label.OTHER, (0, 0, 0.7), (length / 2, 0.03, rng.uniform(0.5, 0.8)), (0.2, 0.3, 0.4), Surface.FENCE,
-              style=rng.random(4))  # fmt: skip
+        b.box(Label.OTHER, (0, 0, 0.7), (length / 2, 0.03, rng.uniform(0.5, 0.8)), (0.2, 0.3, 0.4), Surface.FENCE, style=rng)
 
 
 def bin_or_box(b: Builder, rng: Rng) -> None:
@@ -90,7 +88,7 @@ def billboard(b: Builder, rng: Rng) -> None:
     """A poster on two legs: the print has edges that no LiDAR sees."""
     for x in (-0.7, 0.7):
         b.cylinder(Label.POLE, (x, 0, 0.5), (0.05, 0.05, 0.5), (0.2, 0.2, 0.2), Surface.METAL)
-    b.box(Label.OTHER, (0, 0, 1.7), (1.1, 0.08, 0.9), rng.uniform(0.05, 0.5, 3), Surface.POSTER, style=rng.random(4))
+    b.box(Label.OTHER, (0, 0, 1.7), (1.1, 0.08, 0.9), rng.uniform(0.05, 0.5, 3), Surface.POSTER, style=rng)
 
 
 def house(b: Builder, rng: Rng, length: float, depth: float, height: float) -> None:
@@ -110,8 +108,7 @@ def house(b: Builder, rng: Rng, length: float, depth: float, height: float) -> N
     if rng.random() < 0.45:
         size, x = rng.uniform(0.8, 1.4), rng.uniform(-0.25, 0.25) * length
         top = min(height, rng.uniform(3.0, 6.0))
-        b.box(B, (x, -depth / 2, top / 2), (size, rng.uniform(0.4, 0.9), top / 2), wall * 0.95, Surface.FACADE,
-              style=rng.random(4))  # fmt: skip
+        b.box(B, (x, -depth / 2, top / 2), (size, rng.uniform(0.4, 0.9), top / 2), wall * 0.95, Surface.FACADE, style=rng)
     if rng.random() < 0.6:
         x = rng.uniform(-0.35, 0.35) * length
         b.box(B, (x, -depth / 2 - 0.4, 0.17), (0.7, 0.4, 0.17), (0.4, 0.42, 0.44))
@@ -227,8 +224,8 @@ def boulder(b: Builder, rng: Rng) -> None:
 def bench(b: Builder, rng: Rng) -> None:
     """A bench that faces -y."""
     wood = (0.14, 0.22, 0.32)
-    b.box(Label.OTHER, (0, 0, 0.45), (0.8, 0.22, 0.03), wood, style=rng.random(4))
-    b.box(Label.OTHER, (0, 0.24, 0.75), (0.8, 0.03, 0.18), wood, style=rng.random(4))
+    b.box(Label.OTHER, (0, 0, 0.45), (0.8, 0.22, 0.03), wood, style=rng)
+    b.box(Label.OTHER, (0, 0.24, 0.75), (0.8, 0.03, 0.18), wood, style=rng)
     for x in (-0.6, 0.6):
         b.box(Label.OTHER, (x, 0.02, 0.22), (0.04, 0.2, 0.22), (0.08, 0.08, 0.08), Surface.METAL)
 
@@ -236,7 +233,7 @@ def bench(b: Builder, rng: Rng) -> None:
 def delineator(b: Builder, rng: Rng) -> None:
     """A post at the edge of a country road."""
     b.box(Label.POLE, (0, 0, 0.5), (0.06, 0.05, 0.5), (0.75, 0.75, 0.75))
-    b.box(Label.POLE, (-0.055, 0, 0.8), (0.012, 0.04, 0.09), (0.1, 0.1, 0.1), Surface.SIGN, style=rng.random(4))
+    b.box(Label.POLE, (-0.055, 0, 0.8), (0.012, 0.04, 0.09), (0.1, 0.1, 0.1), Surface.SIGN, style=rng)
 
 
 def pillar(b: Builder, rng: Rng, height: float) -> None:
@@ -280,7 +277,7 @@ def rack(b: Builder, rng: Rng, bay: float, depth: float, levels: int, step: floa
                 half = (rng.uniform(0.38, 0.58), rng.uniform(0.34, 0.48), height / 2)
                 surface = Surface.POSTER if rng.random() < 0.35 else Surface.PLAIN
                 b.box(other, (b_x, rng.normal(0, 0.04), z + 0.20 + height / 2), half, pick_colour(rng, CARTONS), surface,
-                      style=rng.random(4))  # fmt: skip
+                      style=rng)  # fmt: skip
                 b.box(other, (b_x, 0, z + 0.12), (0.58, 0.46, 0.07), (0.20, 0.32, 0.44))
 
 
@@ -288,8 +285,7 @@ def pallet(b: Builder, rng: Rng) -> None:
     """Goods on the floor."""
     height = rng.uniform(0.3, 1.5)
     b.box(Label.OTHER, (0, 0, 0.08), (0.6, 0.4, 0.07), (0.20, 0.32, 0.44))
-    b.box(Label.OTHER, (0, 0, 0.15 + height / 2), (0.55, 0.38, height / 2), pick_colour(rng, CARTONS), Surface.POSTER,
-          style=rng.random(4))  # fmt: skip
+    b.box(Label.OTHER, (0, 0, 0.15 + height / 2), (0.55, 0.38, height / 2), pick_colour(rng, CARTONS), Surface.POSTER, style=rng)
 
 
 def forklift(b: Builder) -> None:
@@ -313,7 +309,7 @@ def wall(b: Builder, rng: Rng, length: float, height: float, colour: tuple[float
         x, r = rng.uniform(-length / 2, length / 2), rng.uniform(0.05, 0.12)
         b.cylinder(Label.BUILDING, (x, -0.2, height / 2), (r, r, height / 2), (0.25, 0.2, 0.3), Surface.METAL)
     b.box(Label.OTHER, (rng.uniform(-0.4, 0.4) * length, -0.2, 1.4), (0.5, 0.1, 0.7), rng.uniform(0.1, 0.6, 3), Surface.POSTER,
-          style=rng.random(4))  # fmt: skip
+          style=rng)  # fmt: skip
 
 
 def guard_rail(b: Builder, length: float) -> None:
@@ -331,8 +327,7 @@ def gantry(b: Builder, rng: Rng, span: float) -> None:
     for z in (5.6, 6.6):
         b.box(Label.POLE, (0, 0, z), (0.12, span / 2, 0.1), grey, Surface.METAL)
     for y in np.arange(-span / 2 + 4, span / 2 - 3, 6.5):
-        b.box(Label.SIGN, (-0.3, y, 6.1), (0.05, 2.2, rng.uniform(0.9, 1.4)), (0.55, 0.22, 0.03), Surface.SIGN,
-              style=rng.random(4))  # fmt: skip
+        b.box(Label.SIGN, (-0.3, y, 6.1), (0.05, 2.2, rng.uniform(0.9, 1.4)), (0.55, 0.22, 0.03), Surface.SIGN, style=rng)
 
 
 def road_sign(b: Builder, rng: Rng) -> None:
@@ -340,16 +335,16 @@ def road_sign(b: Builder, rng: Rng) -> None:
     wide, high = rng.uniform(1.2, 2.2), rng.uniform(0.8, 1.4)
     for y in (-0.6 * wide, 0.6 * wide):
         b.cylinder(Label.POLE, (0.08, y, 1.9), (0.06, 0.06, 1.9), (0.4, 0.4, 0.4), Surface.METAL)
-    b.box(Label.SIGN, (0, 0, 2.2 + high), (0.03, wide, high), (0.55, 0.22, 0.03), Surface.SIGN, style=rng.random(4))
+    b.box(Label.SIGN, (0, 0, 2.2 + high), (0.03, wide, high), (0.55, 0.22, 0.03), Surface.SIGN, style=rng)
 
 
 def lorry(b: Builder, rng: Rng) -> None:
     """An articulated lorry."""
     V, paint = Label.VEHICLE, pick_colour(rng, CAR_PAINTS)
-    b.box(V, (-2.2, 0, 2.55), (6.6, 1.27, 1.4), rng.uniform(0.05, 0.6, 3), Surface.POSTER, style=rng.random(4))
+    b.box(V, (-2.2, 0, 2.55), (6.6, 1.27, 1.4), rng.uniform(0.05, 0.6, 3), Surface.POSTER, style=rng)
     b.box(V, (-2.0, 0, 0.9), (6.4, 1.0, 0.2), (0.08, 0.08, 0.08))
-    b.frustum(V, (6.0, 0, 2.3), (1.1, 1.2, 1.4), paint, Surface.CABIN, taper=(0.1, 0.05), style=rng.random(4))
-    b.box(V, (6.0, 0, 0.75), (1.15, 1.22, 0.35), paint, Surface.BODY, style=rng.random(4))
+    b.frustum(V, (6.0, 0, 2.3), (1.1, 1.2, 1.4), paint, Surface.CABIN, taper=(0.1, 0.05), style=rng)
+    b.box(V, (6.0, 0, 0.75), (1.15, 1.22, 0.35), paint, Surface.BODY, style=rng)
     for x in (-7.5, -6.2, -4.9, 3.6, 6.2):
         for y in (-1, 1):
             b.wheel(V, (x, 1.05 * y, 0.5), (0.5, 0.2, 0.5), (0.03, 0.03, 0.03), Surface.TYRE)

@@ -112,7 +112,9 @@ def intersect(solids: Solids, i: int, rays: Rays, limit: Float32 | None = None) 
     kind = int(solids.kind[i])
     with np.errstate(divide="ignore", invalid="ignore"):
         if kind == BOX:
-            near, far = _box(o, d)
+            near, far = _slab(o[0], d[0])
+            for low, high in (_slab(o[1], d[1]), _slab(o[2], d[2])):
+                near, far = np.maximum(near, low), np.minimum(far, high)
         elif kind == FRUSTUM:
             near, far = _frustum(o, d, solids.taper[i].tolist())
         elif kind == ELLIPSOID:
@@ -134,14 +136,6 @@ def _slab(o: Float32, d: Float32) -> tuple[Float32, Float32]:
     inverse = 1 / (d + TINY)
     middle, reach = -o * inverse, np.abs(inverse)
     return np.asarray(middle - reach), np.asarray(middle + reach)
-
-
-def _box(o: Sequence[Float32], d: Sequence[Float32]) -> tuple[Float32, Float32]:
-    near, far = _slab(o[0], d[0])
-    for k in (1, 2):
-        low, high = _slab(o[k], d[k])
-        near, far = np.maximum(near, low), np.minimum(far, high)
-    return near, far
 
 
 def _frustum(o: Sequence[Float32], d: Sequence[Float32], taper: Sequence[float]) -> tuple[Float32, Float32]:

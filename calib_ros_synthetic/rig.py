@@ -27,8 +27,8 @@ from calib_ros_synthetic.camera import CONDITIONS, Scene, render
 from calib_ros_synthetic.lidar import OwnReturns, delivered, own_returns, scan
 from calib_ros_synthetic.parameters import CHOICE, PARAMETERS, checked, known_of, named, parsed
 from calib_ros_synthetic.rays import CameraView, row_motion
-from calib_ros_synthetic.rigs import OPTICAL, RIGS, Fields, Lens, plain
-from calib_ros_synthetic.scanners import PERIOD, RosetteScanner, SpinningScanner, in_frame, scanner
+from calib_ros_synthetic.rigs import FIELDS, OPTICAL, RIGS, Lens, plain
+from calib_ros_synthetic.scanners import PERIOD, RosetteScanner, in_frame, scanner
 from calib_ros_synthetic.scenes import SCENES
 from calib_ros_synthetic.solids import Floats, Solids
 from calib_ros_synthetic.street import LIDAR_HEIGHT, RIDES, SPINS, STAMP_AT, WEAVING, Ride
@@ -44,18 +44,31 @@ Bytes = NDArray[np.uint8]
 
 
 class SyntheticRig:
-    """What the sensors of a rig measure on a drive. `SyntheticDrive` says what is not said here.
+    """What the sensors of a rig measure on a drive.
 
     Parameters
     ----------
-    rig : a name in rigs.RIGS; None = the plain one, a scanner of `rings` rings and a camera.
+    rig : a name in rigs.RIGS; None = the plain one, a scanner of `rings` rings and a camera. seed : of scene, ride and tilt.
+    rings : 16, 32, 64 (default) or 128 of a spinning LiDAR; 0 for a scanner without rings, which scans a never-repeating rosette
+        ahead. A rig has its own scanner.
     frames, stride : of each pair, frames that are stride tenths of a second apart; the recording is that long. Sensors of more
         than one pair run at their own rates all the time.
-    tilt_deg : every one of several sensors is turned from its mount by this about an axis of its own, and shifted by 1 cm for
-        each degree.
+    width, height : px, by default 1242x375 or the rig's, of which one alone keeps the shape.
+    speed : m/s; at 0 the vehicle stops for every frame, where it would be at its usual speed. By default what is usual in the
+        scene (5 m/s in the street), as far as the rig's vehicle can go.
+    noise : factor on all sensor noise; 0 = none.
+    tilt_deg : the camera of a pair is turned from its mount by this about an axis that depends on the seed; every one of several
+        sensors about an axis of its own, and shifted by 1 cm for each degree.
+    scene : a name in scenes.SCENES. condition : a name in camera.CONDITIONS, by default the rig's.
+    fields : all, xyzir, xyzi or xyz: what the clouds hold, by default what the rig's driver gives.
+    ride : steady, or weaving: the vehicle swerves, brakes and accelerates.
+    image_late_ms : images are stamped that much late; jitter_ms : standard deviation of their stamps.
+    stamp_at : start, middle or end, the part of the scan that its stamp refers to; middle is where the scanner faces ahead.
+    spin : clockwise or counterclockwise, seen from above.
     clocks : factor on the differences between the sensors' clocks; 0 = one clock.
     knock : name of a sensor, or several joined by +, as on one bracket: displaced as one from knock_at seconds on (default: half
         of the drive), by knock_deg about an axis and by knock_m in a direction that depend on the seed.
+    camera : Camera instead of the rig's; T_camera_lidar : extrinsic (4, 4) of a pair instead of the rig's.
 
     References are exact: `reference` before the knock, `reference_at` at any stamp, those of frames at theirs.
     Raises BadInputError for values out of range and for unknown names.
@@ -73,14 +86,15 @@ class SyntheticRig:
                 f"synthetic drive: rings={p['rings']} does not go with rig={rig}, which has its own scanner; leave it out"
             )
         defaults = {name: PARAMETERS[name][0] for name in known}
-        world = named("scene", p["scene"] or defaults["scene"], SCENES)
+        world = named("scene", defaults["scene"] if p["scene"] is None else p["scene"], SCENES)
         self.model = plain(64 if p["rings"] is None else p["rings"]) if rig is None else RIGS[rig]
         cruise = min(world.cruise, self.model.top_speed)
         defaults |= {"speed": cruise} if self.model.is_pair else {"condition": self.model.condition}
         defaults |= {"rings": 64, "width": 1242, "height": 375} if rig is None else {}
         p = {name: defaults[name] if value is None else value for name, value in p.items()}
-        for name, names in (("ride", RIDES), ("stamp_at", STAMP_AT), ("spin", SPINS)):
-            named(name, p.get(name, PARAMETERS[name][0]), dict.fromkeys(names))
+        for name, names in (("ride", RIDES), ("stamp_at", STAMP_AT), ("spin", SPINS), ("fields", FIELDS)):
+            if p.get(name) is not None:
+                named(name, p[name], dict.fromkeys(names))
         changed = [f"{k}={v}" for k, v in p.items() if v is not None and (k in ("seed", "rig") or v != defaults[k])]
         self.name = "synthetic:" + ",".join(changed)  # without what exists only in Python
         self.parameters: dict[str, Any] = {name: values[0] for name, values in PARAMETERS.items()} | p
@@ -92,33 +106,37 @@ class SyntheticRig:
         self.speed: float = cruise if p["speed"] is None else p["speed"]
         if not self.speed and not self.model.is_pair:
             raise BadInputError("synthetic drive: speed=0 does not go with several sensors, which measure at different times")
-        self._fields = self.model.fields if p["fields"] is None else named("fields", p["fields"], {f.value: f for f in Fields})
+        self._fields = p["fields"] or self.model.fields
         self._condition = named("condition", p["condition"] or self.model.condition, CONDITIONS)
         self._ride = Ride(self.seed, self.speed or cruise, p["ride"] == WEAVING)
         self._street = world(self.seed, self._ride.station(self.duration))
         self.cameras, self.lidars = self.model.cameras, self.model.lidars
         self.reference_sensor = self.lidars[0]
-        self.knocked = tuple(
-            named("knock", own, {n: n for n in self.model.sensors}) for own in filter(None, p["knock"].split("+"))
-        )
+        self.knocked = tuple(filter(None, p["knock"].split("+")))
+        for name in self.knocked:
+            named("knock", name, self.model.sensors)
         self.knock_at: float = self.duration / 2 if p["knock_at"] is None else p["knock_at"]
         # The ride is that of a scanner above the origin of the vehicle's frame.
         self._T_ride_base = se3.from_parts(np.eye(3), [0.0, 0.0, 0.0 if self.model.vehicle is None else -LIDAR_HEIGHT])
         self._body = ego.body(self.model.vehicle or "")
-        self._lens = camera
+        sensors, size = self.model.sensors, (p["width"], p["height"])
+        self._lenses = {name: own.kind.camera(*size) for name, own in sensors.items() if isinstance(own.kind, Lens)}
+        self._cameras = {name: camera or own for name, own in self._lenses.items()}
+        self._scanners = {name: scanner(str(sensors[name].kind), sensors[name].rate) for name in self.lidars}
         self._made = Recent(CACHED_OF_PAIR if self.model.is_pair else CACHED)
         self._pose = lru_cache(maxsize=None)(self._mounted)
         self.view = lru_cache(maxsize=None)(self._view)
-        self._scanner = lru_cache(maxsize=None)(self._scanner_of)
-        self._own_layer = lru_cache(maxsize=None)(self._own_layer_of)
+        self._own_layer = lru_cache(maxsize=None)(lambda camera, after: self._own_seen(camera, self._frame(camera, after)))
         self._own_returns = lru_cache(maxsize=None)(self._own_returns_of)
-        self._T_camera_lidar = None if T_camera_lidar is None else se3.as_transform(T_camera_lidar, "T_camera_lidar")
-        if self.model.is_pair and self._T_camera_lidar is None:
-            self._T_camera_lidar = self._reference_of_pair()
+        self._T_camera_lidar = self._reference_of_pair() if self.model.is_pair else None
+        if T_camera_lidar is not None:
+            if not self.model.is_pair:
+                raise BadInputError("synthetic drive: T_camera_lidar does not go with several sensors; leave it out")
+            self._T_camera_lidar = se3.as_transform(T_camera_lidar, "T_camera_lidar")
 
     def camera(self, name: str) -> Camera:
         """The intrinsics of a camera."""
-        return self._lens or self._camera_of_lens(named("camera", name, {own: own for own in self.cameras}))
+        return named("camera", name, self._cameras)
 
     def frame_id(self, name: str) -> str:
         """TF frame of a sensor."""
@@ -179,11 +197,6 @@ class SyntheticRig:
         rate = self.model.sensors[name].rate
         return (PHASE * self._number(name)) % 1 / rate + index / rate
 
-    def pose(self, lidar: str, index: int) -> Floats:
-        """T_world_lidar (4, 4) at a scan's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
-        seconds = self.seconds(lidar, index)
-        return self._in_world(self._frame(lidar, self._is_after(lidar, seconds)), seconds)
-
     def scan(self, lidar: str, index: int) -> tuple[PointCloud, Floats]:
         """Scan `index` of a LiDAR, with the twist (6,) of the frame that it is given in."""
         return self._made((lidar, index), lambda: self._scan(lidar, index))
@@ -203,34 +216,10 @@ class SyntheticRig:
 
     def sweep_s(self, camera: str, lidar: str) -> float:
         """From a scan's stamp to when it sweeps the camera's axis; 0 for scanners that do not turn."""
-        if isinstance(self._scanner(lidar), RosetteScanner):
+        if isinstance(self._scanners[lidar], RosetteScanner):
             return 0.0
         axis = (self._pose(lidar, False)[:3, :3].T @ self._pose(camera, False)[:3, 2])[:2]
         return float(-np.arctan2(axis[1], axis[0]) / (2 * np.pi * self.model.sensors[lidar].rate))
-
-    def describe(self, camera: str, lidar: str) -> dict[str, str]:
-        """Facts for people about a pair."""
-        p, T = self.parameters, self.T_camera_lidar(camera, 0, lidar, 0)
-        tilt, t = se3.rotation_error_deg(OPTICAL.T, T), T[:3, 3]
-        length, numbers = self._ride.station(self.duration), [f"{len(self.stamps(name))}" for name in (camera, lidar)]
-        facts = {
-            "source": f"{self.name}, a ray-cast {p['scene'].replace('_', ' ')} with exact ground truth",
-            "frames": f"{self.frames}, every {self.step:g} s, {length / self.frames:.3g} m apart",
-            "camera": describe_camera(self.camera(camera)),
-            "LiDAR": self._scanner(lidar).describe(),
-            "motion": f"{self.speed:g} m/s, {p['ride']}" if self.speed else "stops for every frame",
-            "noise": f"{p['noise']:g} x the default",
-            "reference": f"{tilt:.2f} deg from looking straight ahead, translation {t[0]:.3f} {t[1]:.3f} {t[2]:.3f} m",
-        }
-        if p["rig"] is not None:
-            facts["rig"] = f"{p['rig']}: {self.model.why}"
-        if not self.model.is_pair:
-            facts["frames"] += f"; of {numbers[0]} images and {numbers[1]} scans"
-            for kind, names, chosen in (("cameras", self.cameras, camera), ("lidars", self.lidars, lidar)):
-                facts[kind] = ", ".join(f"{name} (chosen)" if name == chosen else name for name in names)
-            ahead = (self.clock_s(camera) - self.clock_s(lidar)) * 1000
-            facts["clocks"] = f"the camera's is {ahead:+g} ms ahead of the LiDAR's"
-        return facts
 
     def _number(self, name: str) -> int:
         return list(self.model.sensors).index(name)
@@ -305,40 +294,29 @@ class SyntheticRig:
         ride = self._ride.twist(self._street, self._ride.station(seconds), speed)
         return ride if self.model.vehicle is None else in_frame(ride, self._T_ride_base @ T_base)
 
-    def _camera_of_lens(self, name: str) -> Camera:
-        lens = self.model.sensors[name].kind
-        assert isinstance(lens, Lens)
-        return lens.camera(self.parameters["width"], self.parameters["height"])
-
     def _view(self, name: str) -> CameraView:
         """The pixels of a camera."""
         camera, lens = self.camera(name), self.model.sensors[name].kind
-        if isinstance(lens, Lens) and camera == self._camera_of_lens(name) and camera.model not in PERSPECTIVE:
+        if isinstance(lens, Lens) and camera == self._lenses[name] and camera.model not in PERSPECTIVE:
             return WideView(camera, lens.field)
         return CameraView(camera)
 
-    def _scanner_of(self, name: str) -> SpinningScanner:
-        return scanner(str(self.model.sensors[name].kind), self.model.sensors[name].rate)
-
     def _own_returns_of(self, lidar: str, after: bool) -> OwnReturns | None:
         """What a scanner hits of the vehicle; a pattern that never repeats has none of it, for that is near its blind zone."""
-        if self._body is None or isinstance(self._scanner(lidar), RosetteScanner):
+        if self._body is None or isinstance(self._scanners[lidar], RosetteScanner):
             return None
-        return own_returns(self._body, self._scanner(lidar).beams()[0], self._pose(lidar, after))
+        return own_returns(self._body, self._scanners[lidar].beams()[0], self._pose(lidar, after))
 
-    def _own_layer_of(self, camera: str, after: bool) -> ego.OwnLayer | None:
+    def _own_seen(self, camera: str, T_base_camera: Floats) -> ego.OwnLayer | None:
         """What a camera sees of the vehicle."""
-        return None if self._body is None else ego.own_layer(self._body, self.view(camera), self._frame(camera, after))
-
-    def _solids(self, seconds: float) -> Solids:
-        return self._street.around(self._ride.station(seconds))
+        return None if self._body is None else ego.own_layer(self._body, self.view(camera), T_base_camera)
 
     def _scan(self, lidar: str, index: int) -> tuple[PointCloud, Floats]:
         seconds, street = self.seconds(lidar, index), self._street
-        after, solids = self._is_after(lidar, seconds), self._solids(seconds)
+        after, solids = self._is_after(lidar, seconds), street.around(self._ride.station(seconds))
         T_base_lidar = self._pose(lidar, after)
         T, twist = self._in_world(T_base_lidar, seconds), self._twist(T_base_lidar, seconds)
-        device = replace(self._scanner(lidar), number=index * int(self.parameters["stride"]) if self.model.is_pair else index)
+        device = replace(self._scanners[lidar], number=index * int(self.parameters["stride"]) if self.model.is_pair else index)
         # Everything is cast relative to the sensor: far from the world's origin float32 would be too coarse.
         cloud, hit = scan(
             *(street, solids.moved(-T[:3, 3]), device, T, twist, self.parameters["noise"], self._rng(SCAN, lidar, index)),
@@ -357,11 +335,9 @@ class SyntheticRig:
     ) -> tuple[Bytes, Bytes]:
         """hung: where the camera is, see `_hung`; as the rig has it by default."""
         seconds, street, view = self.seconds(camera, index), self._street, self.view(camera)
-        after, solids = self._is_after(camera, seconds), self._solids(seconds)
+        after, solids = self._is_after(camera, seconds), street.around(self._ride.station(seconds))
         base, T_frame_camera = hung or self._hung(camera, after)
-        own = self._own_layer(camera, after)
-        if hung is not None and self._body is not None:
-            own = ego.own_layer(self._body, view, base @ T_frame_camera)
+        own = self._own_layer(camera, after) if hung is None else self._own_seen(camera, base @ T_frame_camera)
         seen_at, moving = seconds - (age_s if self.speed else 0.0), self._twist(base, seconds)
         T, later = self._in_world(base, seen_at), moving * self._delay_s()
         T = (T @ se3.exp(later) if later.any() else T) @ T_frame_camera
@@ -380,13 +356,11 @@ class RigPair:
     """One camera and one LiDAR of a rig as a source: up to rig.frames frames, rig.step seconds apart."""
 
     def __init__(self, rig: SyntheticRig, camera: str, lidar: str) -> None:
-        self.rig, self.cameras = rig, rig.cameras
-        self._names = (
-            named("camera", camera, {own: own for own in rig.cameras}),
-            named("lidar", lidar, dict.fromkeys(rig.lidars, lidar)),
-        )
+        self.rig, self._names, self.camera = rig, (camera, lidar), rig.camera(camera)
+        self.cameras = rig.cameras
+        named("lidar", lidar, rig._scanners)
         self.name = rig.name if rig.model.is_pair else f"{rig.name},camera={camera},lidar={lidar}"
-        self.camera, self.reference = rig.camera(camera), rig.T_camera_lidar(camera, 0, lidar, 0)
+        self.reference = rig.T_camera_lidar(camera, 0, lidar, 0)
         self.camera_frame, self.lidar_frame = rig.frame_id(camera), rig.frame_id(lidar)
         self._images, self._clouds = rig.stamps(camera), rig.stamps(lidar)
         self._pairs = [(k, k) for k in range(rig.frames)]
@@ -417,12 +391,32 @@ class RigPair:
         return self._frame(index, seen, T_camera_lidar)
 
     def pose(self, index: int) -> Floats:
-        """T_world_lidar (4, 4) at the stamp of the frame's scan, see `SyntheticRig.pose`."""
-        return self.rig.pose(self._names[1], self._pairs[index][1])
+        """T_world_lidar (4, 4) at the scan's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
+        rig, lidar = self.rig, self._names[1]
+        seconds = rig.seconds(lidar, self._pairs[index][1])
+        return rig._in_world(rig._frame(lidar, rig._is_after(lidar, seconds)), seconds)
 
     def describe(self) -> dict[str, str]:
         """Facts for people."""
-        return self.rig.describe(*self._names)
+        (camera, lidar), rig, p = self._names, self.rig, self.rig.parameters
+        tilt, t = se3.rotation_error_deg(OPTICAL.T, self.reference), self.reference[:3, 3]
+        facts = {
+            "source": f"{rig.name}, a ray-cast {p['scene'].replace('_', ' ')} with exact ground truth",
+            "frames": f"{len(self)}, every {rig.step:g} s, {rig._ride.station(rig.duration) / rig.frames:.3g} m apart",
+            "camera": describe_camera(self.camera),
+            "LiDAR": rig._scanners[lidar].describe(),
+            "motion": f"{rig.speed:g} m/s, {p['ride']}" if rig.speed else "stops for every frame",
+            "noise": f"{p['noise']:g} x the default",
+            "reference": f"{tilt:.2f} deg from looking straight ahead, translation {t[0]:.3f} {t[1]:.3f} {t[2]:.3f} m",
+        }
+        if p["rig"] is not None:
+            facts["rig"] = f"{p['rig']}: {rig.model.why}"
+        if not rig.model.is_pair:
+            facts["frames"] += f"; of {len(self._images)} images and {len(self._clouds)} scans"
+            for kind, names, chosen in (("cameras", rig.cameras, camera), ("lidars", rig.lidars, lidar)):
+                facts[kind] = ", ".join(f"{name} (chosen)" if name == chosen else name for name in names)
+            facts["clocks"] = f"the camera's is {1000 * (rig.clock_s(camera) - rig.clock_s(lidar)):+g} ms ahead of the LiDAR's"
+        return facts
 
     def _frame(self, index: int, seen: tuple[Bytes, Bytes], reference: Floats) -> Frame:
         image_at, scan_at = self._pairs[index]

@@ -6,7 +6,6 @@ Positions are in the vehicle's frame base_link: x forward, y left, z up, its ori
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -20,22 +19,10 @@ FOCAL = 0.58  # focal length as a share of the image width, as KITTI's
 OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # a vehicle's axes from those of a camera that looks ahead
 
 
-class Fields(Enum):
-    """Which fields a cloud has beside xyz: all that drivers give, and one less from each to the next, as bare data sets."""
-
-    ALL = "all"
-    NO_TIME = "xyzir"
-    INTENSITY = "xyzi"
-    BARE = "xyz"
-
-
-class Intensity(Enum):
-    """Scale of the intensity."""
-
-    UNIT = "0..1"
-    BYTE = "0..255"
-    SIGNAL = "signal"  # photons: falls with the squared distance, up to some thousands
-    WIDE = "wide"  # up to 70,000, few values above 1000
+# Which fields a cloud has beside xyz: all that drivers give, and one less from each to the next, as bare data sets.
+FIELDS = ("all", "xyzir", "xyzi", "xyz")
+# Scale of the intensity: 0..1, 0..255, photons (they fall with the squared distance), or up to 70,000 with few values above 1000.
+UNIT, BYTE, SIGNAL, WIDE = ("unit", "byte", "signal", "wide")
 
 
 @dataclass(frozen=True)
@@ -115,17 +102,18 @@ class Rig:
     """A vehicle's sensors. Those of one pair measure together, frame by frame; more go each at its own rate.
 
     why: it is here. sensors: by name; the others are stated in the first LiDAR. vehicle: a name in ego.BODIES, "" = out of view,
-    None = none: the scanner rides by itself. condition: a name in camera.CONDITIONS. base_frame: the cloud is given in
-    base_link. compensated: the points are moved to where they are at the cloud's stamp. crop: m to either side at which the cloud
-    ends. triggered: the picture is taken when the scan sweeps the camera's axis, else at the cloud's stamp. top_speed: m/s.
+    None = none: the scanner rides by itself. condition: a name in camera.CONDITIONS. fields, intensity: of clouds, see FIELDS.
+    base_frame: they are given in base_link. compensated: the points are moved to where they are at the cloud's stamp. crop: m to
+    either side at which the cloud ends. triggered: the picture is taken when the scan sweeps the camera's axis, else at the
+    cloud's stamp. top_speed: m/s.
     """
 
     why: str
     sensors: dict[str, MountedSensor]
     vehicle: str | None = "car"
     condition: str = "clear"
-    fields: Fields = Fields.ALL
-    intensity: Intensity = Intensity.BYTE
+    fields: str = FIELDS[0]
+    intensity: str = BYTE
     base_frame: bool = False
     compensated: bool = False
     crop: float = np.inf
@@ -161,7 +149,7 @@ def plain(rings: int) -> Rig:
         MountedSensor(Mount(0.0, 0.0, 0.0), str(rings)),
         MountedSensor(Mount(0.29, 0.05, -0.11), PlainLens(82.0, 1242, 375)),
     )
-    return Rig("", {"velodyne": lidar, "camera": camera}, None, intensity=Intensity.UNIT)
+    return Rig("", {"velodyne": lidar, "camera": camera}, None, intensity=UNIT)
 
 
 NARROW = Lens(34.0, 720, 540, D=(-0.08, 0.12, 4e-4, -3e-4, 0.0))
@@ -197,12 +185,12 @@ RIGS: dict[str, Rig] = {
     ),
     "hdl64e_kitti": _pair(
         "KITTI: 64 rings in two blocks, given without rings and times, and a rectified 82 deg picture 0.33 m away",
-        "hdl64e", Mount(0.0, 0.0, 1.73), KITTI, Mount(0.29, 0.05, 1.62), fields=Fields.INTENSITY, intensity=Intensity.UNIT,
+        "hdl64e", Mount(0.0, 0.0, 1.73), KITTI, Mount(0.29, 0.05, 1.62), fields="xyzi", intensity=UNIT,
     ),
     "hdl64e_waymo": _pair(
         "Waymo: a 50 deg lens; the cloud in the vehicle's frame, compensated, cut off at 22 m to the side, without rings",
         "hdl64e", Mount(-0.1, 0.0, 2.05, pitch=1.5, yaw=148.0), WAYMO, Mount(0.1, -0.05, 1.86), vehicle="car",
-        fields=Fields.INTENSITY, intensity=Intensity.WIDE, base_frame=True, compensated=True, crop=22.0,
+        fields="xyzi", intensity=WIDE, base_frame=True, compensated=True, crop=22.0,
     ),
     "pandar64_roof": _pair(
         "64 rings, 0.17 deg apart around the horizon and up to 6 deg below, and a 50 deg camera, as in PandaSet",
@@ -212,17 +200,17 @@ RIGS: dict[str, Rig] = {
     "os1_64_robot": _pair(
         "A small robot: 64 staggered rings 0.6 m above the floor and a 90 deg camera 0.15 m below",
         "os1_64", Mount(0.0, 0.0, 0.62), Lens(90.0, 800, 592, D=(-0.30, 0.10, 5e-4, -4e-4, -0.016)), Mount(0.13, 0.03, 0.54),
-        vehicle="robot", intensity=Intensity.SIGNAL, top_speed=2.0,
+        vehicle="robot", intensity=SIGNAL, top_speed=2.0,
     ),
     "os1_128_windshield": _pair(
         "128 rings on the roof, and a 60 deg camera behind the windshield 1.2 m away, with the bonnet in the picture",
         "os1_128", Mount(-0.5, 0.0, 1.9), WINDSHIELD, Mount(0.55, 0.10, 1.33, pitch=2.0), vehicle="car",
-        intensity=Intensity.SIGNAL,
+        intensity=SIGNAL,
     ),
     "pandar40p_roof": _pair(
         "Robotaxis: 40 rings, 0.33 deg apart around the horizon, in a cloud that the driver gives in base_link, without times",
         "pandar40p", Mount(-0.2, 0.05, 1.95, yaw=-3.0, pitch=2.0, roll=1.0), WINDSHIELD, Mount(0.35, -0.12, 1.70, pitch=1.0),
-        vehicle="car", fields=Fields.NO_TIME, base_frame=True,
+        vehicle="car", fields="xyzir", base_frame=True,
     ),
     "vlp16_upside_down": _pair(
         "An automated forklift: 16 rings at 5 Hz under its roof, upside down, and an 80 deg camera 0.5 m below",
@@ -252,17 +240,17 @@ RIGS: dict[str, Rig] = {
     "os1_64_wide": _pair(
         "A cheap 120 deg lens, plumb bob, on a robot whose clouds are bare points",
         "os1_64", Mount(0.0, 0.0, 0.62), Lens(118.0, 800, 600, D=(-0.23, 0.042, 3e-4, -2e-4, -0.0029)), Mount(0.2, 0.0, 0.50),
-        vehicle="robot", condition="jpeg", fields=Fields.BARE, top_speed=2.0,
+        vehicle="robot", condition="jpeg", fields="xyz", top_speed=2.0,
     ),
     "os1_64_portrait": _pair(
         "The same robot with its camera on its side, for pictures in portrait format",
         "os1_64", Mount(0.0, 0.0, 0.62), Lens(70.0, 800, 592, D=(-0.28, 0.09, 4e-4, -3e-4, -0.012)),
-        Mount(0.13, -0.06, 0.52, roll=90.0), vehicle="robot", intensity=Intensity.SIGNAL, top_speed=2.0,
+        Mount(0.13, -0.06, 0.52, roll=90.0), vehicle="robot", intensity=SIGNAL, top_speed=2.0,
     ),
     "os1_128_fisheye": _pair(
         "A 190 deg fisheye on a car's roof bar, looking 10 deg down over the bonnet; 128 rings 1.2 m behind it",
         "os1_128", Mount(-0.3, 0.0, 1.95), Lens(190.0, 960, 768, "equidistant", (0.02, -0.004, 8e-4, -1.5e-4)),
-        Mount(0.85, 0.0, 1.72, pitch=10.0), vehicle="car", intensity=Intensity.SIGNAL,
+        Mount(0.85, 0.0, 1.72, pitch=10.0), vehicle="car", intensity=SIGNAL,
     ),
     "mid360_fisheye": _pair(
         "A walking robot: a Mid-360 without rings that never repeats, 0.12 m above a 190 deg fisheye",

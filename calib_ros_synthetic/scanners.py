@@ -109,7 +109,7 @@ class SpinningScanner:
         return vectors.astype(np.float32), delay[:, None] - self._head / speed
 
     def order(self, time: Floats) -> NDArray[np.intp]:
-        """The columns in the order in which they were measured."""
+        """The columns in the order in which they were measured, the head turning clockwise."""
         return np.arange(time.shape[1])[::-1]
 
     def stored(self, row: NDArray[np.intp], time: Float32) -> NDArray[np.intp] | None:

@@ -96,9 +96,10 @@ class Builder:
         surface: Surface = Surface.PLAIN,
         *,
         taper: Numbers = (0.0, 0.0),
-        style: Numbers = (0.0, 0.0, 0.0, 0.0),
+        style: Numbers | np.random.Generator = (0.0, 0.0, 0.0, 0.0),
     ) -> None:
-        """One solid: centre and half sizes (3,) in metres in the object's frame."""
+        """One solid: centre and half sizes (3,) in metres in the object's frame. style: (4,), or what draws it."""
+        style = style.random(4) if isinstance(style, np.random.Generator) else style
         c, s, (x, y, z) = cos(self._yaw), sin(self._yaw), centre
         where = (self._origin[0] + c * x - s * y, self._origin[1] + s * x + c * y, self._origin[2] + z)
         self._rows.append((kind, surface, label, where, tuple(half), self._yaw, tuple(taper), tuple(colour), tuple(style)))

@@ -197,21 +197,15 @@ def _poster(a: Place) -> Bytes:
     return np.where((noise > 1.2) | text, Part.PRINT, Part.PLAIN).astype(np.uint8)
 
 
-def _skin(a: Place) -> Bytes:
-    return np.where((a.q[2] > 0.35) | (a.q[0] < -0.3), Part.HAIR, Part.SKIN).astype(np.uint8)
-
-
-def _fence(a: Place) -> Bytes:
-    return np.where((a.u % 0.16 < 0.03) & (a.q[2] < 0.8), Part.RUBBER, Part.SLAT).astype(np.uint8)
-
-
 PLAIN_PARTS: dict[int, Part] = {
     Surface.PLAIN: Part.PLAIN, Surface.ROOF: Part.TILES, Surface.BARK: Part.BARK, Surface.LEAF: Part.LEAF,
     Surface.CLOTH: Part.CLOTH, Surface.METAL: Part.METAL, Surface.CEILING: Part.PLAIN,
 }  # fmt: skip
 PAINTERS: dict[int, Callable[[Place], Bytes]] = {
     Surface.FACADE: _facade, Surface.BODY: _body, Surface.CABIN: _cabin, Surface.TYRE: _wheel,
-    Surface.SKIN: _skin, Surface.SIGN: _sign, Surface.FENCE: _fence, Surface.POSTER: _poster,
+    Surface.SIGN: _sign, Surface.POSTER: _poster,
+    Surface.SKIN: lambda a: np.where((a.q[2] > 0.35) | (a.q[0] < -0.3), Part.HAIR, Part.SKIN).astype(np.uint8),
+    Surface.FENCE: lambda a: np.where((a.u % 0.16 < 0.03) & (a.q[2] < 0.8), Part.RUBBER, Part.SLAT).astype(np.uint8),
 }  # fmt: skip
 
 

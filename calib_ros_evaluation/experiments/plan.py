@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
-from calib_ros_evaluation.results import SET
+from calib_ros_evaluation.results import SET, EvaluationJob, job
 
 Options = dict[str, float | int | str]
 Wanted = tuple[str, Sequence[int], Sequence[str], Options]

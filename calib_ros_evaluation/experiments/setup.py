@@ -29,7 +29,7 @@ from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyE
 from calib_ros.frame import Frame
 from calib_ros_check.checker import Checker
 from calib_ros_evaluation.methods.method import Method
-from calib_ros_evaluation.methods.registry import methods
+from calib_ros_evaluation.methods.own import methods
 
 Matrix = NDArray[np.float64]
 MOST_FRAMES = 60  # of a source; more are spread over it

@@ -27,11 +27,10 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.curves import curves
-from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, spread, worker_cache
 from calib_ros_evaluation.methods.edges import LevinsonScore, worse_share
 from calib_ros_evaluation.protocols.definitions import MISCALIBRATION, PROTOCOLS, TOLERANCE, Size, displacement
-from calib_ros_evaluation.results import OF_TRIALS
+from calib_ros_evaluation.results import OF_TRIALS, EvaluationJob
 from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_thesis.features import importance
 

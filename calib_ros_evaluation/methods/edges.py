@@ -19,7 +19,7 @@ from calib_ros.registration.score.point_score import Score, project
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import AXES, LEVEL
-from calib_ros_evaluation.methods.method import Outcome, PointFeatures, Viewing, Watched, near, require
+from calib_ros_evaluation.methods.method import MeanScore, Outcome, PointFeatures, Viewing, Watched, near, require
 from calib_ros_thesis.cloud import discontinuity
 
 Matrix = NDArray[np.float64]
@@ -312,16 +312,31 @@ class Castorena(Viewing):
         order = np.argsort(-np.linalg.norm(view.xyz, axis=1), kind="stable")
         return replace(view, value=None).select(order)
 
-    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> CastorenaScore:
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> MeanScore:
         """Mean of the frames' scores. TooFewFeaturesError for fewer than min_points per frame near the image at T_prior."""
-        return CastorenaScore(self, features, T_prior, self.scales[-1])
+        return self._score(features, T_prior, self.scales[-1])
+
+    def _score(self, features: Sequence[PointFeatures], T_prior: Matrix, scale: float) -> MeanScore:
+        """-|Omega| F with both blurs `scale` times as wide."""
+        kept = near(features, T_prior, self.margin, self.min_points, "near the image")
+        weights = [(f.xyz, edge_weights(f.image, self.gamma, self.image_sigma * scale).reshape(2, -1)) for f in kept]
+        camera = features[0].camera
+
+        def of_frame(frame: tuple[Map, Map], T: Matrix) -> float:
+            xyz, w = frame
+            u, v, points = project(xyz, T, camera)
+            depth = xyz[points] @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
+            pixels, x, y = slopes_at_points((camera.height, camera.width), self.depth_sigma * scale, u, v, depth)
+            return -misfit((w[0][pixels], w[1][pixels]), (x, y))
+
+        return MeanScore(weights, of_frame)
 
     def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """FISTA within reach, coarse to fine; the evaluations of all searches are counted."""
         watched, found = Watched(self.score(features, T)), T
         start = watched.value(T)
         for scale in self.scales[:-1]:
-            coarse = Watched(CastorenaScore(self, features, T, scale))
+            coarse = Watched(self._score(features, T, scale))
             found, _ = fista(coarse, T, reach.half_width(), self.finest_deg * scale, self.evaluations, found)
             watched.evaluations += coarse.evaluations
         found, end = fista(watched, T, reach.half_width(), self.finest_deg, self.evaluations, found)
@@ -346,24 +361,3 @@ def misfit(weights: tuple[Map, Map], steepness: tuple[Map, Map]) -> float:
         N = float(w.sum(dtype=np.float64)) * float(slope.sum(dtype=np.float64))
         total += len(w) * float(w @ slope) / N if N > 0 else 1.0
     return total
-
-
-class CastorenaScore:
-    """-|Omega| F, the mean over frames, with both blurs `scale` times as wide as the method says; a Score."""
-
-    def __init__(self, method: Castorena, features: Sequence[PointFeatures], T_prior: Matrix, scale: float) -> None:
-        kept = near(features, T_prior, method.margin, method.min_points, "near the image")
-        self.camera = features[0].camera
-        self._sigma = method.depth_sigma * scale
-        sigma = method.image_sigma * scale
-        self._frames = [(f.xyz, edge_weights(f.image, method.gamma, sigma).reshape(2, -1)) for f in kept]
-
-    def value(self, T: Matrix) -> float:
-        """At T_camera_lidar (4, 4)."""
-        return -float(np.mean([self._misfit(T, xyz, weights) for xyz, weights in self._frames]))
-
-    def _misfit(self, T: Matrix, xyz: Map, weights: Map) -> float:
-        u, v, points = project(xyz, T, self.camera)
-        depth = xyz[points] @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
-        pixels, x, y = slopes_at_points((self.camera.height, self.camera.width), self._sigma, u, v, depth)
-        return misfit((weights[0][pixels], weights[1][pixels]), (x, y))

@@ -29,7 +29,7 @@ from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_im
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import barzilai_borwein, nelder_mead
-from calib_ros_evaluation.methods.method import Outcome, PointFeatures, Viewing, Watched, require, search_limits
+from calib_ros_evaluation.methods.method import MeanScore, Outcome, PointFeatures, Viewing, Watched, require, search_limits
 
 Matrix = NDArray[np.float64]
 PANDEY_BINS = 256  # of both: the papers' lasers and cameras give 8 bits, and so do ours
@@ -77,16 +77,14 @@ def density(counts: NDArray[np.number], bandwidth: tuple[float, float]) -> Matri
     bandwidth: along rows and columns, in bins. The histogram is mirrored at its ends, so that no mass leaves it; the marginals
     of the result are those of the histogram, smoothed alike.
     """
-    down, across = (_kernel(h) for h in bandwidth)
+    kernels = []
+    for h in bandwidth:
+        r = int(np.ceil(TAIL * h))
+        weight = np.exp(-0.5 * (np.arange(-r, r + 1) / max(h, 1e-9)) ** 2)
+        kernels.append(np.asarray((weight / weight.sum())[:, None], np.float32))
+    down, across = kernels
     smooth = cv2.sepFilter2D(counts.astype(np.float32), cv2.CV_32F, across, down, borderType=cv2.BORDER_REFLECT)
     return np.asarray(smooth / smooth.sum(dtype=np.float64), np.float64)
-
-
-def _kernel(bandwidth: float) -> NDArray[np.float32]:
-    """Gaussian (2 r + 1, 1) of a standard deviation in bins, sum 1."""
-    r = int(np.ceil(TAIL * bandwidth))
-    weight = np.exp(-0.5 * (np.arange(-r, r + 1) / max(bandwidth, 1e-9)) ** 2)
-    return np.asarray((weight / weight.sum())[:, None], np.float32)
 
 
 def known_reflectivity(view: PointFeatures, frame_name: str) -> NDArray[np.float32]:
@@ -170,21 +168,11 @@ class Pandey(Viewing):
         return Outcome(found, watched.evaluations)
 
 
-@dataclass(frozen=True, eq=False)
-class DistanceScore:
-    """Less the mean of the frames' distances: -1, nothing in common, to 0. frames: with the points that are not hidden."""
-
-    frames: Sequence[PointFeatures]
-
-    def value(self, T: Matrix) -> float:
-        """At T_camera_lidar (4, 4); a frame without a point in the image has a distance of 1."""
-        return -float(np.mean([_distance(frame, T) for frame in self.frames]))
-
-
-def _distance(frame: PointFeatures, T: Matrix) -> float:
+def likeness(frame: PointFeatures, T: Matrix) -> float:
+    """Less the distance of a frame at T_camera_lidar (4, 4): -1, nothing in common or no point in the image, to 0."""
     u, v, points = project(frame.xyz, T, frame.camera)
     counts = joint_counts(frame.value[points], frame.image[v, u], NID_BINS)
-    return normalised_information_distance(counts / len(points)) if len(points) else 1.0
+    return -normalised_information_distance(counts / len(points)) if len(points) else -1.0
 
 
 def unhidden(frame: PointFeatures, T: Matrix, tolerance: float) -> NDArray[np.intp]:
@@ -226,13 +214,13 @@ class Nid(Viewing):
         shade = np.minimum(np.arange(256) * NID_BINS // 255, NID_BINS - 1).astype(np.uint8)
         return replace(view, image=shade[cv2.equalizeHist(view.image)], value=(rank * NID_BINS).astype(np.intp))
 
-    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> DistanceScore:
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> MeanScore:
         """What is maximised while what is hidden stays as it is at T_prior (4, 4), and only points in its image count.
 
         TooFewFeaturesError if there is hardly any.
         """
         seen = [f.select(unhidden(f, T_prior, self.tolerance_m)) for f in features]
-        return DistanceScore(enough(seen))
+        return MeanScore(enough(seen), likeness)
 
     def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Nelder and Mead's simplex from T (4, 4), again and again; every search has its own score.

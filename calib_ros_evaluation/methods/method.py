@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -91,6 +91,18 @@ class Watched:
         """At T (4, 4)."""
         self.evaluations += 1
         return self.score.value(T)
+
+
+@dataclass(frozen=True, eq=False)
+class MeanScore:
+    """The mean over frames of what `of_frame` makes of one at T_camera_lidar (4, 4); a Score."""
+
+    frames: Sequence[Any]
+    of_frame: Callable[[Any, Matrix], float]
+
+    def value(self, T: Matrix) -> float:
+        """At T (4, 4)."""
+        return float(np.mean([self.of_frame(frame, T) for frame in self.frames]))
 
 
 def typical_step_deg(reach: SearchBox) -> float:

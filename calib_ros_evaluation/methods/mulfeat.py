@@ -19,6 +19,7 @@ from calib_ros.registration.score.point_score import project
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import barzilai_borwein
 from calib_ros_evaluation.methods.method import (
+    MeanScore,
     Outcome,
     PointFeatures,
     Viewing,
@@ -152,10 +153,17 @@ class Mulfeat(Viewing):
         blur = self.smoothing * float(view.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         return PointFeatures(view.camera, smoothed(edges, blur), view.xyz[index], P)
 
-    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> MulfeatScore:
+    def score(self, features: Sequence[PointFeatures], T_prior: Matrix) -> MeanScore:
         """Mean of the frames' J. TooFewFeaturesError for fewer than min_points per frame near the image at T_prior."""
-        kept = near(features, T_prior, self.margin, self.min_points, WHAT)
-        return MulfeatScore(kept, self.lidar_edge, self.image_edge)
+        return MeanScore(near(features, T_prior, self.margin, self.min_points, WHAT), self.matched)
+
+    def matched(self, f: PointFeatures, T: Matrix) -> float:
+        """J of eq. 4.6 of a frame; 0 without LiDAR edges in the image."""
+        u, v, inside = project(f.xyz, T, f.camera)
+        P, E = f.value[inside], f.image[v, u]
+        is_edge = self.lidar_edge <= P
+        n_matched = int(np.count_nonzero(is_edge & (self.image_edge <= E)))
+        return n_matched / max(int(np.count_nonzero(is_edge)), 1) * float(P @ E)
 
     def optimise(self, features: Sequence[PointFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Steepest ascent with the steps of Barzilai and Borwein, round after round from the best so far, within the reach."""
@@ -165,24 +173,3 @@ class Mulfeat(Viewing):
             T, _ = barzilai_borwein(watched, T, step, step / 2, self.evaluations, limits)
             step /= 2
         return Outcome(T, watched.evaluations)
-
-
-@dataclass(frozen=True, eq=False)
-class MulfeatScore:
-    """J of eq. 4.6, the mean over frames; a Score. lidar_edge, image_edge: as of Mulfeat."""
-
-    frames: Sequence[PointFeatures]
-    lidar_edge: float
-    image_edge: float
-
-    def value(self, T: Matrix) -> float:
-        """At T_camera_lidar (4, 4). A frame without LiDAR edges in the image adds 0."""
-        return sum(self._of_frame(f, T) for f in self.frames) / len(self.frames)
-
-    def _of_frame(self, f: PointFeatures, T: Matrix) -> float:
-        u, v, inside = project(f.xyz, T, f.camera)
-        P, E = f.value[inside], f.image[v, u]
-        is_edge = self.lidar_edge <= P
-        n_edges = int(np.count_nonzero(is_edge))
-        n_matched = int(np.count_nonzero(is_edge & (self.image_edge <= E)))
-        return n_matched / max(n_edges, 1) * float(P @ E)

@@ -1,5 +1,5 @@
 """The two methods of this project: its default, the fast form, searched, optimised and validated by the calibrator; and that of
-the thesis, eq. 3.12 and 3.16, by the downhill simplex of Nelder and Mead (table 4.3)."""
+the thesis, eq. 3.12 and 3.16, by the downhill simplex of Nelder and Mead (table 4.3); and all methods that can be compared."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
@@ -18,7 +19,10 @@ from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.score.point_score import LevelScore, PointScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
-from calib_ros_evaluation.methods.method import Extracting, Outcome, Watched, search_limits, typical_step_deg
+from calib_ros_evaluation.methods.edges import Castorena, Levinson
+from calib_ros_evaluation.methods.information import Nid, Pandey
+from calib_ros_evaluation.methods.method import Extracting, Method, Outcome, Watched, search_limits, typical_step_deg
+from calib_ros_evaluation.methods.mulfeat import Mulfeat
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import frame_weights
 from calib_ros_thesis.score import ThesisLevelScore, ThesisScore
@@ -109,3 +113,13 @@ class Thesis(Extracting):
             watched.score = scores.at(level)
             T, _ = nelder_mead(watched, T, step / 2**level, evaluations, limits=limits)
         return Outcome(T, watched.evaluations)
+
+
+# In the order of the thesis's table 4.2, then what came after it.
+METHODS = (Pandey, Levinson, Castorena, Mulfeat, Thesis, Nid, Own)
+NAMES = tuple(method.name for method in METHODS)
+
+
+def methods(config: Config) -> dict[str, Method]:
+    """Name -> method, in the order of NAMES; all work with this configuration."""
+    return {method.name: method(config=config) for method in METHODS}

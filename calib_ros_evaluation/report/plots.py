@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
@@ -150,7 +150,13 @@ def boxes(trials: Mapping[str, pd.DataFrame], styles: Styles) -> Plot:
     for axis, label in enumerate(AXES):
         axes = figure.add_subplot(2, 3, axis + 1)
         columns = [E[:, axis] for E in own.values()]
-        half = _half_range(columns, LIMITS[axis // 3])
+        # To where the whiskers of half of the methods end, so that one that is far off does not flatten all the others.
+        ends = []
+        for values in columns:
+            low, high = np.quantile(values, [0.25, 0.75])
+            beyond = 1.5 * (high - low)
+            ends.append(np.abs(values[(values >= low - beyond) & (values <= high + beyond)]).max())
+        half = max(1.15 * float(np.median(ends)), 2 * LIMITS[axis // 3])
         drawn = axes.boxplot(columns, patch_artist=True, widths=0.6, flierprops={"marker": ".", "markersize": 4, "alpha": 0.5})
         for part, median, method in zip(drawn["boxes"], drawn["medians"], own, strict=True):
             part.set(facecolor=styles[method]["color"], alpha=0.75, linewidth=1.6 if method == OURS else 0.9)
@@ -169,17 +175,6 @@ def boxes(trials: Mapping[str, pd.DataFrame], styles: Styles) -> Plot:
         '"out": so many trials lie outside the drawn range. Grey band: the limit of success.'
     )
     return finished(figure, "single_boxes", "Errors of single frames per axis", caption)
-
-
-def _half_range(columns: Sequence[Matrix], limit: float) -> float:
-    """Half the drawn range: where the whiskers of half of the methods end, so that one that is far off does not flatten all the
-    others; at least twice the limit of success."""
-    ends = []
-    for values in columns:
-        low, high = np.quantile(values, [0.25, 0.75])
-        inside = values[(values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))]
-        ends.append(float(np.abs(inside).max()))
-    return max(1.15 * float(np.median(ends)), 2 * limit)
 
 
 def starts(trials: dict[str, pd.DataFrame], styles: Styles) -> Plot:
@@ -206,6 +201,8 @@ def _share(success: pd.Series) -> tuple[float, float, float]:
 
 def frames(trials: dict[str, pd.DataFrame], styles: Styles) -> Plot:
     """Errors against the number of frames."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     figure = empty_figure(13, 5.2)
     numbers, by_number = groups(trials, "n")
     labels = {"rotation_deg": "rotation error, deg", "cm": "translation error, cm"}
@@ -218,8 +215,12 @@ def frames(trials: dict[str, pd.DataFrame], styles: Styles) -> Plot:
         axes.axhline(limit, color="0.5", linewidth=1, linestyle=(0, (2, 3)), zorder=1)
         _side_by_side(axes, found, styles, [str(n) for n in numbers])
         axes.set_yscale("log")
-        decimal(axes.yaxis)
-        axes.set_ylim(*_seen(found.values(), limit))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=30))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        shown = np.concatenate([[limit], *(np.ravel(values) for values in found.values())])
+        shown = shown[np.isfinite(shown) & (shown > 0)]
+        axes.set_ylim(max(shown.min() / 1.3, 1e-4), 1.3 * shown.max())
         axes.set(xlabel="frames", ylabel=f"{labels[column]} (logarithmic)")
     method_legend(figure, trials, styles)
     caption = "Median over all trials, bars from quartile to quartile; dotted: the limit of success."
@@ -239,19 +240,3 @@ def _side_by_side(axes: Any, found: Mapping[str, Sequence[Sequence[float]]], sty
         axes.errorbar(place[kept], y[kept], off, markersize=6, elinewidth=1, capsize=2.5, **styles[method])
     axes.set_xticks(places, labels)
     axes.grid(axis="y", color="0.9")
-
-
-def _seen(drawn: Iterable[Sequence[Sequence[float]]], limit: float) -> tuple[float, float]:
-    """Range of a logarithmic axis that shows all that is drawn, and the limit of success."""
-    kept = np.concatenate([limit * np.ones(1), *(np.ravel(values) for values in drawn)])
-    kept = kept[np.isfinite(kept) & (kept > 0)]
-    return float(max(kept.min() / 1.3, 1e-4)), float(1.3 * kept.max())
-
-
-def decimal(axis: Any) -> None:
-    """Ticks at 1, 2 and 5, written out."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=30))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())

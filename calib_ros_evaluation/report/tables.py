@@ -97,18 +97,14 @@ def basins(curves: Curves) -> Matrix:
     It ends where a sample farther out is higher than the lowest one nearer the peak by RISE of the span. A side whose rise ends
     beyond the truth counts as 0, a curve without a span as well.
     """
-    return np.array([_basin(x, y) for x, y in zip(curves.offsets, curves.values, strict=True)])
-
-
-def _basin(x: Matrix, y: Matrix) -> float:
-    if not np.isfinite(y).all():
-        return math.nan
-    span, peak = float(np.ptp(y)), int(np.argmax(y))
-    if span <= 1e-12:
-        return 0.0
-    right = peak + _falling(y[peak:], RISE * span)
-    left = peak - _falling(y[peak::-1], RISE * span)
-    return 0.5 * (max(float(x[right]), 0.0) + max(-float(x[left]), 0.0))
+    out = np.full(6, np.nan)
+    for k, (x, y) in enumerate(zip(curves.offsets, curves.values, strict=True)):
+        if np.isfinite(y).all():
+            span, peak = float(np.ptp(y)), int(np.argmax(y))
+            right = peak + _falling(y[peak:], RISE * span)
+            left = peak - _falling(y[peak::-1], RISE * span)
+            out[k] = 0.5 * (max(float(x[right]), 0.0) + max(-float(x[left]), 0.0)) if span > 1e-12 else 0.0
+    return out
 
 
 def _falling(y: Matrix, tolerance: float) -> int:

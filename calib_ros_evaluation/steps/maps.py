@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -16,6 +15,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.score.point_score import Score, project
 from calib_ros_evaluation.curves import AXES, Curves, curves
+from calib_ros_evaluation.methods.method import MeanScore
 from calib_ros_evaluation.steps.cloud import REFLECTIVITY, depth_scale
 from calib_ros_evaluation.steps.pictures import (
     GREYS,
@@ -25,7 +25,6 @@ from calib_ros_evaluation.steps.pictures import (
     VIRIDIS,
     WRONG_DEG,
     WRONG_M,
-    Image,
     Matrix,
     RegisteredFrame,
     Scale,
@@ -37,6 +36,7 @@ from calib_ros_evaluation.steps.pictures import (
     tiles,
 )
 from calib_ros_thesis.config import thesis_of
+from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import (
     BLUR,
     DEPTH_STEP,
@@ -91,34 +91,32 @@ def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
             f"Figure 3.13. {text} {shown.mean():.1%} of the pixels are filled.",
             draw(levels / DEPTH_UNITS, shown),
         )
+    h, w = sparse_depth.shape
+    window = busiest(scene.maps.discontinuity, max(h // 3, 2), max(w // 8, 2))
+    pictures = [
+        inverted.palette[np.where(levels[window] != EMPTY, inverted.levels(levels[window] / DEPTH_UNITS), 0)]
+        for levels in stages.values()
+    ]
     yield wide_step(
         "Completion, magnified",
         "Figure 3.13 on the part of the picture with the strongest jumps, pixel by pixel: from single points to a surface. "
         "The last step but the inversion back is a median blur, which takes away what sticks out of a surface.",
-        _magnified(stages, scene.maps.discontinuity, inverted),
+        inverted.below(tiles(pictures, list(stages), 3, w)),
     )
-
-
-def _magnified(stages: dict[str, Levels], interest: NDArray[np.float32], scale: Scale) -> Image:
-    h, w = interest.shape
-    window = busiest(interest, max(h // 3, 2), max(w // 8, 2))
-    pictures = [
-        scale.palette[np.where(levels[window] != EMPTY, scale.levels(levels[window] / DEPTH_UNITS), 0)]
-        for levels in stages.values()
-    ]
-    return scale.below(tiles(pictures, list(stages), 3, w))
 
 
 def map_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Discontinuity, sparse maps, completion, dense maps, edges."""
-    lidar = scene.maps.lidar
-    size = lidar.occupied.size
+    lidar, points, camera = scene.maps.lidar, scene.thesis.points, scene.frame.camera
+    u, v, inside = project(points.xyz, scene.T, camera)
+    depth = np.zeros((camera.height, camera.width), np.float32)
+    depth[v, u] = points.depth[inside]  # far ones first
     yield step(
         "Scan on the image",
         "All points that pass the filters, by eq. 2.30 with the extrinsic of this page, coloured by depth. "
         f"{np.count_nonzero(lidar.occupied)} pixels "
         f"({lidar.occupied.mean():.1%}) hold a point; where several fall on one, the nearest counts.",
-        _points(scene),
+        depth_scale(points.depth[inside]).over(scene.gray, depth, depth > 0),
     )
     D = scene.maps.discontinuity
     jumps = scene.thesis.points.discontinuity
@@ -131,18 +129,8 @@ def map_steps(scene: RegisteredFrame) -> Iterator[Step]:
     )
     yield from _sparse(scene)
     yield from completion_steps(scene)
-    yield from _dense(scene, size)
+    yield from _dense(scene)
     yield from _edges(scene)
-
-
-def _points(scene: RegisteredFrame) -> NDArray[np.uint8]:
-    """The image with its points coloured by depth, far ones beneath."""
-    points, camera = scene.thesis.points, scene.frame.camera
-    u, v, inside = project(points.xyz, scene.T, camera)
-    scale = depth_scale(points.depth[inside])
-    depth = np.zeros((camera.height, camera.width), np.float32)
-    depth[v, u] = points.depth[inside]
-    return scale.over(scene.gray, depth, depth > 0)
 
 
 def _depth_scale(lidar: EdgeMaps) -> Scale:
@@ -174,7 +162,7 @@ def _sparse(scene: RegisteredFrame) -> Iterator[Step]:
     )
 
 
-def _dense(scene: RegisteredFrame, size: int) -> Iterator[Step]:
+def _dense(scene: RegisteredFrame) -> Iterator[Step]:
     config, lidar = thesis_of(scene.config), scene.maps.lidar
     shown = lidar.dense_depth != EMPTY
     yield step(
@@ -201,7 +189,7 @@ def _dense(scene: RegisteredFrame, size: int) -> Iterator[Step]:
     yield step(
         "Objects closed",
         f"Figure 3.15c: the object map after a closing by {config.closing} px, which joins the points of an object and keeps its "
-        f"size. {np.count_nonzero(lidar.dense_object) / size:.1%} of the pixels belong to an object.",
+        f"size. {(lidar.dense_object > 0).mean():.1%} of the pixels belong to an object.",
         NAMES[lidar.dense_object],
     )
 
@@ -226,21 +214,6 @@ def _edges(scene: RegisteredFrame) -> Iterator[Step]:
         f"{np.count_nonzero(E_L)} pixels, {np.count_nonzero(E_L) / max(int(lidar.occupied.sum()), 1):.0%} of those with a point.",
         Scale("edge strength", 0, 1, GREYS).dots(E_L, lidar.occupied),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Both:
-    """J of eq. 3.12 as a score, which notes the normalised one on the way: both come from the same maps."""
-
-    score: ThesisScore
-    normalized: list[float] = field(default_factory=list)
-
-    def value(self, T: Matrix) -> float:
-        """J at T (4, 4), at the last smoothing."""
-        pixels, _, edges = self.score.shown(T)[0]
-        J = float(np.sum(edges * self.score.features[0].image_edges[-1].ravel()[pixels], dtype=np.float64))
-        self.normalized.append(J / max(float(np.sum(edges, dtype=np.float64)), 1e-12))
-        return J
 
 
 def score_steps(scene: RegisteredFrame, samples: int) -> Iterator[Step]:
@@ -331,13 +304,22 @@ def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score |
 def _curve_steps(scene: RegisteredFrame, fast: Score | None, samples: int) -> Iterator[Step]:
     found: dict[str, Curves] = {}
     try:
-        both = Both(ThesisScore([scene.thesis], scene.T, scene.config))
+        score = ThesisScore([scene.thesis], scene.T, scene.config)
     except TooFewFeaturesError as error:
         yield score_step("Loss curves", f"No curves: {error}.")
         return
-    raw = curves(both, scene.T, ROTATION_DEG, TRANSLATION_M, samples)
+    normalized: list[float] = []
+
+    def both(features: ThesisFeatures, T: Matrix) -> float:
+        """J of eq. 3.12 at T (4, 4), at the last smoothing; the normalised one is noted: both come from the same maps."""
+        pixels, _, edges = score.shown(T)[0]
+        J = float(np.sum(edges * features.image_edges[-1].ravel()[pixels], dtype=np.float64))
+        normalized.append(J / max(float(np.sum(edges, dtype=np.float64)), 1e-12))
+        return J
+
+    raw = curves(MeanScore(score.features, both), scene.T, ROTATION_DEG, TRANSLATION_M, samples)
     found["J, eq. 3.12"] = raw
-    found["J / LiDAR edges"] = dataclasses.replace(raw, values=np.reshape(both.normalized, raw.values.shape))
+    found["J / LiDAR edges"] = dataclasses.replace(raw, values=np.reshape(normalized, raw.values.shape))
     if fast is not None:
         found["fast score"] = curves(fast, scene.T, ROTATION_DEG, TRANSLATION_M, samples)
     missing = "" if fast is not None else " The scan shows too few edge points for the fast score."

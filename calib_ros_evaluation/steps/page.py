@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -109,8 +110,10 @@ def check_folder(folder: Path) -> None:
         raise BadInputError(f"--out {folder}: {standing} is a file; choose a folder")
     if not os.access(standing, os.W_OK | os.X_OK):
         raise BadInputError(f"--out {folder}: {standing} cannot be written; check its permissions or choose another folder")
-    page = folder / PAGE
-    if page.exists() and not _is_ours(page):
+    page, is_ours = folder / PAGE, False
+    with suppress(OSError):
+        is_ours = MARK in page.read_text(encoding="utf-8", errors="replace")[:2000]
+    if page.exists() and not is_ours:
         raise BadInputError(f"--out {folder} holds an {PAGE} that `calib-ros steps` did not write; choose another folder")
 
 
@@ -150,13 +153,6 @@ def write_page(
         if file not in pictures:
             (folder / file).unlink(missing_ok=True)
     return target
-
-
-def _is_ours(page: Path) -> bool:
-    try:
-        return MARK in page.read_text(encoding="utf-8", errors="replace")[:2000]
-    except OSError:
-        return False
 
 
 def run_steps(args: argparse.Namespace) -> str:

@@ -13,8 +13,8 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros_evaluation.methods import information as jh
-from calib_ros_evaluation.methods.information import DistanceScore, InformationScore, Nid, Pandey, unhidden
-from calib_ros_evaluation.methods.method import PointFeatures
+from calib_ros_evaluation.methods.information import InformationScore, Nid, Pandey, likeness, unhidden
+from calib_ros_evaluation.methods.method import MeanScore, PointFeatures
 
 METHODS = [Pandey(), Nid()]
 both = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
@@ -75,12 +75,12 @@ def test_the_distance_counts_pairs_of_bins_at_the_nearest_pixel() -> None:
     # The four points are seen at grey bins 9, 9, 0, 0 and reflect levels 2, 2, 2, 7: the table MIXED, turned.
     xyz = at_pixels((5, 3), (6.4, 2.6), (10, 10), (0, 12), (30, 3), (5, -2))  # the last two fall beside the image
     frame = PointFeatures(CAMERA, light, xyz, np.array([2, 2, 2, 7, 1, 1]))
-    assert DistanceScore([frame]).value(np.eye(4)) == pytest.approx(-log(3) / (2 * log(2)))
+    assert MeanScore([frame], likeness).value(np.eye(4)) == pytest.approx(-log(3) / (2 * log(2)))
     # Two frames: the mean. The other's levels follow its grey values: distance 0.
     other = dataclasses.replace(frame, value=np.array([2, 2, 7, 7, 1, 1]))
-    assert DistanceScore([frame, other]).value(np.eye(4)) == pytest.approx(-log(3) / (4 * log(2)))
+    assert MeanScore([frame, other], likeness).value(np.eye(4)) == pytest.approx(-log(3) / (4 * log(2)))
     away = se3.perturb(np.eye(4), [0, 0, 0], [0, 0, -100])  # all points behind the camera
-    assert DistanceScore([frame, other]).value(away) == -1
+    assert MeanScore([frame, other], likeness).value(away) == -1
 
 
 def test_information_takes_the_grey_value_between_pixels_and_pools_frames() -> None:

@@ -12,8 +12,8 @@ from calib_ros.config import Config
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import reflectivity
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import PointFeatures, search_limits, typical_step_deg
-from calib_ros_evaluation.methods.mulfeat import Mulfeat, MulfeatScore, edge_probability
+from calib_ros_evaluation.methods.method import MeanScore, PointFeatures, search_limits, typical_step_deg
+from calib_ros_evaluation.methods.mulfeat import Mulfeat, edge_probability
 
 IDENTITY = np.eye(4)  # the points are given in the camera's frame
 CAMERA = Camera(np.array([[50.0, 0, 19.5], [0, 50.0, 11.5], [0, 0, 1]]), 40, 24)
@@ -42,11 +42,11 @@ def test_the_score_by_hand(three):
 
     J = 1/2 (0.5 * 0.8 + 0.25 * 0.2 + 0.1 * 0.6) = 1/2 (0.40 + 0.05 + 0.06) = 0.255
     """
-    score = MulfeatScore([three], lidar_edge=1 / 6, image_edge=0.3)
+    score = MeanScore([three], Mulfeat(lidar_edge=1 / 6, image_edge=0.3).matched)
     assert score.value(IDENTITY) == pytest.approx(0.255, rel=1e-6)
     # With E^C >= 0.2 an edge, both match: 2/2 * 0.51. With P >= 0.05, three are edges, and two match: 2/3 * 0.51.
-    assert MulfeatScore([three], 1 / 6, 0.2).value(IDENTITY) == pytest.approx(0.51, rel=1e-6)
-    assert MulfeatScore([three], 0.05, 0.3).value(IDENTITY) == pytest.approx(0.34, rel=1e-6)
+    assert Mulfeat(lidar_edge=1 / 6, image_edge=0.2).matched(three, IDENTITY) == pytest.approx(0.51, rel=1e-6)
+    assert Mulfeat(lidar_edge=0.05, image_edge=0.3).matched(three, IDENTITY) == pytest.approx(0.34, rel=1e-6)
     # 0.2 m to the right at 10 m is one pixel: (4, 2), (11, 5), (21, 8) hold E^C = 0, 0.4, 0. J = 1/2 (0.25 * 0.4) = 0.05.
     assert score.value(se3.from_parts(np.eye(3), [0.2, 0, 0])) == pytest.approx(0.05, rel=1e-6)
 

@@ -20,7 +20,6 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud, SemanticClass
 from calib_ros.result import Result
 from calib_ros_evaluation.commands import sources_in
-from calib_ros_evaluation.experiments.job import job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import (
     Setup,
@@ -36,11 +35,11 @@ from calib_ros_evaluation.experiments.setup import (
     worker_cache,
 )
 from calib_ros_evaluation.experiments.trial import classes_of_points, run_jobs
-from calib_ros_evaluation.methods.registry import NAMES
+from calib_ros_evaluation.methods.own import NAMES
 from calib_ros_evaluation.protocols.definitions import NAMES as PROTOCOL_NAMES
-from calib_ros_evaluation.protocols.detection import COLUMNS as PERTURBED
-from calib_ros_evaluation.report.sections import sections
-from calib_ros_evaluation.results import TWIST_AXES, collect_results
+from calib_ros_evaluation.protocols.trials import COLUMNS as PERTURBED
+from calib_ros_evaluation.report.page import sections
+from calib_ros_evaluation.results import TWIST_AXES, collect_results, job
 from calib_ros_thesis.features import importance
 
 pytestmark = pytest.mark.usefixtures("rendered_once")

@@ -15,8 +15,7 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
-from calib_ros_evaluation.methods.own import LINEARISATION, Own, Thesis, counted
-from calib_ros_evaluation.methods.registry import methods
+from calib_ros_evaluation.methods.own import LINEARISATION, Own, Thesis, counted, methods
 from calib_ros_thesis.score import ThesisScore
 
 # The features of these scenes were made without semantics: what is compared with them has none either.

@@ -29,7 +29,7 @@ from calib_ros_evaluation.protocols.definitions import (
     Size,
     displacement,
 )
-from calib_ros_evaluation.protocols.detection import (
+from calib_ros_evaluation.protocols.trials import (
     COLUMNS,
     INCONCLUSIVE,
     RIGHT,
@@ -37,11 +37,12 @@ from calib_ros_evaluation.protocols.detection import (
     Detection,
     accuracy_table,
     detection_jobs,
+    drawn,
     kind_of,
     read_perturbations,
     sets_table,
+    size_table,
 )
-from calib_ros_evaluation.protocols.trials import drawn, size_table
 from calib_ros_evaluation.results import read_trials, trials_table
 
 pytestmark = pytest.mark.usefixtures("rendered_once")

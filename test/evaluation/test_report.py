@@ -18,8 +18,7 @@ from trial_rows import row, table
 from calib_ros.errors import MissingDependencyError
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.report import tables
-from calib_ros_evaluation.report.page import write_report
-from calib_ros_evaluation.report.sections import sections
+from calib_ros_evaluation.report.page import sections, write_report
 from calib_ros_evaluation.report.table import Table, escaped, figures
 from calib_ros_evaluation.report.tables import area, basins, called_right, hits, median, peak_distances, quantile
 from calib_ros_evaluation.results import Averaging, CurveResult, Results, Similarity, Trust, algorithm_6

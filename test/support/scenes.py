@@ -18,12 +18,13 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.config import Config, SearchConfig, SemanticsConfig, TrackerConfig
 from calib_ros.datasets.recent import Recent
+from calib_ros.frame import NANOSECONDS
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.result import CONVERGED, REFUSED, Result
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_synthetic.rig import SyntheticRig
+from calib_ros_synthetic.rig import RigPair, SyntheticRig
 
 SIZE = {"width": 640, "height": 240, "rings": 64, "speed": 0, "stride": 30}
 NEAR, FAR = ([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]), ([4, -3, 5], [0.3, -0.2, 0.25])  # 1 deg / 10 cm, 7 deg / 44 cm
@@ -86,10 +87,17 @@ def is_near(reference: np.ndarray, T: np.ndarray, deg: float, m: float) -> bool:
     return se3.rotation_error_deg(reference, T) < deg and se3.translation_error_m(reference, T) < m
 
 
-def on_pixels_of_their_class(drive: SyntheticDrive, index: int, T: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """Classes (n,) of a frame's points in the picture, and whether a pixel within `reach` px has the same one."""
+def on_pixels_of_their_class(
+    drive: RigPair, index: int, T: np.ndarray, reach: int = 0, ahead_s: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Classes (n,) of a frame's points in the picture, and whether a pixel within `reach` px has the same one. ahead_s: of the
+    camera's clock before the LiDAR's; points are moved to the image's moment then, else taken as they are."""
     frame = drive[index]
-    uv, inside = drive.camera.project(se3.transform(T, frame.cloud.xyz))
+    xyz = frame.cloud.xyz
+    if ahead_s is not None:
+        late = (frame.stamp - frame.moment_of_cloud) / NANOSECONDS - ahead_s
+        xyz = moved(xyz, frame.twist, frame.cloud.time - late)
+    uv, inside = drive.camera.project(se3.transform(T, xyz))
     u, v = np.rint(uv[inside]).astype(int).T
     own = frame.cloud.label[inside]
     same = np.zeros(len(own), bool)

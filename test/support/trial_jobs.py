@@ -14,7 +14,7 @@ from waiting import until
 
 from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.pool import run
-from calib_ros_evaluation.experiments.job import EvaluationJob, job
+from calib_ros_evaluation.results import EvaluationJob, job
 
 
 def groups(n: int, size: int = 3) -> list[list[EvaluationJob]]:

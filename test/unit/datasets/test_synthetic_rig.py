@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenes import on_pixels_of_their_class
 
 from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
 from calib_ros.frame import NANOSECONDS, UNLABELLED
-from calib_ros.lidar.deskew import moved
 from calib_ros_synthetic.rig import RigPair, SyntheticRig, open_drive
 from calib_ros_synthetic.rigs import RIGS
 
@@ -21,19 +21,10 @@ def small(rig: str = SIX, **options: object) -> SyntheticRig:
 
 def agreement(rig: SyntheticRig, camera: str, lidar: str, index: int, T: np.ndarray | None = None) -> float:
     """Share of a scan's points that fall on a pixel of their own class, in a frame of a pair."""
-    frame = rig.pair(camera, lidar)[index]
-    cloud, classes, ahead = frame.cloud, frame.classes, rig.clock_s(camera) - rig.clock_s(lidar)
-    assert frame.reference is not None
-    assert cloud.time is not None
-    assert cloud.label is not None
-    assert classes is not None
-    late = (frame.stamp - frame.moment_of_cloud) / NANOSECONDS - ahead
-    xyz = moved(cloud.xyz, frame.twist, cloud.time - late)  # type: ignore[arg-type]
-    uv, inside = frame.camera.project(se3.transform(frame.reference if T is None else T, xyz))
-    u, v = np.rint(uv[inside]).astype(int).T.clip(0, [[classes.shape[1] - 1], [classes.shape[0] - 1]])
-    label = cloud.label[inside]
-    assert np.count_nonzero(label != UNLABELLED) > 1000
-    return float((classes[v, u] == label)[label != UNLABELLED].mean())
+    pair, ahead = rig.pair(camera, lidar), rig.clock_s(camera) - rig.clock_s(lidar)
+    own, same = on_pixels_of_their_class(pair, index, pair[index].reference if T is None else T, ahead_s=ahead)
+    assert np.count_nonzero(own != UNLABELLED) > 1000
+    return float(same[own != UNLABELLED].mean())
 
 
 PAIRS = [

@@ -11,7 +11,7 @@ from trial_jobs import groups
 
 from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.journal import Journal
-from calib_ros_evaluation.experiments.job import job
+from calib_ros_evaluation.results import job
 
 ABOUT = {"version": "1"}
 FOREIGN = (b"someone else's\n", b'{"my": "data"}', b'{"my": 1}\n{"half a li', b'{"about":{},"by":"fleet check"}\n')

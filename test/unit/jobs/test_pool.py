@@ -21,7 +21,7 @@ from waiting import LIMIT_S, until
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError, TooFewFeaturesError
 from calib_ros_check.jobs import pool
 from calib_ros_check.jobs.journal import Answer, Journal
-from calib_ros_evaluation.experiments.job import EvaluationJob, job
+from calib_ros_evaluation.results import EvaluationJob, job
 
 ABOUT = {"version": "1"}
 BAD = {one.key for one in groups(8)[3]}  # jobs of `fall` and `refuse` that do not go well
