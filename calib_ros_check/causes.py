@@ -83,7 +83,7 @@ def explained(hypothesis: Hypothesis, camera: Camera) -> tuple[CauseFinding, ...
     """That a hypothesis holds, and excludes the others. What was mixed up is mended before clocks and intrinsics are judged."""
     own = CauseFinding(hypothesis.cause, CauseState.FOUND, hypothesis.message)
     if hypothesis.of_lens:
-        return (*instead(own, of_cameras(camera)), *not_mixed_up(OTHER_FITS))
+        return (*instead(own, of_cameras(camera)), *findings(MIXED_UP, CauseState.EXCLUDED, OTHER_FITS))
     return instead(own, MIXED_UP)
 
 
@@ -110,11 +110,6 @@ def centre_finding(u_px: float, v_px: float) -> CauseFinding:
     )
     message = f"{words} explains the frames as well as the rotation: they do not tell the two apart"
     return CauseFinding(Cause.PRINCIPAL_POINT, CauseState.POSSIBLE, message, {"u_px": u_px, "v_px": v_px})
-
-
-def not_mixed_up(why: str) -> tuple[CauseFinding, ...]:
-    """Findings where nothing was mixed up. why: AS_GIVEN, OFF or OTHER_FITS."""
-    return findings(MIXED_UP, CauseState.EXCLUDED, why)
 
 
 def complete(judged: Sequence[CauseFinding], camera: Camera) -> tuple[CauseFinding, ...]:

@@ -30,7 +30,7 @@ from calib_ros.registration.covariance import covariance
 from calib_ros.registration.features import FrameFeatures, ScanEdges, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.judgement.evidence import Match, convinces, freedom, log_odds, rare_odds, shows_lens, shows_noise
-from calib_ros.registration.judgement.hypotheses import AsTaken, fisheyes
+from calib_ros.registration.judgement.hypotheses import MIXED_UP, AsTaken, fisheyes
 from calib_ros.registration.judgement.judge import NEAR, Candidate, Question, is_only_off
 from calib_ros.registration.judgement.lens import LensEstimate, LensFault
 from calib_ros.registration.nuisance.parameters import NEAR_LEVELS, TOLERANCE_DEG, noise_of, refined
@@ -50,7 +50,6 @@ from calib_ros_check.causes import (
     explained,
     findings,
     lens_findings,
-    not_mixed_up,
     possible_causes,
 )
 from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
@@ -163,7 +162,10 @@ class Checker:
         if found is not None:
             result = self._judged(found, inputs)
         else:
-            result = self._nothing_found(inputs, NOTHING_MATCHES if features else "no frame can be used")
+            why = NOTHING_MATCHES if features else "no frame can be used"
+            causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
+            known = {"tolerance": inputs.tolerance, "T_checked": inputs.T, "T_estimated": None, "covariance": None}
+            result = CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)
         return replace(
             result,
             frame_names=tuple(f.name or str(k) for k, f in enumerate(features)),
@@ -185,7 +187,7 @@ class Checker:
         if one is not None:
             # What holds on most vehicles has to hold exactly; else its optimum tells how far the extrinsic is off.
             off = is_only_off(one, tolerance.deg, tolerance.m)
-            told = not_mixed_up(OFF) if off else explained(one.hypothesis, self.camera)
+            told = findings(MIXED_UP, CauseState.EXCLUDED, OFF) if off else explained(one.hypothesis, self.camera)
             known = Result(one.T, CONVERGED, frames_used=len(features), evidence=Evidence(one.z_score, None, np.nan, np.nan))
             T_corrected = inputs.T if off else one.hypothesis.T
             return Explanation(one.score, one.T, covariance_of(one.score, one.T), T_corrected, known, told)
@@ -230,7 +232,8 @@ class Checker:
         causes = (clocks, *causes)
         blamed, right = any(own.state is CauseState.FOUND for own in causes), inputs.tolerance.covers(inputs.T, found)
         why = OTHER_FITS if blamed else AS_GIVEN if right else OFF
-        return Explanation(score, found, C, inputs.T, result, (*causes, *not_mixed_up(why)), shared, whole)
+        causes = (*causes, *findings(MIXED_UP, CauseState.EXCLUDED, why))
+        return Explanation(score, found, C, inputs.T, result, causes, shared, whole)
 
     def _lens(
         self, score: PointScore, T: Matrix, result: Result, inputs: CheckInputs, turned: Matrix | None = None
@@ -331,11 +334,6 @@ class Checker:
             p_value=evidence.p_value if evidence else np.nan,
             frames_used=result.frames_used,
         )
-
-    def _nothing_found(self, inputs: CheckInputs, why: str) -> CheckResult:
-        causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
-        known = {"tolerance": inputs.tolerance, "T_checked": inputs.T, "T_estimated": None, "covariance": None}
-        return CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)
 
 
 def covariance_of(score: PointScore, T: Transform) -> Covariance:

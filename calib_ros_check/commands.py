@@ -65,13 +65,9 @@ class Check:
 
     def run(self, args: argparse.Namespace) -> int:
         """Check and tell; the exit code."""
-        from calib_ros_check.cli import check_one, is_one, options_of
+        from calib_ros_check.cli import check_many, check_one, is_one
 
-        if is_one(args.source, args.rig):
-            return check_one(args)
-        from calib_ros_check.fleet.cli import check_many
-
-        return check_many(args, options_of(args))
+        return check_one(args) if is_one(args.source, args.rig) else check_many(args)
 
 
 class Certify:
@@ -93,7 +89,7 @@ class Certify:
 
     def run(self, args: argparse.Namespace) -> int:
         """Certify and tell; the exit code."""
-        from calib_ros_check.fleet.cli import certify_many
+        from calib_ros_check.cli import certify_many
 
         return certify_many(args)
 

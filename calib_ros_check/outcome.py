@@ -89,8 +89,24 @@ class CauseFinding:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
+class AsJson:
+    """What is written as JSON."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        raise NotImplementedError
+
+    def dumps(self) -> str:
+        """JSON."""
+        return json.dumps(self.to_dict(), indent=1) + "\n"
+
+    def save(self, path: str | Path) -> None:
+        """Write JSON atomically. BadInputError if the folder cannot be written."""
+        write_atomically(path, self.dumps().encode())
+
+
 @dataclass(frozen=True, eq=False)
-class CheckResult:
+class CheckResult(AsJson):
     """Whether an extrinsic is right to within a tolerance.
 
     verdict: in all; fail where the extrinsic is off by more, or another cause was found. reason: one line for people, what was
@@ -146,14 +162,6 @@ class CheckResult:
         rounded = {name: round(values[name], 3) for name in ("elapsed_s", "cpu_s")}
         first = {"verdict": self.verdict.value, "reason": self.reason, "cause": plain(self.cause)}
         return first | values | rounded | {"version": VERSION}
-
-    def dumps(self) -> str:
-        """JSON."""
-        return json.dumps(self.to_dict(), indent=1) + "\n"
-
-    def save(self, path: str | Path) -> None:
-        """Write JSON atomically. BadInputError if the folder cannot be written."""
-        write_atomically(path, self.dumps().encode())
 
 
 def plain(value: Any) -> Any:

@@ -31,22 +31,12 @@ from calib_ros_check.page import page_template, write_page
 from calib_ros_check.recording import Checked
 from calib_ros_check.rig import shown as html
 from calib_ros_check.rig.check import RigCheck
-from calib_ros_check.rig.shown import EdgeShown, LoopShown, RigShown, SensorShown
-from calib_ros_check.tolerance import Judgement, amount, signed
+from calib_ros_check.rig.shown import EdgeShown, RigShown, SensorShown
+from calib_ros_check.tolerance import TITLES, Judgement, amount, signed
 
 PICTURES = 3
 MAX_WIDTH = 1100  # px of a picture on the page
 QUALITY = 85  # of JPEG
-LONG_NAMES = {
-    "rx": "pitch (rx)",
-    "ry": "yaw (ry)",
-    "rz": "roll (rz)",
-    "tx": "sideways (tx)",
-    "ty": "vertical (ty)",
-    "tz": "forward (tz)",
-    "rotation": "rotation in all",
-    "translation": "translation in all",
-}
 STYLE = """\
 .verdict { display: inline-block; padding: .25rem .9rem; border-radius: 6px; color: #fff; font-weight: 700; font-size: 1.2rem; }
 .pass { background: #0072b2; } .fail { background: #a3246e; } .inconclusive { background: #8a5000; }
@@ -186,7 +176,7 @@ def write_rig_check(path: str | Path, found: RigCheck, config: Config) -> None:
         rotation, translation = p.judgement.rotation, p.judgement.translation
         size = (rotation.error, translation.error) if rotation.is_known else None
         edges.append(EdgeShown(p.target, p.source, p.kind, p.verdict.value, html.LEVELS[p.verdict.value], p.reason, size))
-    loops = tuple(LoopShown(tuple(own.sensors), *own.size, own.p_value, own.closes) for own in found.solution.loops)
+    loops = tuple((own.sensors, own.size, own.p_value, own.closes) for own in found.solution.loops)
     rig = RigShown(found.solution.reference, tuple(sensors), tuple(edges), loops, found.reason)
     parts = [_part(f"{p.target} with {p.source}", p.verdict.value, p.check, found.tolerance) for p in found.pairs if p.check]
     pictures = [
@@ -263,7 +253,7 @@ def _row(own: Deviation, tolerance: Tolerance) -> dict[str, object]:
     limit = tolerance.deg if is_angle else tolerance.m
     known, said = own.is_known, amount if own.name in ("rotation", "translation") else signed
     return {
-        "name": LONG_NAMES[own.name],
+        "name": f"{TITLES[own.name]} ({own.name})" if own.name in TITLES else f"{own.name} in all",
         "verdict": own.verdict.value,
         "error": said(own.error, is_angle) if known else "-",
         "interval": f"{said(own.low, is_angle)} to {said(own.high, is_angle)}" if known else "-",

@@ -24,6 +24,7 @@ from calib_ros.registration.search.constraints import Limits
 from calib_ros_check.outcome import CauseFinding, CheckVerdict, Deviation, Tolerance
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+TITLES = dict(zip(AXES, ("pitch", "yaw", "roll", "sideways", "height", "forward"), strict=True))
 # Scales of the prior, as multiples of the tolerance.
 SCALES = 2.0 ** np.arange(-4, 9)
 SAMPLES = 20000
@@ -177,7 +178,9 @@ def _deviation(name: str, samples: Matrix, limit: float, unit: float, shown: boo
     tail = (1 - INTERVAL) / 2
     low, error, high = (float(x) for x in unit * np.quantile(samples, [tail, 0.5, 1 - tail]))
     found = Deviation(name, verdict_of(float((np.abs(samples) <= limit).mean()), shown), error, low, high)
-    return replace(found, words=axis_words(found) if name in AXES else size_words(found))
+    is_angle = name == "rotation"
+    size = f"off by {amount(error, is_angle)} ({amount(low, is_angle)} to {amount(high, is_angle)})"
+    return replace(found, words=axis_words(found) if name in AXES else size)
 
 
 def _worst(judgement: Judgement) -> list[Deviation]:
@@ -225,9 +228,3 @@ def axis_words(axis: Deviation) -> str:
     if axis.low <= 0 <= axis.high:
         return f"between {signed(axis.low, is_angle)} and {signed(axis.high, is_angle)}"
     return f"{DIRECTIONS[axis.name][int(axis.error < 0)].format(amount(axis.error, is_angle))} (+- {spread})"
-
-
-def size_words(size: Deviation) -> str:
-    """The size of the error in all."""
-    is_angle = size.name == "rotation"
-    return f"off by {amount(size.error, is_angle)} ({amount(size.low, is_angle)} to {amount(size.high, is_angle)})"

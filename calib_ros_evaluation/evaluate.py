@@ -12,8 +12,7 @@ import yaml
 
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.journal import Journal
-from calib_ros_check.jobs.pool import run
+from calib_ros_check.jobs.pool import Journal, run
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, code_fingerprint, inspect_sources
 from calib_ros_evaluation.experiments.trial import run_jobs

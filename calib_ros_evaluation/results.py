@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
-from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.jobs.pool import Answer
 from calib_ros_evaluation.curves import Curves
 
 T = TypeVar("T")

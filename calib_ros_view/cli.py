@@ -18,14 +18,14 @@ from calib_ros.datasets.rig import open_rig
 from calib_ros.errors import BadInputError
 from calib_ros.io import check_output
 from calib_ros.registration.progress import Progress
-from calib_ros.rig.description import RigDescription, read_rig
+from calib_ros.rig.description import read_rig
 from calib_ros.rig.edges import priors_of
 from calib_ros.rig.graph import solve
 from calib_ros.rig.report import load
 from calib_ros.runtime import return_freed_memory
-from calib_ros_check.rig.shown import RigShown, of_priors, of_result
+from calib_ros_check.rig.shown import of_priors, of_result
 from calib_ros_view.session.rig_session import RigSession
-from calib_ros_view.session.session import Session
+from calib_ros_view.session.session import Session, SessionJobs
 from calib_ros_view.web.server import RIG, Address, Opened, Opening, Pictures, listening, require_nicegui, serve
 
 FRAMES = 10  # of a source, unless said otherwise
@@ -88,14 +88,19 @@ def _of_node(args: argparse.Namespace, pictures: Pictures) -> Iterator[Shown]:
 def _of_rig(args: argparse.Namespace, pictures: Pictures) -> Iterator[Shown]:
     """A recording of several sensors."""
     _refuse(args, OF_ONE_PAIR, f"--rig says what {{}} would: leave them out, and set them in {args.rig}")
-    from calib_ros_view.session.jobs import SessionJobs
     from calib_ros_view.web.live_page import live_page
     from calib_ros_view.web.source_page import SourcePage
 
     config, description = configuration(args.config, preset_name=args.preset), read_rig(args.rig)
     out = Path(args.out or OUT)
     check_output(str(out), "--out")
-    rig = None if args.initial is None else _result(args.initial, description)  # before frames are read for nothing
+    rig = None
+    if args.initial is not None:  # before frames are read for nothing
+        found, names = load(args.initial), {sensor.name for sensor in description.sensors}
+        if set(found.poses) != names or found.reference != description.reference:
+            own = ", ".join(found.poses)
+            raise BadInputError(f"{args.initial} is of {own}, not of the sensors of --rig; give a result of this rig")
+        rig = of_result(json.loads(Path(args.initial).read_text(encoding="utf-8")), found)
     source = open_rig(args.source, description, **bag_options(args))
     rig = rig or of_priors(description, solve([], priors_of(description, source), description.reference))
     session = RigSession(source, description, rig, config, args.frames, out)
@@ -111,24 +116,8 @@ def _of_rig(args: argparse.Namespace, pictures: Pictures) -> Iterator[Shown]:
 @contextmanager
 def _of_source(args: argparse.Namespace, pictures: Pictures) -> Iterator[Shown]:
     """A recording of a pair."""
-    session = _session(args)
-    from calib_ros_view.session.jobs import SessionJobs
     from calib_ros_view.web.source_page import SourcePage
 
-    with closing(SessionJobs(session)) as jobs:
-        yield TITLE, lambda: SourcePage(session, jobs, pictures).build(), None
-
-
-def _result(path: str, description: RigDescription) -> RigShown:
-    """What `calib-ros rig --json` wrote. BadInputError for another file, or one of other sensors."""
-    solution = load(path)
-    if set(solution.poses) != {sensor.name for sensor in description.sensors} or solution.reference != description.reference:
-        raise BadInputError(f"{path} is of {', '.join(solution.poses)}, not of the sensors of --rig; give a result of this rig")
-    return of_result(json.loads(Path(path).read_text(encoding="utf-8")), solution)
-
-
-def _session(args: argparse.Namespace) -> Session:
-    """Frames, their edges, and the start."""
     config = configuration(args.config, preset_name=args.preset)
     if args.out is not None:
         check_output(args.out, "--out")
@@ -148,4 +137,5 @@ def _session(args: argparse.Namespace) -> Session:
         session = Session(frames, source, start, config, Path(args.out or OUT), Progress(lambda stage, share: step(share)))
     for line in session.scores.notes:
         note(line)
-    return session
+    with closing(SessionJobs(session)) as jobs:
+        yield TITLE, lambda: SourcePage(session, jobs, pictures).build(), None

@@ -11,15 +11,12 @@ from typing import Any
 
 from calib_ros.errors import MissingDependencyError
 from calib_ros_check.fleet.certificates import certificate_of
-from calib_ros_check.fleet.claims import find_claims
-from calib_ros_check.fleet.fleet import Fleet, FleetOptions
+from calib_ros_check.fleet.fleet import Fleet, FleetOptions, write_changes, write_csv, write_parquet
 from calib_ros_check.fleet.history import VERDICTS, Row, row_of, vehicles
 from calib_ros_check.fleet.jobs import OTHER, lost, options_key, run_checks
 from calib_ros_check.fleet.page import TEMPLATE, write_fleet_page
-from calib_ros_check.fleet.recordings import find_recordings
-from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
-from calib_ros_check.jobs.journal import Journal
-from calib_ros_check.jobs.pool import run
+from calib_ros_check.fleet.recordings import find_claims, find_recordings
+from calib_ros_check.jobs.pool import Journal, run
 from calib_ros_check.page import page_template
 from calib_ros_check.recording import REFERENCE, TF, CheckOptions
 

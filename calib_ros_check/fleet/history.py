@@ -14,10 +14,9 @@ from scipy.stats import chi2
 
 from calib_ros.arrays import Covariance, Matrix
 from calib_ros.frame import NANOSECONDS
-from calib_ros_check.fleet.changes import FALSE_ALARMS, Segments, segments
+from calib_ros_check.fleet.changes import FALSE_ALARMS, Extrinsics, Segments, extrinsics, scatter, segments
 from calib_ros_check.fleet.recordings import Recording
-from calib_ros_check.fleet.sequence import Extrinsics, extrinsics, scatter
-from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.jobs.pool import Answer
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_check.tolerance import AXES
 

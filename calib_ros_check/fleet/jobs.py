@@ -19,7 +19,7 @@ from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
 from calib_ros.rig.description import read_rig
 from calib_ros_check.fleet.recordings import Recording
-from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.jobs.pool import Answer
 from calib_ros_check.recording import REFERENCE, TF, CheckOptions, check_source
 from calib_ros_check.rig.check import as_given, as_row, check_recording
 

@@ -2,35 +2,112 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi
 
 from calib_ros import se3
-from calib_ros.arrays import Transform
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.datasets.rig import open_rig
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.io import write_atomically
 from calib_ros.registration.judgement.evidence import CONFIDENCE
 from calib_ros.result import VERSION, Cause
 from calib_ros.rig.description import MAX_SIGMA_DEG, MAX_SIGMA_M, RigDescription, prior_covariance, read_rig
 from calib_ros.rig.edges import Measurement, Progress, RigMeasurer
-from calib_ros.rig.graph import Edge, RigSolution, solve
+from calib_ros.rig.graph import SIGNIFICANCE, Edge, RigSolution, solve
+from calib_ros.rig.moved import CLOCK, MOVED, NOTHING, RigHypothesis, hypotheses, verdict
 from calib_ros.rig.report import load, loop_dict
 from calib_ros_check.checker import Checker
-from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance, plain
+from calib_ros_check.outcome import AsJson, CheckResult, CheckVerdict, Tolerance, plain
 from calib_ros_check.recording import FRAMES, REFERENCE, TF, CheckOptions
-from calib_ros_check.rig.blame import Blame, blame, claimed
-from calib_ros_check.tolerance import MORE_FRAMES, Judgement, judge, unknown
+from calib_ros_check.tolerance import INTERVAL, MORE_FRAMES, Judgement, judge, unknown
+
+CLAIMED_S = 0.005  # standard deviation of a claimed offset of clocks: what drivers leave
+
+
+@dataclass(frozen=True, eq=False)
+class Blame:
+    """off: what each sensor that is off, or whose clock is, is said to be. doubts: what cannot be told apart, and what even this
+    does not explain."""
+
+    off: Mapping[str, str] = field(default_factory=dict)
+    displaced: frozenset[str] = frozenset()
+    doubts: tuple[str, ...] = ()
+
+
+def claimed(
+    poses: Mapping[str, Transform], reference: str, tolerance: Tolerance, edges: Sequence[Edge] = (), clock_s: float = 0.0
+) -> RigSolution:
+    """Poses T_reference_sensor (4, 4) as a solution of which the check asks: known so well that 95 % of errors are within the
+    tolerance, which is no displacement. edges: whose offsets of clocks are claimed to be clock_s, s."""
+    sigmas = np.array([tolerance.deg, tolerance.m]) / chi.ppf(INTERVAL, 3)
+    others = [name for name in poses if name != reference]
+    covariance = np.zeros((6 * len(others), 6 * len(others)))
+    for k, name in enumerate(others):
+        covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = prior_covariance(poses[name], *sigmas)
+    told = [replace(e, time_offset_s=clock_s, time_sigma_s=CLAIMED_S) for e in edges if e.time_offset_s is not None]
+    return RigSolution(reference, poses, covariance, tuple(told))
+
+
+def blame(before: RigSolution, edges: Sequence[Edge], off: bool, clocks: bool) -> Blame:
+    """Sensors whose displacements, or clocks, explain edges against what is claimed, the most probable one first, until what is
+    left is within what is claimed. off, clocks: whether any pair is known to be off, or to have wrong clocks."""
+    kinds = {MOVED: off, CLOCK: clocks}
+    names: dict[str, str] = {}
+    displaced: set[str] = set()
+    doubts: list[str] = []
+    for k in range(len(before.poses) if edges and (off or clocks) else 0):
+        # At first it is known that something is wrong.
+        found = [h for h in hypotheses(before, edges) if kinds.get(h.kind, k > 0) and not {*h.sensors} & {*names}]
+        total = sum(h.posterior for h in found)
+        likely = verdict([replace(h, posterior=h.posterior / total) for h in found])[0] if total > 0 else ()
+        # Of several that are off, none explains all: the first of them is as good as the next.
+        several = len(likely) > 1 and max(h.p_value for h in likely) < SIGNIFICANCE
+        if likely and several and likely[0].kind != NOTHING:
+            likely = likely[:1]
+        if len(likely) != 1 or likely[0].kind == NOTHING:
+            some = [h for h in likely if h.kind != NOTHING]
+            if len(some) == len(likely) > 1:
+                doubts.append(f"cannot tell between: {'; '.join(map(_words, likely))}")
+            elif likely and likely[0].p_value < SIGNIFICANCE:
+                doubts.append("the edges fit badly even so: one of them may be wrong")
+            break
+        names |= dict.fromkeys(likely[0].sensors, _words(likely[0]))
+        displaced |= {*likely[0].sensors} if likely[0].kind == MOVED else set()
+        before = _after(before, likely[0])
+    return Blame(names, frozenset(displaced), tuple(doubts))
+
+
+def _words(found: RigHypothesis) -> str:
+    text = str(found).replace(" moved by ", " is off by ").replace(" jumped by ", " is off by ")
+    return f"{text} against {', '.join(found.others)}" if found.kind == MOVED else text
+
+
+def _after(before: RigSolution, found: RigHypothesis) -> RigSolution:
+    """The claim with what was found put right, as well as it is known."""
+    if found.kind == CLOCK:
+        late = float(found.displacement[0])
+        sides = {e: (e.source == found.sensors[0]) - (e.target == found.sensors[0]) for e in before.edges}
+        edges = [replace(e, time_offset_s=(e.time_offset_s or 0.0) + sides[e] * late) for e in before.edges]
+        return replace(before, edges=tuple(edges))
+    # Where the reference is among them, all others are displaced the other way.
+    moves = [n for n in before.columns if (n in found.sensors) != (before.reference in found.sensors)]
+    D = se3.exp(found.displacement)
+    D = se3.inverse(D) if before.reference in found.sensors else D
+    share = np.zeros((len(before.covariance), 6))
+    for name in moves:
+        share[before.columns[name]] = np.eye(6)
+    poses = {name: D @ T if name in moves else T for name, T in before.poses.items()}
+    covariance: Matrix = before.covariance + share @ found.covariance @ share.T
+    return replace(before, poses=poses, covariance=covariance)
+
 
 PASS, FAIL, INCONCLUSIVE = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE
 OF_ONE_PAIR = ("camera", "image_topic", "points_topic", "camera_info_topic")
-NO_EDGE = "no pair joins it to the others"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +153,7 @@ class SensorCheck:
 
 
 @dataclass(frozen=True, eq=False)
-class RigCheck:
+class RigCheck(AsJson):
     """Whether the extrinsics of a rig are right to within a tolerance.
 
     verdict: fail where any sensor fails, pass where all pass. given: T_reference_sensor (4, 4) as checked. solution: by the
@@ -122,14 +199,6 @@ class RigCheck:
             "notes": list(self.notes),
             "version": VERSION,
         }  # fmt: skip
-
-    def dumps(self) -> str:
-        """JSON."""
-        return json.dumps(self.to_dict(), indent=1) + "\n"
-
-    def save(self, path: str | Path) -> None:
-        """Write JSON atomically. BadInputError if the folder cannot be written."""
-        write_atomically(path, self.dumps().encode())
 
 
 def _told(verdict: CheckVerdict, reason: str, judgement: Judgement) -> dict[str, Any]:
@@ -177,14 +246,18 @@ def as_row(found: RigCheck) -> dict[str, Any]:
 def check_rig(measurer: RigMeasurer, tolerance: Tolerance) -> RigCheck:
     """Check the extrinsics that are the measurer's priors. Deterministic. A pair whose frames cannot be read is inconclusive."""
     known = measurer.solution([])
-    pairs = [_between_lidars(known, m, tolerance) for m in _once(measurer.between_lidars())]
+    between: dict[tuple[str, str], Measurement] = {}  # of every pair that with an edge, or the first
+    for m in measurer.between_lidars():
+        if m.edge is not None or (m.target, m.source) not in between:
+            between[m.target, m.source] = m
+    pairs = [_by_edge(known, m, tolerance) for m in between.values()]
     listed = measurer.camera_pairs(known)
     for k, (camera, lidar) in enumerate(listed):
         measurer.progress(f"{camera} with {lidar}", k / len(listed))
         pairs.append(_check_pair(measurer, camera, lidar, known, tolerance))
     joined = {pair.target for pair in pairs if pair.edge is not None}
     for camera in (name for name in measurer.description.cameras if name not in joined):
-        pairs += [_between_lidars(known, m, tolerance) for m in measurer.by_motion(camera, known)]
+        pairs += [_by_edge(known, m, tolerance) for m in measurer.by_motion(camera, known)]
     return judged(known, measurer.description, pairs, tolerance, measurer.config.motion.time_offset_s, measurer.rig.name)
 
 
@@ -205,14 +278,21 @@ def judged(
     off = any(p.edge in mounts and p.judgement.p_within <= 1 - CONFIDENCE for p in pairs)
     clocks = any(p.cause is Cause.TIME_OFFSET for p in pairs)
     found = blame(claimed(known.poses, known.reference, tolerance, mounts if clocks else (), clock_s), mounts, off, clocks)
-    anchor = _anchor(solution, found)
+    # What the others are judged against: the reference, or, if that is off, the one that is known best to it.
+    known_best = sorted(solution.columns, key=lambda name: float(np.trace(solution.marginal(name))))
+    right = [name for name in (solution.reference, *known_best) if name not in found.displaced]
+    anchor = right[0] if right else solution.reference
     causes = _causes(pairs, found)
     sensors = {
         s.name: _sensor(s.name, anchor, known, solution, pairs, tolerance, causes.get(s.name) or found.off.get(s.name, ""))
         for s in description.sensors
         if s.name != anchor
     }
-    sensors[anchor] = _of_anchor(anchor, sensors, causes.get(anchor) or found.off.get(anchor, ""))
+    agree = [name for name, own in sensors.items() if own.verdict is PASS]
+    told = f"and {', '.join(agree)} agree with it" if agree else "and none agrees with it"
+    wrong = causes.get(anchor) or found.off.get(anchor, "")
+    stands = FAIL if wrong else PASS if agree else INCONCLUSIVE
+    sensors[anchor] = SensorCheck(stands, wrong or f"the others are judged against it, {told}", unknown(), anchor)
     notes = [f"the loop {', '.join(loop.sensors)} does not close: {loop.size[0]:.2f} deg, {100 * loop.size[1]:.1f} cm"
              for loop in solution.loops if not loop.closes]  # fmt: skip
     notes += [f"{e.name} contradicts the other pairs and is left out" for e in solution.rejected]
@@ -238,16 +318,7 @@ def _check_pair(measurer: RigMeasurer, camera: str, lidar: str, known: RigSoluti
     return PairCheck(camera, lidar, kind, judgement, found.reason, edge, found, frame)
 
 
-def _once(measured: Sequence[Measurement]) -> list[Measurement]:
-    """Of every pair that with an edge, or the first."""
-    found: dict[tuple[str, str], Measurement] = {}
-    for m in measured:
-        if m.edge is not None or (m.target, m.source) not in found:
-            found[m.target, m.source] = m
-    return list(found.values())
-
-
-def _between_lidars(known: RigSolution, m: Measurement, tolerance: Tolerance) -> PairCheck:
+def _by_edge(known: RigSolution, m: Measurement, tolerance: Tolerance) -> PairCheck:
     if m.edge is None:
         return PairCheck(m.target, m.source, m.kind, unknown(), m.reason)
     judgement = judge(known.between(m.target, m.source)[0], m.edge.T, m.edge.covariance, tolerance)
@@ -270,14 +341,6 @@ def _causes(pairs: Sequence[PairCheck], found: Blame) -> dict[str, str]:
     return out
 
 
-def _anchor(solution: RigSolution, found: Blame) -> str:
-    """The sensor that the others are judged against: the reference, or, if that is off, the one that is known best to it."""
-    if solution.reference not in found.displaced:
-        return solution.reference
-    rest = [name for name in solution.columns if name not in found.displaced]
-    return min(rest, key=lambda name: float(np.trace(solution.marginal(name)))) if rest else solution.reference
-
-
 def _sensor(
     name: str,
     anchor: str,
@@ -295,17 +358,8 @@ def _sensor(
         judgement = judge(known.between(name, anchor)[0], *solution.between(name, anchor), tolerance)
         reason = _sizes(judgement)
     else:
-        judgement, reason = unknown(), "; ".join(pair.reason for pair in own) or f"{NO_EDGE}; {MORE_FRAMES}"
+        judgement, reason = unknown(), "; ".join(pair.reason for pair in own) or f"no pair joins it to the others; {MORE_FRAMES}"
     return SensorCheck(FAIL if wrong else judgement.verdict, wrong or reason, judgement, anchor)
-
-
-def _of_anchor(anchor: str, others: Mapping[str, SensorCheck], wrong: str) -> SensorCheck:
-    agree = [name for name, own in others.items() if own.verdict is PASS]
-    if wrong:
-        return SensorCheck(FAIL, wrong, unknown(), anchor)
-    if agree:
-        return SensorCheck(PASS, f"the others are judged against it, and {', '.join(agree)} agree with it", unknown(), anchor)
-    return SensorCheck(INCONCLUSIVE, "the others are judged against it, and none agrees with it", unknown(), anchor)
 
 
 def _verdict(
@@ -313,7 +367,7 @@ def _verdict(
 ) -> tuple[CheckVerdict, str]:
     failed = {name: own for name, own in sensors.items() if own.verdict is FAIL}
     if failed:
-        told = [own.reason if own.reason in found.lines else f"{name}: {own.reason}" for name, own in failed.items()]
+        told = [own.reason if own.reason in found.off.values() else f"{name}: {own.reason}" for name, own in failed.items()]
         return FAIL, "; ".join(dict.fromkeys([*told, *found.doubts]))
     against = [f"{p.target} with {p.source}" for p in pairs if p.verdict is FAIL]
     if against:

@@ -31,6 +31,7 @@ LEVELS = {  # of whatever has a status: a pair, a sensor, an edge, a check
 }
 EXCESS = 2.0  # standard deviations, in the mean of the six axes, from which on an edge that is used is doubtful
 Size = tuple[float, float]  # deg and m
+LoopShown = tuple[Sequence[str], Size, float, bool]  # sensors, residual, p-value, whether it closes
 NOT_ESTIMATED = "nothing is estimated: these are the priors; give a result of calib-ros rig --json with --initial"
 
 WIDTH, BOX, ROW, HIGH = 400, 152, 50, 38  # px of the graph: whole, a box with a name, from one to the next, a box's height
@@ -97,17 +98,6 @@ class EdgeShown:
     residual: Size | None = None
     excess: float | None = None
     sigma: Size | None = None
-
-
-@dataclass(frozen=True)
-class LoopShown:
-    """A closed chain of edges, see `calib_ros.rig.graph.Loop`."""
-
-    sensors: tuple[str, ...]
-    rotation_deg: float
-    translation_m: float
-    p_value: float
-    closes: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,14 +176,13 @@ def of_result(data: Mapping[str, Any], solution: RigSolution) -> RigShown:
                 C = np.array(own["covariance"], float).reshape(6, 6)
                 edge = compared(edge, se3.as_transform(T, "an edge"), C, solution.poses)
             edges.append(edge)
-        loops = tuple(
-            LoopShown(tuple(own["sensors"]), own["rotation_deg"], own["translation_m"], own["p_value"], own["closes"])
-            for own in data["loops"]
-        )
+        loops = [
+            (own["sensors"], (own["rotation_deg"], own["translation_m"]), own["p_value"], own["closes"]) for own in data["loops"]
+        ]
     except (ValueError, TypeError, LookupError, AttributeError):
         raise BadInputError("this is no whole result of calib-ros rig; give the file that --json wrote") from None
     text = data.get("change") or summary(sensors, edges, loops)
-    return RigShown(solution.reference, tuple(sensors), tuple(edges), loops, text)
+    return RigShown(solution.reference, tuple(sensors), tuple(edges), tuple(loops), text)
 
 
 def of_report(report: RigReport) -> RigShown:
@@ -208,7 +197,7 @@ def summary(sensors: Sequence[SensorShown], edges: Sequence[EdgeShown], loops: S
     """How many sensors are usable, and what contradicts what."""
     parts = [f"{sum(own.usable is True for own in sensors)} of {len(sensors)} sensors usable"]
     parts += [f"{own.target}-{own.source} contradicts the others" for own in edges if own.fate == REJECTED]
-    return "; ".join([*parts, *(f"loop {', '.join(own.sensors)} does not close" for own in loops if not own.closes)])
+    return "; ".join([*parts, *(f"loop {', '.join(names)} does not close" for names, _, _, closes in loops if not closes)])
 
 
 def legend() -> str:
@@ -330,11 +319,9 @@ def edges_html(rig: RigShown) -> str:
 def loops_html(rig: RigShown) -> str:
     """A row for each loop."""
     rows = []
-    for own in rig.loops:
-        closes = _signed(GOOD, "closes") if own.closes else _signed(BAD, "does not close")
-        rows.append(
-            [escape(" – ".join(own.sensors)), closes, amounts((own.rotation_deg, own.translation_m)), f"{own.p_value:.2g}"]
-        )
+    for names, size, p_value, closes in rig.loops:
+        told = _signed(GOOD, "closes") if closes else _signed(BAD, "does not close")
+        rows.append([escape(" – ".join(names)), told, amounts(size), f"{p_value:.2g}"])
     return _table(["loop", "", "residual", "p-value"], rows) if rows else '<p class="soft">no edges close a loop</p>'
 
 

@@ -24,7 +24,7 @@ from calib_ros.online.keyframes import histogram, similarity
 from calib_ros.registration.classes import CLOUD, IMAGE
 from calib_ros.registration.score.point_score import Score
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.jobs.pool import Answer
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, spread, worker_cache

@@ -15,7 +15,7 @@ import pandas as pd
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.jobs.pool import Answer
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.evaluate import Study, StudyReport
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache

@@ -59,9 +59,8 @@ class KeyframeServer(NodeService):
     async def _answer(self, request: GetKeyframes.Request, response: GetKeyframes.Response) -> GetKeyframes.Response:
         try:
             drawn = await done(self._node, self._aside.submit(self._draw, request.max_keyframes, request.max_width))
-            pictures, response.cpu = drawn.result()
-            response.keyframes = pictures
-            response.success, response.message = True, f"the newest {len(pictures)} keyframes"
+            response.keyframes, response.cpu = drawn.result()
+            response.success, response.message = True, f"the newest {len(response.keyframes)} keyframes"
         except CalibrationError as error:
             response.success, response.message = False, str(error)
         except Exception as error:  # it would end the node
@@ -91,7 +90,10 @@ def keyframe_pictures(recalibrator: Recalibrator, count: int = 0, width: int = 0
         raise CalibrationError(NO_KEYFRAME)
     T = recalibrator.current.result.T_camera_lidar
     chosen = kept[-count:] if count else kept
-    scores = _scores(recalibrator, chosen, T)
+    try:
+        scores = [float(own) for own in recalibrator.calibrator.objectives.of_edges(chosen, T).frame_scores(T)]
+    except TooFewFeaturesError:
+        scores = [math.nan] * len(chosen)
     newest = max(features.stamp for features in kept)
     pictures = []
     for features, score in zip(reversed(chosen), reversed(scores), strict=True):
@@ -103,13 +105,6 @@ def keyframe_pictures(recalibrator: Recalibrator, count: int = 0, width: int = 0
         message.data = array.array("B", jpeg.tobytes())
         pictures.append(message)
     return pictures
-
-
-def _scores(recalibrator: Recalibrator, kept: list[FrameFeatures], T: NDArray[np.float64]) -> list[float]:
-    try:
-        return [float(score) for score in recalibrator.calibrator.objectives.of_edges(kept, T).frame_scores(T)]
-    except TooFewFeaturesError:
-        return [math.nan] * len(kept)
 
 
 def _draw(features: FrameFeatures, T: NDArray[np.float64], width: int) -> tuple[NDArray[np.uint8], int]:

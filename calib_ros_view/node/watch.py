@@ -27,18 +27,7 @@ from calib_ros.rig.description import CAMERA, LIDAR
 from calib_ros.rig.graph import at_sensor, worst_sigmas
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import advice_of, covariance_from_ros, matrix_from_transform
-from calib_ros_check.rig.shown import (
-    BAD,
-    DOUBTED,
-    DOUBTFUL,
-    LEVELS,
-    REJECTED,
-    EdgeShown,
-    LoopShown,
-    RigShown,
-    SensorShown,
-    compared,
-)
+from calib_ros_check.rig.shown import BAD, DOUBTED, DOUBTFUL, LEVELS, REJECTED, EdgeShown, RigShown, SensorShown, compared
 from calib_ros_view.node.calls import NodeClient
 from calib_ros_view.session.live import SILENT_S, Diagnosis, NodeState, Pair
 
@@ -257,9 +246,7 @@ class Watch(NodeClient):
             sensors.append(
                 SensorShown(own.name, kind, T, own.status, own.reason, own.usable, sigma, moved if any(moved) else None)
             )
-        loops = tuple(
-            LoopShown(tuple(own.sensors), own.rotation_deg, own.translation_m, own.p_value, own.closes) for own in message.loops
-        )
+        loops = tuple((own.sensors, (own.rotation_deg, own.translation_m), own.p_value, own.closes) for own in message.loops)
         rig = RigShown(message.reference, tuple(sensors), (), loops, message.text)
         edges = [self._edge(pair, told, rig, message) for pair, told in self._pairs.items()]
         for own in message.edges:

@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from calib_ros import se3
@@ -28,7 +29,60 @@ from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
-from calib_ros_view.session.motion import AXES
+
+STEP_DEG, STEP_CM, LARGE = 0.05, 1.0, 10  # of a key, and with shift so many times as far
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One of the six numbers.
+
+    more, less: what a larger and a smaller one mean, for people. keys: that make it larger and smaller; arrows move the points in
+    the picture. unit: deg or cm.
+    """
+
+    name: str
+    title: str
+    more: str
+    less: str
+    keys: tuple[str, str]
+    unit: str
+
+
+AXES = (
+    Axis("rx", "pitch", "camera looks further down", "camera looks further up", ("ArrowUp", "ArrowDown"), "deg"),
+    Axis("ry", "yaw", "camera looks further left", "camera looks further right", ("ArrowRight", "ArrowLeft"), "deg"),
+    Axis("rz", "roll", "camera is rolled anticlockwise", "camera is rolled clockwise", ("e", "q"), "deg"),
+    Axis("tx", "sideways", "camera further left", "camera further right", ("a", "d"), "cm"),
+    Axis("ty", "height", "camera further up", "camera further down", ("r", "f"), "cm"),
+    Axis("tz", "forward", "camera further back", "camera further forward", ("s", "w"), "cm"),
+)
+
+
+def moved(start: Matrix, values: Matrix) -> Matrix:
+    """The start (4, 4) moved by (6,) deg and cm: the LiDAR is shifted along the camera's axes, then all turns about the camera.
+
+    So a rotation leaves the camera where it is, as one turns a camera on its mount. Inverse of `offsets`.
+    """
+    R = Rotation.from_rotvec(np.deg2rad(values[:3])).as_matrix()
+    return se3.from_parts(R @ start[:3, :3], R @ (start[:3, 3] + np.asarray(values[3:]) / 100.0))
+
+
+def offsets(start: Matrix, T: Matrix) -> Matrix:
+    """The numbers (6,), deg and cm, that move the start (4, 4) to T (4, 4)."""
+    R = T[:3, :3] @ start[:3, :3].T
+    shift = R.T @ T[:3, 3] - start[:3, 3]
+    return np.concatenate([np.rad2deg(Rotation.from_matrix(R).as_rotvec()), 100.0 * shift])
+
+
+def step_of(key: str, shift: bool) -> tuple[int, float] | None:
+    """Number of the axis that a key moves, and by how much, deg or cm; None if it moves nothing."""
+    for k, axis in enumerate(AXES):
+        for sign, own in zip((1, -1), axis.keys, strict=True):
+            if own in (key, key.lower()):  # shift makes letters capital
+                return k, sign * (STEP_DEG if axis.unit == "deg" else STEP_CM) * (LARGE if shift else 1)
+    return None
+
 
 CURVE_DEG, CURVE_M, SAMPLES = 2.0, 0.3, 41  # half widths of the curves, and scores along each
 POINTS = 40_000  # edge points that tell a curve; more take longer and change nothing
@@ -147,3 +201,77 @@ def ellipse(covariance: Matrix, pair: tuple[int, int]) -> Matrix:
     turn = np.linspace(0, 2 * np.pi, ELLIPSE_POINTS)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     return np.asarray(circle * np.sqrt(chi2.ppf(PROBABILITY, 2) * np.maximum(values, 0)) @ vectors.T)
+
+
+WIDTH, HEIGHT, MARGIN = 200, 96, 16  # px of one plot
+BAR_WIDTH, BARS = 300, 46  # px of the bars of all frames
+SIDE = 140  # px of an ellipse's plot
+LEAST_DEG, LEAST_CM = 0.1, 1.0  # half widths of an ellipse's plot, at least
+AROUND = 1.25  # of the ellipse and the cross
+FLAT = 1e-12
+
+
+def curve_plots(numbers: Numbers) -> str:
+    """Six curves of the score, each about the present extrinsic in the middle, with a mark at its highest place."""
+    low, high = float(numbers.curves.min()), float(numbers.curves.max())
+    return "".join(_curve(k, numbers, low, max(high - low, FLAT)) for k in range(6))
+
+
+def ellipse_plots(known: Known) -> str:
+    """Where the scenes put the extrinsic from here, with 95 %, for the pairs of axes that compensate each other."""
+    return "".join(_ellipse(known, pair) for pair in PAIRS)
+
+
+def frame_bars(scores: Matrix, shown: int) -> str:
+    """A bar per frame with its score, up from a line at 0 or down from it; a frame without a score has none."""
+    values = np.nan_to_num(np.asarray(scores, float), nan=0.0)
+    low, high = min(float(values.min(initial=0.0)), 0.0), max(float(values.max(initial=0.0)), 0.0)
+    per_score, step = (BARS - 2) / max(high - low, FLAT), BAR_WIDTH / max(len(values), 1)
+    zero = 1 + high * per_score
+    bars = []
+    for k, value in enumerate(values):
+        style = "var(--mark)" if k == shown else "var(--accent)"
+        top, height = zero - max(value, 0) * per_score, abs(value) * per_score
+        bars.append(
+            f'<rect x="{k * step + 1:.1f}" y="{top:.1f}" width="{max(step - 2, 1):.1f}" height="{height:.1f}" fill="{style}">'
+            f"<title>frame {k + 1}: {value:.3f}</title></rect>"
+        )
+    line = f'<line x1="0" x2="{BAR_WIDTH}" y1="{zero:.1f}" y2="{zero:.1f}" stroke="currentColor" stroke-width=".6"/>'
+    label = 'role="img" aria-label="score of each frame"'
+    return f'<svg class="plot" viewBox="0 0 {BAR_WIDTH} {BARS}" {label}>{"".join(bars)}{line}</svg>'
+
+
+def _curve(k: int, numbers: Numbers, low: float, span: float) -> str:
+    axis, x, y = AXES[k], numbers.offsets[k], numbers.curves[k]
+    u = MARGIN + (x - x[0]) / (x[-1] - x[0]) * (WIDTH - 2 * MARGIN)
+    v = HEIGHT - MARGIN - (y - low) / span * (HEIGHT - 2.2 * MARGIN)
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(u, v, strict=True))
+    peak, middle = int(np.argmax(y)), WIDTH / 2
+    return (
+        f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="score over {axis.title}, highest at '
+        f'{x[peak]:+.2f} {axis.unit}"><line class="now" x1="{middle}" x2="{middle}" y1="{MARGIN}" y2="{HEIGHT - MARGIN}" '
+        f'stroke-dasharray="3 3"/><polyline class="curve" points="{points}"/><circle cx="{u[peak]:.1f}" cy="{v[peak]:.1f}" r="3" '
+        f'fill="var(--accent)"/><text x="{MARGIN}" y="11">{axis.title}</text><text x="{WIDTH - MARGIN}" y="11" '
+        f'text-anchor="end">best {x[peak]:+.2f} {axis.unit}</text><text x="{MARGIN}" y="{HEIGHT - 3}">{x[0]:g}</text>'
+        f'<text x="{WIDTH - MARGIN}" y="{HEIGHT - 3}" text-anchor="end">{x[-1]:+g} {axis.unit}</text></svg>'
+    )
+
+
+def _ellipse(known: Known, pair: tuple[int, int]) -> str:
+    scale = np.array([180 / np.pi if k < 3 else 100.0 for k in pair])
+    centre = known.offset[list(pair)] * scale
+    border = ellipse(known.covariance, pair) + centre
+    least = np.array([LEAST_DEG if k < 3 else LEAST_CM for k in pair])
+    half = np.maximum(AROUND * np.abs(border).max(axis=0), least)
+    at = SIDE / 2 + border / half * (SIDE / 2 - MARGIN) * [1, -1]
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in at)
+    one, other = (AXES[k] for k in pair)
+    middle = SIDE / 2
+    return (
+        f'<svg class="plot" viewBox="0 0 {SIDE} {SIDE}" role="img" aria-label="{one.title} and {other.title} with 95 %">'
+        f'<line class="now" x1="{middle}" x2="{middle}" y1="{MARGIN}" y2="{SIDE - MARGIN}" stroke-dasharray="3 3"/>'
+        f'<line class="now" y1="{middle}" y2="{middle}" x1="{MARGIN}" x2="{SIDE - MARGIN}" stroke-dasharray="3 3"/>'
+        f'<polygon class="curve" points="{points}"/><text x="{middle}" y="{SIDE - 2}" text-anchor="middle">{one.title} '
+        f'±{half[0]:.2g} {one.unit}</text><text x="{middle}" y="10" text-anchor="middle">{other.title} ±{half[1]:.2g} '
+        f"{other.unit}</text></svg>"
+    )

@@ -52,9 +52,13 @@ class RigSession:
         self.moments = [k / max(count - 1, 1) for k in self._positions(count)]
         self.moment = len(self.moments) // 2
         self._read_clouds(self.moments[self.moment])
-        given = description.pairs
-        pairs = [(a, b) for a, b in given or () if description[a].kind == CAMERA]
-        self.pairs = pairs if given is not None else [(a, b) for a in rig.cameras for b in rig.lidars if self._sees(a, b)]
+        shares = {
+            (a, b): seen_share(source.camera(a), se3.inverse(rig.poses[a]) @ rig.poses[b], self.clouds[b].astype(float))
+            for a in (rig.cameras if description.pairs is None else ())
+            for b in rig.lidars
+        }
+        listed = [(a, b) for a, b in description.pairs or () if description[a].kind == CAMERA]
+        self.pairs = listed or [pair for pair, share in shares.items() if share >= SEEN]
         if not rig.edges:
             edges = tuple(EdgeShown(*pair, "registration", "not measured", NEUTRAL) for pair in self.pairs)
             self.rig = replace(rig, edges=edges)
@@ -62,10 +66,6 @@ class RigSession:
 
     def _positions(self, count: int) -> list[int]:
         return frame_positions(self._frames, count) if self._frames else spread_positions(FRAMES, count)
-
-    def _sees(self, camera: str, lidar: str) -> bool:
-        T = se3.inverse(self.rig.poses[camera]) @ self.rig.poses[lidar]
-        return seen_share(self._source.camera(camera), T, self.clouds[lidar].astype(float)) >= SEEN
 
     def pairs_of(self, tile: str) -> Sequence[Pair]:
         """Pairs of a camera and a LiDAR that can be opened from a picture."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,16 @@ from calib_ros.arrays import Matrix
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.datasets.source import Source
-from calib_ros.errors import BadInputError
+from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.export import export
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, TENTATIVE, Result
-from calib_ros_view.session.motion import moved, offsets
-from calib_ros_view.session.numbers import FrameScores
+from calib_ros_check.checker import Checker, CheckInputs
+from calib_ros_check.outcome import CheckResult, Tolerance
+from calib_ros_view.session.numbers import FrameScores, moved, offsets
 from calib_ros_view.session.picture import FramePicture
 
 MOST_FRAMES = 40  # whose clouds and pictures are held
@@ -206,9 +208,7 @@ class Session:
     def shown_at(self, frame: int, state: SessionState) -> Matrix:
         """T (4, 4) at which the points of a frame are drawn: the extrinsic, and the vehicle's motion during the time offset."""
         twist = self.frames[frame].twist
-        if twist is None or not state.time_offset_s:
-            return state.T
-        return state.T @ se3.exp(twist * state.time_offset_s)
+        return state.T if twist is None or not state.time_offset_s else state.T @ se3.exp(twist * state.time_offset_s)
 
     def features(self, state: SessionState) -> list[FrameFeatures]:
         """Features of the frames that count, at the time offset."""
@@ -242,7 +242,109 @@ class Session:
 
     def error(self) -> tuple[float, float] | None:
         """Rotation, deg, and translation, m, from the source's reference; None if it has none."""
-        if self.reference is None:
-            return None
-        T = self._state.T
-        return se3.rotation_error_deg(self.reference, T), se3.translation_error_m(self.reference, T)
+        return None if self.reference is None else se3.error(self.reference, self._state.T)
+
+
+SEARCH_DEG, SEARCH_M = 10.0, 0.5  # half widths of "search around here"
+REFINE, SEARCH, CHECK = "refine", "search", "check"
+
+
+class StoppedError(Exception):
+    """Somebody stopped the work."""
+
+
+@dataclass
+class SessionJob:
+    """Work that runs, or ended.
+
+    share: 0..1 of its stage. message: how it ended; failed: that it did not do what was asked. state: that the message is about,
+    None if it is about none.
+    """
+
+    name: str
+    stage: str = ""
+    share: float = 0.0
+    running: bool = True
+    failed: bool = False
+    message: str = ""
+    check: CheckResult | None = None
+    state: SessionState | None = None
+    stopped: threading.Event = field(default_factory=threading.Event)  # set: it ends at its next step
+
+    def title(self, now: SessionState) -> str:
+        """Its name, and whether what it says is of another state than the present one."""
+        return self.name if self.state is None or self.state is now else f"earlier {self.name}"
+
+    def watch(self, stage: str, share: float) -> None:
+        """Progress of the work; raises StoppedError when it is to end."""
+        self.stage, self.share = stage, share
+        if self.stopped.is_set():
+            raise StoppedError
+
+
+class SessionJobs:
+    """Runs work on a session in a thread of its own. A browser that is closed does not end it; what it finds is a step of the
+    history, so that nothing is lost."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self.current: SessionJob | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether something runs."""
+        return self.current is not None and self.current.running
+
+    def start(self, name: str) -> SessionJob:
+        """Begin refine, search or check. BadInputError if something runs already, or there is no such work."""
+        if name not in (REFINE, SEARCH, CHECK):
+            raise BadInputError(f"'{name}' is not known; choose one of {REFINE}, {SEARCH}, {CHECK}")
+        with self._lock:
+            if self.busy:
+                raise BadInputError("something runs already; wait for it, or stop it")
+            job = self.current = SessionJob(name)
+            self._thread = threading.Thread(target=self._run, args=(job,), name=f"view {name}", daemon=True)
+            self._thread.start()
+        return job
+
+    def stop(self) -> None:
+        """Stop what runs."""
+        if self.current is not None:
+            self.current.stopped.set()
+
+    def close(self, timeout_s: float = 10.0) -> None:
+        """Stop what runs and wait for its end."""
+        self.stop()
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    def _run(self, job: SessionJob) -> None:
+        try:
+            (self._check if job.name == CHECK else self._estimate)(job, self._session.state)
+        except StoppedError:
+            job.message = "stopped; nothing has changed"
+        except CalibrationError as error:
+            job.failed, job.message = True, str(error)
+        except Exception as error:  # the page goes on; whoever looks has to see it
+            job.failed, job.message = True, f"failed, {type(error).__name__}: {error}"
+        finally:
+            job.running = False
+            self._session.touch()
+
+    def _estimate(self, job: SessionJob, state: SessionState) -> None:
+        box = SearchBox(SEARCH_DEG, SEARCH_M) if job.name == SEARCH else None
+        features = self._session.features(state)
+        result = self._session.scores.calibrator.estimate(features, state.T, box, job.watch)
+        job.watch(job.stage, 1.0)
+        if result.converged:
+            job.message = f"accepted; {result.reason}" if result.reason else "accepted"
+            job.state = self._session.take(result, "refined" if box is None else "searched")
+        else:
+            job.failed, job.message = True, f"{result.status}: {result.reason}"
+
+    def _check(self, job: SessionJob, state: SessionState) -> None:
+        inputs = CheckInputs(state.T, Tolerance(), progress=job.watch)
+        found = Checker(self._session.camera, self._session.config).check_features(self._session.features(state), inputs)
+        job.check, job.state, job.message = found, state, f"{found.verdict.value}: {found.reason}"

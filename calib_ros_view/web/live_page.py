@@ -20,22 +20,9 @@ from calib_ros.arrays import Matrix
 from calib_ros_check.rig import shown as html
 from calib_ros_view.session.live import HOUR, Event, Pair, Presence, moment_of
 from calib_ros_view.session.rig_session import RigSession
-from calib_ros_view.web import live_charts, theme
-from calib_ros_view.web.live_words import (
-    ACTIONS,
-    CSS,
-    KEYS_OF_PAIR,
-    KEYS_OF_RIG,
-    Action,
-    ago,
-    clock,
-    event_html,
-    legend_html,
-    numbers_html,
-    said_of,
-    tile_html,
-    words_of_answer,
-)
+from calib_ros_view.web import live_words as words
+from calib_ros_view.web import theme
+from calib_ros_view.web.live_words import ACTIONS, CSS, KEYS_OF_PAIR, KEYS_OF_RIG, Action
 from calib_ros_view.web.panels import RigScene
 from calib_ros_view.web.server import Pictures
 
@@ -191,7 +178,7 @@ class Gallery:
         if answer.success:
             keyframes = list(enumerate(answer.response.keyframes))
             address = {k: self._pictures.put(f"keyframe {k}{self._watch.name}", bytes(tile.data)) for k, tile in keyframes}
-            self.content = f'<div class="tiles">{"".join(tile_html(tile, address[k]) for k, tile in keyframes)}</div>'
+            self.content = f'<div class="tiles">{"".join(words.tile_html(tile, address[k]) for k, tile in keyframes)}</div>'
             drawn, ms = len(keyframes), 1000 * answer.response.cpu
             self.note = f"{drawn} keyframe{'s' * (drawn != 1)}, drawn in {ms:.0f} ms of the node's CPU time"
         else:
@@ -285,7 +272,7 @@ class PairPart:
                 ui.label("relative to").classes("soft text-sm")
                 toggle = ui.toggle(REFERENCES, value=self._reference, on_change=lambda e: self._choose(reference=e.value))
                 self._references = toggle.props('dense no-caps aria-label="relative to"')
-                self._moment_input = ui.input(value=clock(self._moment), on_change=self._choose_moment).props(
+                self._moment_input = ui.input(value=words.clock(self._moment), on_change=self._choose_moment).props(
                     'type=time step=1 dense outlined aria-label="time of the extrinsic that the charts are relative to"'
                 )
                 self._moment_input.bind_visibility_from(self._references, "value", lambda value: value == "moment")
@@ -319,7 +306,7 @@ class PairPart:
     def _strip_clicked(self, event: GenericEventArguments) -> None:
         share = event.args if isinstance(event.args, (int, float)) else 1.0
         self._references.value = "moment"
-        self._moment_input.value = clock(self._from + min(max(float(share), 0.0), 1.0) * (self._to - self._from))
+        self._moment_input.value = words.clock(self._from + min(max(float(share), 0.0), 1.0) * (self._to - self._from))
 
     def _ask(self, action: Action) -> None:
         """Call a service; one that changes something only after a yes."""
@@ -350,15 +337,18 @@ class PairPart:
             watch.look()
         with watch.lock:
             history = watch.history
-            said = said_of(watch, now)
-            self._numbers.content = numbers_html(history)
+            said = words.said_of(watch, now)
+            self._numbers.content = words.numbers_html(history)
             events = history.newest_events(EVENTS_SHOWN)
             since = max(now - min(self._window, HOUR), history.started) if now - history.started > 60 else now - 60
             strip = history.strip(since, now)
             if now >= self._charts_due:
                 self._charts_due = now + CHARTS_S
                 poses, measures = history.poses(since, self._relative_to()), history.measures.rows(since, 300)
-                self._draw_charts(poses, measures, since, now)
+                for chart, made in zip(self._charts, words.charts(poses, measures, since, now), strict=True):
+                    chart.options.clear()
+                    chart.options.update(made)
+                    chart.update()
         self._from, self._to = since, now
         self._badge.text, self._usable.text, self._words.text, self._reason.text = (
             said.badge,
@@ -368,11 +358,11 @@ class PairPart:
         )
         self._advice.text = f"To do: {said.advice}" if said.advice else ""
         self._badge.style(f"background: {said.colour}")
-        self._strip.style(f"background-image: {live_charts.strip_css(strip, since, now)}")
-        self._legend.content = legend_html(list(dict.fromkeys(status for _, _, status in strip)))
+        self._strip.style(f"background-image: {words.strip_css(strip, since, now)}")
+        self._legend.content = words.legend_html(list(dict.fromkeys(status for _, _, status in strip)))
         if events != self._events_shown:
             self._events_shown = events
-            self._events.content = "".join(map(event_html, events)) or '<p class="soft">nothing yet</p>'
+            self._events.content = "".join(map(words.event_html, events)) or '<p class="soft">nothing yet</p>'
         self._update_answers()
         self._update_pictures(now)
 
@@ -382,17 +372,6 @@ class PairPart:
         if self._reference == "newest":
             return None if history.state is None else history.state.result.T_camera_lidar
         return history.pose_at(self._moment) if self._reference == "moment" else None
-
-    def _draw_charts(self, poses: Matrix, measures: Matrix, since: float, now: float) -> None:
-        options = (
-            *(live_charts.poses_chart(poses, translation, since, now) for translation in (False, True)),
-            live_charts.drift_chart(poses, measures, since, now),
-            live_charts.rates_chart(measures, since, now),
-        )
-        for chart, made in zip(self._charts, options, strict=True):
-            chart.options.clear()
-            chart.options.update(made)
-            chart.update()
 
     def _update_answers(self) -> None:
         busy, answers, progress = self._watch.busy, dict(self._watch.answers), self._watch.progress
@@ -404,7 +383,7 @@ class PairPart:
             self._stage.text, self._bar.value = progress[0] or "waits its turn", progress[1]
         if answers:
             service, (at, answer) = list(answers.items())[-1]
-            self._answer.text = words_of_answer(service, at, answer)
+            self._answer.text = words.words_of_answer(service, at, answer)
 
     def _update_pictures(self, now: float) -> None:
         overlay, gallery, history = self._watch.overlay, self._gallery, self._watch.history
@@ -413,10 +392,10 @@ class PairPart:
             self._picture.props(f'src="{self._pictures.put(f"overlay{self._watch.name}", overlay.jpeg)}"')
             self._picture.set_visibility(True)
         if overlay.number:
-            self._overlay_note.text = f"drawn {ago(now - overlay.at)}; before: initial extrinsic, after: current one"
+            self._overlay_note.text = f"drawn {words.ago(now - overlay.at)}; before: initial extrinsic, after: current one"
         if gallery.at != self._gallery_shown:
             self._gallery_shown, self._tiles.content = gallery.at, gallery.content
         keyframes = history.diagnosis.number("keyframes in the buffer")
         if history.presence is Presence.LIVE and keyframes >= 0 and gallery.is_due(int(keyframes)):
             ui.timer(0, gallery.draw, once=True)
-        self._gallery_note.text = gallery.note + (f", {ago(now - gallery.at)}" if gallery.at else "")
+        self._gallery_note.text = gallery.note + (f", {words.ago(now - gallery.at)}" if gallery.at else "")

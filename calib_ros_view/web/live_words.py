@@ -5,26 +5,26 @@ Names and reasons come from the network: what becomes HTML is escaped here.
 
 from __future__ import annotations
 
-import html
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from html import escape
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from calib_ros.arrays import Matrix
 from calib_ros_check.rig.shown import BAD, DOUBTFUL, GOOD, NEUTRAL
+from calib_ros_check.tolerance import TITLES
 from calib_ros_view.node.calls import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Answer, NodeClient
 from calib_ros_view.session.live import Event, LiveHistory, Presence
-from calib_ros_view.session.motion import AXES
-from calib_ros_view.web.live_charts import COLOURS, GREY
 
 if TYPE_CHECKING:
     from calib_ros_msgs.msg import KeyframePicture
     from calib_ros_msgs.srv import Check
 
 LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
-GONE = "gone"
 
 
 @dataclass(frozen=True)
@@ -82,22 +82,16 @@ FIGURES = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Said:
-    """badge: the status. level: how good it is. usable: in words, or nothing. words: what it means. reason: why it is so. advice:
-    what to do, or nothing."""
+class Said(NamedTuple):
+    """badge: the status, and its colour. usable: in words, or nothing. words: what it means. reason: why it is so. advice: what
+    to do, or nothing."""
 
     badge: str
-    level: str
+    colour: str
     usable: str
     words: str
     reason: str
     advice: str = ""
-
-    @property
-    def colour(self) -> str:
-        """Of the badge."""
-        return LEVEL_COLOURS[self.level] if self.badge == GONE else COLOURS.get(self.badge, LEVEL_COLOURS[self.level])
 
 
 def said_of(watch: NodeClient, now: float) -> Said:
@@ -111,7 +105,7 @@ def said_of(watch: NodeClient, now: float) -> Said:
             "To check: is the node running, active, and called so (--node)? Has it the same ROS_DOMAIN_ID, "
             f"discovery range and RMW_IMPLEMENTATION? Nodes seen: {', '.join(seen) if seen else 'none'}."
         )
-        return Said("waiting", NEUTRAL, "", words, hint)
+        return Said("waiting", COLOURS["initial"], "", words, hint)
     if presence is Presence.GONE:
         hint = (
             "ROS still lists it: it hangs, is not active, or ended moments ago."
@@ -119,16 +113,21 @@ def said_of(watch: NodeClient, now: float) -> Said:
             else "ROS lists it no more: it has ended."
         )
         words = f"Node gone since {clock(history.heard or now)}. {hint}"
-        return Said(GONE, BAD, "not usable", words, "It comes back by itself; what is shown below is the last known.")
+        return Said(
+            "gone", LEVEL_COLOURS[BAD], "not usable", words, "It comes back by itself; what is shown below is the last known."
+        )
     if state is None:
-        return Said("heard", NEUTRAL, "", "The node is there; its extrinsic is still to come.", history.diagnosis.message)
+        return Said(
+            "heard", COLOURS["initial"], "", "The node is there; its extrinsic is still to come.", history.diagnosis.message
+        )
     problem = history.diagnosis.message if history.diagnosis.level else ""
     own = state.result.reason.strip(" :;")
     for sign in ":;":  # the badge says the status already
         problem = problem.removeprefix(f"{state.result.status}{sign} ")
     told, cause = problem if own in problem else "; ".join(filter(None, [own, problem])), state.result.cause
     reason = told if cause is None else f"{cause.words}: {told}"
-    return Said(state.result.status, state.level, "usable" if state.usable else "not usable", state.words, reason, state.advice)
+    status, usable = state.result.status, "usable" if state.usable else "not usable"
+    return Said(status, COLOURS.get(status, LEVEL_COLOURS[state.level]), usable, state.words, reason, state.advice)
 
 
 def numbers_html(history: LiveHistory) -> str:
@@ -147,18 +146,14 @@ def numbers_html(history: LiveHistory) -> str:
             cells.append(("clock offset, ms", _number(1000 * result.time_offset_s, 1)))
     cells += [(label, diagnosis.values[name]) for name, label in FIGURES.items() if name in diagnosis.values]
     notes = {"Monitor": diagnosis.values.get("monitor", "none"), "Last check": diagnosis.check}
-    check = "".join(f'<p class="soft text-sm">{name}: {_text(said)}</p>' for name, said in notes.items())
-    shown = "".join(f"<div><span>{_text(n)}</span><b>{_text(v)}</b></div>" for n, v in cells)
+    check = "".join(f'<p class="soft text-sm">{name}: {escape(said)}</p>' for name, said in notes.items())
+    shown = "".join(f"<div><span>{escape(n)}</span><b>{escape(v)}</b></div>" for n, v in cells)
     return f'<div class="numbers">{shown}</div>{check}'
 
 
 def legend_html(statuses: list[str]) -> str:
     """The statuses in the colours of the strip."""
-    return " &nbsp; ".join(f'<span style="color:{COLOURS.get(s, GREY)}">■</span> {_text(s)}' for s in statuses)
-
-
-def _text(value: str) -> str:
-    return html.escape(value)
+    return " &nbsp; ".join(f'<span style="color:{COLOURS.get(s, GREY)}">■</span> {escape(s)}' for s in statuses)
 
 
 def event_html(event: Event) -> str:
@@ -166,7 +161,7 @@ def event_html(event: Event) -> str:
     times = f" <b>×{event.count}</b>" if event.count > 1 else ""
     return (
         f'<div style="border-color:{LEVEL_COLOURS[event.level]}"><time>{clock(event.at)}</time>'
-        f"<p>{_text(event.text)}{times}</p></div>"
+        f"<p>{escape(event.text)}{times}</p></div>"
     )
 
 
@@ -191,9 +186,8 @@ def words_of_check(response: Check.Response) -> list[str]:
     if not response.success:
         return []
     lines = [response.cause_message] if response.cause_message else []
-    titles = {"rotation": "rotation", "translation": "translation", **{axis.name: axis.title for axis in AXES}}
     found = (response.rotation, response.translation, *response.axes)
-    lines += [f"{titles.get(own.name, own.name)}: {own.words}" for own in found if own.words]
+    lines += [f"{TITLES.get(own.name, own.name)}: {own.words}" for own in found if own.words]
     return lines + list(response.notes)
 
 
@@ -209,3 +203,95 @@ def ago(seconds: float) -> str:
 
 def _number(value: float, decimals: int) -> str:
     return f"{value:.{decimals}f}" if math.isfinite(value) else "none"
+
+
+Options = dict[str, Any]
+X, Y, Z = "#e5534b", "#2ea043", "#4a90e2"
+GREY, RULE = "#8b949e", "rgba(139,148,158,0.22)"
+AMBER, VIOLET = "#d29922", "#a371f7"
+COLOURS = {
+    "converged": "#2ea043", "tentative": "#4a90e2", "initial": "#8b949e", "refused": "#d29922", "insufficient": "#d29922",
+    "suspect": "#e8912d", "moved": "#e5534b", "blinded": "#b62324", "gone": "rgba(139,148,158,0.35)",
+}  # fmt: skip
+SMALLEST_P = 1e-6
+CLOCK = {"hour": "{HH}:{mm}", "minute": "{HH}:{mm}", "second": "{HH}:{mm}:{ss}"}
+
+
+def charts(poses: Matrix, measures: Matrix, since: float, now: float) -> list[Options]:
+    """Rotation and translation with their 2-sigma bands; drift on the left axis, the monitor's p-value on the right one; images,
+    clouds and pairs per second, CPU time on the right axis. poses, measures: of `LiveHistory`."""
+    made = []
+    for first, unit, names in (
+        (1, "°", ("pitch (x)", "yaw (y)", "roll (z)")),
+        (4, "cm", ("right (x)", "down (y)", "forward (z)")),
+    ):
+        series: list[Options] = []
+        for k, (name, colour) in enumerate(zip(names, (X, Y, Z), strict=True)):
+            value, sigma = poses[:, first + k], poses[:, first + k + 6]
+            # A band of its own entry in the legend would be one too many: it shares the name, and so the switch, of its line.
+            band = {"name": name, "type": "line", "symbol": "none", "silent": True, "stack": f"band {k}", "stackStrategy": "all"}
+            band |= {"lineStyle": {"opacity": 0}, "tooltip": {"show": False}, "color": colour}
+            series.append({**band, "data": points(poses[:, 0], value - 2 * sigma)})
+            series.append({**band, "data": points(poses[:, 0], 4 * sigma), "areaStyle": {"opacity": 0.13}})
+            series.append(_line(name, colour, points(poses[:, 0], value)))
+        made.append(_chart(series, since, now, unit))
+    times, shaded = measures[:, 0], {"areaStyle": {"opacity": 0.08}}
+    p = [[t, max(v, SMALLEST_P) if v is not None else None] for t, v in points(times, measures[:, 1], 9)]
+    series = [{**_line("drift", AMBER, points(poses[:, 0], poses[:, 13])), **shaded}]
+    series.append({**_line("p-value", VIOLET, p), "yAxisIndex": 1, "step": "end"})
+    made.append(_chart(series, since, now, "", {**_axis(""), "type": "log", "min": SMALLEST_P, "max": 1}))
+    rates = (("images/s", X, 2), ("clouds/s", Z, 3), ("pairs/s", Y, 4))
+    series = [_line(name, colour, points(times, measures[:, k], 1)) for name, colour, k in rates]
+    series.append({**_line("CPU", AMBER, points(times, 100 * measures[:, 5], 1)), "yAxisIndex": 1, **shaded})
+    return [*made, _chart(series, since, now, "", {**_axis(" %"), "min": 0})]
+
+
+def _chart(series: Sequence[Options], since: float, now: float, unit: str, right: Options | None = None) -> Options:
+    """A chart over time. right: a second axis; the left one begins at 0 then."""
+    left = _axis(unit)
+    return {
+        "animation": False, "textStyle": {"color": GREY}, "backgroundColor": "transparent",
+        "grid": {"left": 52, "right": 14 if right is None else 52, "top": 34, "bottom": 26},
+        "legend": {"data": list(dict.fromkeys(own["name"] for own in series)), "top": 0, "textStyle": {"color": GREY},
+                   "icon": "roundRect", "itemWidth": 12, "itemHeight": 4},
+        "tooltip": {"trigger": "axis", "confine": True},
+        "xAxis": {  # the same window for all charts, so that what is above each other belongs together
+            "type": "time", "min": round(1000 * since), "max": round(1000 * now),
+            "axisLabel": {"color": GREY, "hideOverlap": True, "formatter": CLOCK},
+            "axisLine": {"lineStyle": {"color": RULE}}, "splitLine": {"show": False},
+        },
+        "yAxis": left if right is None else [{**left, "scale": False, "min": 0}, {**right, "splitLine": {"show": False}}],
+        "series": list(series),
+    }  # fmt: skip
+
+
+def _axis(unit: str) -> Options:
+    """Of values. Labels are whatever ECharts finds round, with the unit."""
+    label, rule = {"color": GREY, "formatter": f"{{value}}{unit}"}, {"lineStyle": {"color": RULE}}
+    return {"type": "value", "scale": True, "axisLabel": label, "splitLine": rule}
+
+
+def _line(name: str, colour: str, data: list[list[float | None]]) -> Options:
+    """Without symbols; broken at gaps."""
+    line = {"type": "line", "symbol": "none", "lineStyle": {"width": 2}, "connectNulls": False}
+    return {"name": name, "color": colour, "data": data, **line}
+
+
+def points(times: Matrix, values: Matrix, decimals: int = 3) -> list[list[float | None]]:
+    """Times in ms, and values, rounded: they go over the wire as text. NaN becomes a gap."""
+    return [
+        [round(1000 * t), None if not math.isfinite(v) else round(v, decimals)]
+        for t, v in zip(times.tolist(), values.tolist(), strict=True)
+    ]
+
+
+def strip_css(spans: Sequence[tuple[float, float, str]], since: float, now: float) -> str:
+    """Statuses over time as a CSS gradient with hard stops; transparent before the first."""
+    total, stops = max(now - since, 1e-3), ["transparent 0%"]
+    for k, (begin, end, status) in enumerate(spans):
+        left, right = 100 * (begin - since) / total, 100 * (end - since) / total
+        if k == 0:
+            stops.append(f"transparent {left:.2f}%")
+        colour = COLOURS.get(status, GREY)
+        stops += [f"{colour} {left:.2f}%", f"{colour} {right:.2f}%"]
+    return f"linear-gradient(90deg, {', '.join(stops)})"

@@ -94,10 +94,17 @@ class Guard:
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         if not self._own_page(headers):
             await _refuse(scope, receive, send, REFUSED_ORIGIN)
-        elif self._token is None or _equal(_cookie(headers), self._token):
+            return
+        # Of the port that the browser addresses, which behind a tunnel is not the one that is served. SimpleCookie would drop all
+        # for one that it cannot parse, as other pages of a host may set.
+        name = f"{COOKIE}_{urlsplit('//' + headers.get('host', '')).port or 80}"
+        pairs = (part.strip().partition("=") for part in headers.get("cookie", "").split(";"))
+        held = next((value for own, _, value in pairs if own == name), "")
+        asked = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
+        if self._token is None or hmac.compare_digest(held.encode(), self._token.encode()):
             await self._app(scope, receive, send)
-        elif _equal(_asked_token(scope), self._token):
-            await self._app(scope, receive, self._with_cookie(send, _cookie_name(headers)))
+        elif hmac.compare_digest(asked.encode(), self._token.encode()):
+            await self._app(scope, receive, self._with_cookie(send, name))
         else:
             await _refuse(scope, receive, send, REFUSED_TOKEN)
 
@@ -119,26 +126,6 @@ class Guard:
             await send(message)
 
         return sent
-
-
-def _cookie_name(headers: Mapping[str, str]) -> str:
-    """Of the port that the browser addresses, which behind a tunnel is not the one that is served."""
-    return f"{COOKIE}_{urlsplit('//' + headers.get('host', '')).port or 80}"
-
-
-def _cookie(headers: Mapping[str, str]) -> str:
-    """The value of our own cookie. SimpleCookie would drop all for one that it cannot parse, as other pages of a host may set."""
-    pairs = (part.strip().partition("=") for part in headers.get("cookie", "").split(";"))
-    return next((value for name, _, value in pairs if name == _cookie_name(headers)), "")
-
-
-def _asked_token(scope: Scope) -> str:
-    query: bytes = scope.get("query_string", b"")
-    return parse_qs(query.decode("latin-1")).get("token", [""])[0]
-
-
-def _equal(one: str, other: str) -> bool:
-    return hmac.compare_digest(one.encode(), other.encode())
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, why: bytes) -> None:

@@ -13,14 +13,12 @@ import numpy as np
 from nicegui import background_tasks, events, run, ui
 
 from calib_ros.errors import CalibrationError
-from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, SessionJobs
-from calib_ros_view.session.motion import AXES, step_of
+from calib_ros_view.session.numbers import AXES, step_of
 from calib_ros_view.session.picture import COLORINGS, Look, encoded
-from calib_ros_view.session.session import MOST_TIME_OFFSET_S, Session
+from calib_ros_view.session.session import CHECK, MOST_TIME_OFFSET_S, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, Session, SessionJobs
 from calib_ros_view.web import theme
-from calib_ros_view.web.panels import NumberPanel, ScenePanel, Sheet
+from calib_ros_view.web.panels import ZOOM, NumberPanel, ScenePanel, Sheet, Viewer
 from calib_ros_view.web.server import Pictures
-from calib_ros_view.web.viewer import ZOOM, Viewer
 
 SLIDER_DEG, SLIDER_CM = 5.0, 60.0  # half widths; numbers beside them reach farther
 KEEP = "(e) => e.stopPropagation()"  # a key of what has the focus is none of the page
@@ -30,24 +28,7 @@ HELD_S = 0.5  # after its last event, a slider is not set from here, so that it 
 QUIET_S = 0.25  # after the last change, from which numbers are computed
 TICK_S = 0.1  # between two looks at the session
 FORMATS = {"tf": "TF (static_transform_publisher)", "urdf": "URDF joint", "kitti": "KITTI calib.txt", "autoware": "Autoware YAML"}
-KEYS = {
-    **{f"{a.keys[0]} / {a.keys[1]}": f"{a.title}: {a.more} / {a.less.removeprefix('camera ')}" for a in AXES},
-    "Shift": "ten times as far",
-    "n / p": "next / previous frame",
-    "x": "leave this frame out, or take it back in",
-    "z / y": "undo / redo",
-    "Enter": "refine from here",
-    "h": "search around here",
-    "c": "check",
-    "Escape": "stop what runs; the keys belong to the picture again",
-    "+ / - / 0": "zoom in / out / all of the image",
-    "i / j / k / l": "look further up / left / down / right, when zoomed in",
-    "1 to 5": "colour by depth, reflectivity, ring, class, edge kind",
-    "b": "now, side by side, blended with before",
-    "g": "LiDAR edges on or off",
-    "t": "light or dark",
-    "?": "this list",
-}
+MOVES = {f"{a.keys[0]} / {a.keys[1]}": f"{a.title}: {a.more} / {a.less.removeprefix('camera ')}" for a in AXES}
 HINTS = {"ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight": "→"}
 
 
@@ -71,10 +52,13 @@ class SourcePage:
 
     def build(self) -> None:
         """Lay the page out, and keep it up to date until the browser leaves."""
-        self._copied = ui.dialog()
-        keys = {_shown(key): what for key, what in KEYS.items()}
-        with theme.bar(self._session.name, keys, self._back) as (self._switch, self._keys):
+        self._copied, commands = ui.dialog(), self._commands()
+        keys = MOVES | {"Shift": "ten times as far"} | {key: what for key, what, _ in commands}
+        keys |= {"t": "light or dark", "?": "this list"}
+        keys = {_shown(key): what for key, what in keys.items()}
+        with theme.bar(self._session.name, keys, self._back) as (switch, self._keys):
             self._actions()
+        self._do = {key: do for _, _, dos in commands for key, do in dos.items()} | {"t": switch, "?": self._keys.open}
         with ui.element("div").classes("w-full flex flex-col lg:flex-row flex-nowrap gap-2 p-2"):
             with ui.element("div").classes("grow min-w-0 flex flex-col flex-nowrap gap-2").style("flex-basis: 0"):
                 self._viewer()
@@ -100,7 +84,9 @@ class SourcePage:
                 far = f" within {SEARCH_DEG:g} deg and {100 * SEARCH_M:g} cm" if name == SEARCH else ""
                 ui.tooltip(f"{name} from here{far} ({hint})")
         self._stop = ui.button("Stop", on_click=self._jobs.stop).props("dense no-caps color=negative unelevated")
-        with ui.button("Save", on_click=lambda: self._tell(self._save)).props("dense no-caps flat"):
+        with ui.button(
+            "Save", on_click=lambda: self._tell(lambda: ui.notify(f"saved to {self._session.save()}", type="positive"))
+        ).props("dense no-caps flat"):
             ui.tooltip(f"write {self._session.out}" if self._session.out else "no file: start with --out FILE")
         with ui.button("Copy", icon="content_copy").props("dense no-caps flat"), ui.menu():
             for form, title in FORMATS.items():
@@ -153,7 +139,7 @@ class SourcePage:
             number = ui.number(value=0, step=step, suffix=unit, format="%.2f").props("dense borderless input-class=text-right")
             number.classes("figures plain").style("flex: 0 0 6.2rem").props(f'aria-label="{title}, {unit}"')
         slider.on("update:model-value", lambda e: self._slid(k, e.args), throttle=THROTTLE_S)
-        slider.on("change", self._let_go)
+        slider.on("change", lambda: setattr(self, "_drag", self._drag + 1))
         number.on("change", lambda: self._slid(k, number.value), [])
         self._rows.append((slider, number))
 
@@ -176,37 +162,41 @@ class SourcePage:
             self._tell(lambda: self._session.move_to(values, f"key {step[0]} {self._id}"))
             self._dirty.set()
             return
-        do = self._commands().get(key if key in ("Enter", "Escape") else key.lower())
+        do = self._do.get(key if key in ("Enter", "Escape") else key.lower())
         if do is not None and not (event.action.repeat and key not in ("n", "p")):
             do()
 
-    def _commands(self) -> dict[str, Callable[[], object]]:
-        by_color: dict[str, Callable[[], object]] = {
-            str(k + 1): partial(self._view.color_by, name) for k, name in enumerate(COLORINGS)
+    def _commands(self) -> list[tuple[str, str, dict[str, Callable[[], object]]]]:
+        """Keys and what they do, in words and indeed."""
+        view, session = self._view, self._session
+        zoom: dict[str, Callable[[], object]] = {
+            "+": partial(view.zoom, ZOOM),
+            "-": partial(view.zoom, 1 / ZOOM),
+            "0": view.show_all,
         }
-        return by_color | {
-            "n": lambda: self._go(1),
-            "p": lambda: self._go(-1),
-            "x": lambda: self._leave(self._frame, self._frame not in self._session.state.left_out),
-            "z": self._session.undo,
-            "y": self._session.redo,
-            "Enter": lambda: self._begin(REFINE),
-            "h": lambda: self._begin(SEARCH),
-            "c": lambda: self._begin(CHECK),
-            "Escape": self._jobs.stop,
-            "+": lambda: self._view.zoom(ZOOM),
-            "=": lambda: self._view.zoom(ZOOM),
-            "-": lambda: self._view.zoom(1 / ZOOM),
-            "0": self._view.show_all,
-            "i": lambda: self._view.pan(0, -1),
-            "j": lambda: self._view.pan(-1, 0),
-            "k": lambda: self._view.pan(0, 1),
-            "l": lambda: self._view.pan(1, 0),
-            "b": self._view.compare_next,
-            "g": self._view.switch_edges,
-            "t": self._switch,
-            "?": self._keys.open,
-        }
+        return [
+            ("n / p", "next / previous frame", {"n": partial(self._go, 1), "p": partial(self._go, -1)}),
+            ("x", "leave this frame out, or take it back in", {"x": self._leave_or_take}),
+            ("z / y", "undo / redo", {"z": session.undo, "y": session.redo}),
+            ("Enter", "refine from here", {"Enter": partial(self._begin, REFINE)}),
+            ("h", "search around here", {"h": partial(self._begin, SEARCH)}),
+            ("c", "check", {"c": partial(self._begin, CHECK)}),
+            ("Escape", "stop what runs; the keys belong to the picture again", {"Escape": self._jobs.stop}),
+            ("+ / - / 0", "zoom in / out / all of the image", {**zoom, "=": zoom["+"]}),
+            (
+                *("i / j / k / l", "look further up / left / down / right, when zoomed in"),
+                {key: partial(view.pan, *to) for key, to in zip("ijkl", ((0, -1), (-1, 0), (0, 1), (1, 0)), strict=True)},
+            ),
+            (
+                *("1 to 5", "colour by depth, reflectivity, ring, class, edge kind"),
+                {str(k + 1): partial(view.color_by, name) for k, name in enumerate(COLORINGS)},
+            ),
+            ("b", "now, side by side, blended with before", {"b": view.compare_next}),
+            ("g", "LiDAR edges on or off", {"g": view.switch_edges}),
+        ]
+
+    def _leave_or_take(self) -> None:
+        self._leave(self._frame, self._frame not in self._session.state.left_out)
 
     def _leave(self, frame: int, left: bool) -> None:
         self._tell(lambda: self._session.leave_out(frame, left))
@@ -224,9 +214,6 @@ class SourcePage:
         values[k] = float(value)
         self._tell(lambda: self._session.move_to(values, drag))
 
-    def _let_go(self) -> None:
-        self._drag += 1
-
     def _go(self, by: int) -> None:
         self._go_to((self._frame + by) % len(self._session.frames))
 
@@ -237,9 +224,6 @@ class SourcePage:
 
     def _begin(self, name: str) -> None:
         self._tell(lambda: self._jobs.start(name))
-
-    def _save(self) -> None:
-        ui.notify(f"saved to {self._session.save()}", type="positive")
 
     def _copy(self, form: str) -> None:
         text = self._session.export(form)
@@ -294,23 +278,15 @@ class SourcePage:
             self._show_position()
             self._dirty.set()
         self._show_job()
-        if not self._busy and loop.time() - self._changed_at > QUIET_S:
-            self._busy = True
+        if not self._busy and self._stale.get(self._tab, False) and loop.time() - self._changed_at > QUIET_S:
+            self._busy, self._stale[self._tab] = True, False  # the part that is looked at
+            parts = {"numbers": self._numbers.show, "frames": self._sheet.show, "scene": self._scene.show}
             try:
-                await self._catch_up()
+                await parts[self._tab](self._session.state, self._frame, self._view.look)
+            except CalibrationError as error:
+                ui.notify(str(error), type="warning")
             finally:
                 self._busy = False
-
-    async def _catch_up(self) -> None:
-        """Show the part that is looked at anew, if it is not up to date."""
-        if not self._stale.get(self._tab, False):
-            return
-        self._stale[self._tab] = False
-        parts = {"numbers": self._numbers.show, "frames": self._sheet.show, "scene": self._scene.show}
-        try:
-            await parts[self._tab](self._session.state, self._frame, self._view.look)
-        except CalibrationError as error:
-            ui.notify(str(error), type="warning")
 
     def _show_position(self) -> None:
         state, values = self._session.state, self._session.offsets

@@ -9,7 +9,7 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.registration.initial_guess import nominal
 from calib_ros_check.fleet.recordings import Recording
-from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.jobs.pool import Answer
 from calib_ros_check.outcome import CheckResult, Tolerance
 from calib_ros_check.tolerance import judge
 

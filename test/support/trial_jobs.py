@@ -12,8 +12,7 @@ from pathlib import Path
 
 from waiting import until
 
-from calib_ros_check.jobs.journal import Answer, Journal
-from calib_ros_check.jobs.pool import run
+from calib_ros_check.jobs.pool import Answer, Journal, run
 from calib_ros_evaluation.results import EvaluationJob, job
 
 

@@ -10,7 +10,7 @@ import pytest
 from trial_jobs import groups
 
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.journal import Journal
+from calib_ros_check.jobs.pool import Journal
 from calib_ros_evaluation.results import job
 
 ABOUT = {"version": "1"}

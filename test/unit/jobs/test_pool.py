@@ -20,7 +20,7 @@ from waiting import LIMIT_S, until
 
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError, TooFewFeaturesError
 from calib_ros_check.jobs import pool
-from calib_ros_check.jobs.journal import Answer, Journal
+from calib_ros_check.jobs.pool import Answer, Journal
 from calib_ros_evaluation.results import EvaluationJob, job
 
 ABOUT = {"version": "1"}

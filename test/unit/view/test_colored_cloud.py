@@ -9,7 +9,7 @@ import numpy as np
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.initial_guess import nominal
-from calib_ros_view.session.colored_cloud import UNSEEN, colored_cloud
+from calib_ros_view.session.picture import UNSEEN, colored_cloud
 
 CAMERA = Camera(np.array([[300.0, 0, 160], [0, 300.0, 100], [0, 0, 1]]), 320, 200)
 

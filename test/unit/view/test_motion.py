@@ -8,7 +8,7 @@ import pytest
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.registration.initial_guess import nominal
-from calib_ros_view.session.motion import AXES, moved, offsets, step_of
+from calib_ros_view.session.numbers import AXES, moved, offsets, step_of
 
 START = se3.perturb(nominal(), [3, -2, 1], [0.2, -0.1, 0.4])
 CAMERA = Camera(np.array([[400.0, 0, 320], [0, 400.0, 120], [0, 0, 1]]), 640, 240)

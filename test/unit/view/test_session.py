@@ -13,9 +13,8 @@ from calib_ros import Config, result, se3
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros_check.outcome import CheckVerdict
-from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, SessionJobs
-from calib_ros_view.session.plots import curve_plots, ellipse_plots, frame_bars
-from calib_ros_view.session.session import MOST_UNDO, Session
+from calib_ros_view.session.numbers import curve_plots, ellipse_plots, frame_bars
+from calib_ros_view.session.session import CHECK, MOST_UNDO, REFINE, SEARCH, Session, SessionJobs
 
 OFF = np.array([0.0, 1.0, 0, 5.0, 0, 0])
 

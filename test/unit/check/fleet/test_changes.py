@@ -7,8 +7,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.registration.initial_guess import nominal
-from calib_ros_check.fleet.changes import change_penalty, segments
-from calib_ros_check.fleet.sequence import Extrinsics, extrinsics, scatter
+from calib_ros_check.fleet.changes import Extrinsics, change_penalty, extrinsics, scatter, segments
 
 SIGMA = np.r_[np.deg2rad([0.05] * 3), [0.01] * 3]
 TURN = np.deg2rad([0.3, 0, 0, 0, 0, 0])  # 0.3 deg about x

@@ -12,12 +12,10 @@ import pytest
 from fleets import broken, checked, moved
 
 from calib_ros.errors import MissingDependencyError
-from calib_ros_check.fleet.cli import summary
-from calib_ros_check.fleet.fleet import Fleet, FleetOptions
+from calib_ros_check.cli import fleet_summary
+from calib_ros_check.fleet.fleet import Fleet, FleetOptions, write_changes, write_csv, write_parquet
 from calib_ros_check.fleet.history import Row, row_of, utc, vehicles
-from calib_ros_check.fleet.page import MOST_ROWS, change_size, write_fleet_page
-from calib_ros_check.fleet.plot import plots
-from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
+from calib_ros_check.fleet.page import MOST_ROWS, change_size, plots, write_fleet_page
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +70,7 @@ def test_exit_codes() -> None:
 
 
 def test_what_is_printed(fleet: Fleet) -> None:
-    text = summary(fleet)
+    text = fleet_summary(fleet)
     assert text.splitlines()[0].startswith("37 recordings of 4 vehicles: ")
     assert "a changed between drive_05 (2025-10-14T08:53:20Z) and drive_06" in text
     assert "not confirmed, only the newest" in text

@@ -43,7 +43,7 @@ def test_a_result_is_shown_with_what_contradicts_it(shown: RigShown) -> None:
     assert wrong.residual[0] == pytest.approx(3.0, abs=0.3)
     assert wrong.excess > 10 > max(e.excess for e in shown.edges if e.fate == "used")
     assert shown.edges[5].residual is None
-    assert [loop.closes for loop in shown.loops] != [True, True]
+    assert [closes for *_, closes in shown.loops] != [True, True]
     assert shown.text.startswith("4 of 5 sensors usable; l1-l0 contradicts the others; loop ")
 
 
@@ -87,7 +87,7 @@ def test_tables_escape_what_they_are_told_and_have_whole_names(shown: RigShown) 
     assert rows[0] == ["edge", "", "1σ", "residual", "why"]
     assert rows[6][0] == "c2 – l0"
     assert rows[6][4] == "too <dark>"
-    assert html.loops_html(shown).count("does not close") == sum(not loop.closes for loop in shown.loops)
+    assert html.loops_html(shown).count("does not close") == sum(not closes for *_, closes in shown.loops)
     longer = replace(shown, sensors=tuple(replace(own, name=own.name + "_with_a_very_long_name") for own in shown.sensors))
     assert ">c0_with_a_very_lo…<" in html.graph_svg(longer)
     assert "c0_with_a_very_long_name" in ElementTree.fromstring(html.sensors_html(longer)).itertext()
