@@ -106,7 +106,7 @@ class SyntheticRig:
         self.speed: float = cruise if p["speed"] is None else p["speed"]
         if not self.speed and not self.model.is_pair:
             raise BadInputError("synthetic drive: speed=0 does not go with several sensors, which measure at different times")
-        self._fields = p["fields"] or self.model.fields
+        self._fields = self.model.fields if rig is None else p["fields"] or self.model.fields  # the plain scanner gives all
         self._condition = named("condition", p["condition"] or self.model.condition, CONDITIONS)
         self._ride = Ride(self.seed, self.speed or cruise, p["ride"] == WEAVING)
         self._street = world(self.seed, self._ride.station(self.duration))
