@@ -160,9 +160,11 @@ class Result:
         `Calibrator.calibrate` states the extrinsic for it, `Calibrator.estimate` that for the camera that was given.
     origin* : where an initial extrinsic comes from.
     shared_covariance* : (6, 6), part of both that estimates of the same sensors have in common: what the clocks leave open.
+    lens_effect* : twist (6, n) of the extrinsic per unit of each change of the lens, rad and m, and the second moment (n, n) of
+        these: the rest of `covariance_with_intrinsics`.
     clock_direction* : (6,), left twist of the extrinsic per second that the points are measured later, rad/s and m/s.
     clock_sigma_s* : standard deviation, s, of an offset of the clocks that may be as large as motion.max_time_offset_s, as far as
-        the scenes tell.
+        the scenes tell. clock_offset_s* : that offset by the scenes alone, as `time_offset_s`, be it used or not.
     time_offset_s : of the clocks, which belongs to the extrinsic, as motion.time_offset_s: positive = points were measured later,
         or the image was exposed earlier, than stamped. time_offset_sigma_s : its standard deviation, s.
     stamping : how scans without point times are stamped, where the frames show that it is another way than configured.
@@ -197,8 +199,10 @@ class Result:
     origin: InitialSource | None = None
     covariance_with_intrinsics: Covariance | None = None
     shared_covariance: Covariance | None = None
+    lens_effect: tuple[Matrix, Covariance] | None = None
     clock_direction: Matrix | None = None
     clock_sigma_s: float | None = None
+    clock_offset_s: float | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     stamping: Stamping | None = None

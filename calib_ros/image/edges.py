@@ -133,11 +133,12 @@ def edge_levels(
     share: float = 0.0,
     used: Mask | None = None,
     across: Map | None = None,
+    least: float = 0.0,
 ) -> list[EdgeLevel]:
     """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine (see `blurred_levels`).
 
     semantic: oriented edges (2, H, W) in 0..1, of which `share` is blended in (figure 3.10). used: (H, W), False where there are
-    to be no edges, nor one along the border; None = everywhere. across: see `oriented_edges`.
+    to be no edges, nor one along the border; None = everywhere. across: see `oriented_edges`. least: of the blur, rad.
     """
     if used is not None:
         used = without_border(used, BILATERAL_DIAMETER // 2 + EDGE_REACH)
@@ -146,16 +147,21 @@ def edge_levels(
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
     if used is not None:
         edges = tuple(filled(e, used) for e in edges)
-    return blurred_levels(edges, focal_length, local_contrast=True)
+    return blurred_levels(edges, focal_length, local_contrast=True, least=least)
 
 
 def blurred_levels(
-    edges: Sequence[Map], focal_length: float, sigmas: Sequence[float] = SIGMAS, local_contrast: bool = False
+    edges: Sequence[Map],
+    focal_length: float,
+    sigmas: Sequence[float] = SIGMAS,
+    local_contrast: bool = False,
+    least: float = 0.0,
 ) -> list[EdgeLevel]:
     """Edge maps (H, W) of any number of channels -> levels, coarse to fine.
 
     The blur is an angle: it grows with the focal length (px). Coarse levels are stored smaller, at about half their blur.
-    local_contrast: divide every level by its local mean.
+    local_contrast: divide every level by its local mean. least: of the blur, rad: by how much what meets the maps is off, below
+    which its best match is one of chance.
     """
     levels = []
     for sigma in sigmas:
@@ -163,6 +169,7 @@ def blurred_levels(
         # At most the size of the image, whatever the focal length, and at least one pixel remains.
         blur = min(max(sigma * focal_length / REFERENCE_FOCAL_LENGTH, MIN_SIGMA), max(height, width))
         scale = 1 << int(np.log2(min(max(blur / STORED_BLUR, 1), height, width)))
+        blur = max(blur, least * focal_length)  # the size stays: frames lie side by side
         levels.append(EdgeLevel(np.stack([_blurred(e, blur, scale, local_contrast) for e in edges]), scale, blur))
     return levels
 

@@ -7,7 +7,7 @@ point between the last ray on the near surface and the first ray past it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -68,6 +68,7 @@ class EdgePoints:
         `deskew.deskewed_edges` has moved them; None if unknown.
     label : (n,) uint8, SemanticClass of the object with the edge; None if the cloud has no classes.
     pose : of the scanner in the LiDAR frame.
+    azimuth_step : rad between rays of a ring, within which side edges may lie anywhere; 0 = they lie between measured points.
     """
 
     xyz: NDArray[np.float32]
@@ -77,6 +78,7 @@ class EdgePoints:
     time: NDArray[np.float32] | None = None
     label: NDArray[np.uint8] | None = None
     pose: ScannerPose = CLOUD_FRAME
+    azimuth_step: float = 0.0
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -85,7 +87,7 @@ class EdgePoints:
         """The points of these indices."""
         time = None if self.time is None else self.time[keep]
         label = None if self.label is None else self.label[keep]
-        return EdgePoints(self.xyz[keep], self.strength[keep], self.kind[keep], self.ring_spacing, time, label, self.pose)
+        return replace(self, xyz=self.xyz[keep], strength=self.strength[keep], kind=self.kind[keep], time=time, label=label)
 
 
 def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
@@ -109,6 +111,7 @@ def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
         None if scan.cloud.time is None else scan.cloud.time[index],
         None if scan.cloud.label is None else scan.cloud.label[index],
         scan.pose,
+        scan.azimuth_step if scan.layout == "rings" else 0.0,
     )
 
 

@@ -109,7 +109,7 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats) -> Motion:
     T = se3.exp(twist * gap_s)
     for reach in MATCH_DISTANCES:
         target, source = (moved(points, twist, time) for points, time in (before, scan))
-        found = align(target, source, T, reach)
+        found = align(prepared(target), prepared(source), T, reach)
         T = np.asarray(found.T_target_source, float)
         if not np.isfinite(T).all():
             return Motion(None, "the alignment of the scans diverged")
@@ -130,19 +130,26 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats) -> Motion:
     return Motion(None if problem else twist, problem)
 
 
-def align(target: Floats, source: Floats, T: Floats, reach_m: float) -> Any:
-    """small_gicp's result of GICP from T_target_source (4, 4): points (n, 3) m, matched up to reach_m apart. Its H is of a right
-    twist. Raises MissingDependencyError without the library."""
+def prepared(points: Floats) -> tuple[Any, Any]:
+    """Points (n, 3) m for `align`: small_gicp's cloud with the surface around every point, and tree. Raises
+    MissingDependencyError without the library."""
     try:
         import small_gicp as gicp
     except ImportError:
         raise MissingDependencyError(MISSING) from None
-    clouds = [gicp.PointCloud(points) for points in (target, source)]
-    trees = [gicp.KdTree(cloud, 1) for cloud in clouds]
-    for cloud, tree in zip(clouds, trees, strict=True):
-        gicp.estimate_covariances(cloud, tree, NEIGHBOURS, 1)
+    cloud = gicp.PointCloud(points)
+    tree = gicp.KdTree(cloud, 1)
+    gicp.estimate_covariances(cloud, tree, NEIGHBOURS, 1)
+    return cloud, tree
+
+
+def align(target: tuple[Any, Any], source: tuple[Any, Any], T: Floats, reach_m: float) -> Any:
+    """small_gicp's result of GICP of `prepared` points from T_target_source (4, 4), matched up to reach_m apart. Its H is of a
+    right twist."""
+    import small_gicp as gicp
+
     # One thread: sums in another order would make results differ from run to run.
     return gicp.align(
-        *clouds, trees[0], init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach_m,
+        target[0], source[0], target[1], init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach_m,
         num_threads=1, max_iterations=30, rotation_epsilon=MIN_STEP, translation_epsilon=MIN_STEP,
     )  # fmt: skip

@@ -31,6 +31,7 @@ OUTLIER_ROUNDS = 3  # an outlier frame may hide another
 # Causes that a corrected camera may mend; of others, it would only be another wrong one.
 OF_LENSES = (Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.NOT_RECTIFIED, Cause.ALREADY_RECTIFIED)
 CAMERA_ROUNDS = 3  # after two, changes are those by which pictures differ that are rectified a fraction of a pixel apart
+Nuisance = tuple[Covariance, tuple[Matrix, Covariance] | None, Effect | None]  # see Estimate.nuisance
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,20 +64,21 @@ class Estimate:
         """Of the features that the optimum is one of."""
         return self.optimised.objective
 
-    def nuisance(self, config: Config, lens: LensEstimate | None) -> tuple[Covariance, Covariance, Effect | None]:
-        """What the clocks and this lens leave open of the optimum, however many such scenes there are: covariances (6, 6) of
-        both, and the effect of an offset as large as motion.max_time_offset_s; None where the motion is not known."""
+    def nuisance(self, config: Config, lens: LensEstimate | None) -> Nuisance:
+        """What the clocks and this lens leave open of the optimum, however many such scenes there are: covariance (6, 6) by the
+        clocks, how the lens moves it, and the effect of an offset as large as motion.max_time_offset_s; None where the motion is
+        not known."""
         T, covariance, constraints = self.T, self.covariance, self.objective.constraints
         score = self.objective.smooth_score(T)
         sigma_s, clocks = self.optimised.clocks(config.motion)
         active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
-        nothing, by_lens = np.zeros((6, 6)), np.zeros((6, 6))
+        nothing, by_lens = np.zeros((6, 6)), None
         if not limits.open_axes.any():
             return nothing, by_lens, None
         if lens is not None:
             kept = [axis for direction in self.unobservable for axis in direction.axes]
-            by_lens = lens.added_covariance(constraints, covariance, kept)
+            by_lens = lens.effect(constraints, covariance, kept)
         moving = with_known_motion(self.optimised.features, score)
         if moving is None:
             return nothing, by_lens, None
@@ -87,20 +89,15 @@ class Estimate:
         by_clocks = effect.constrained(constraints, covariance, sigma_s).covariance(sigma_s)
         return by_clocks, by_lens, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s)
 
-    def result(
-        self,
-        nuisance: tuple[Covariance, Covariance, Effect | None],
-        refusal: Refusal | None,
-        motion: MotionConfig,
-        notes: Sequence[str],
-    ) -> Result:
+    def result(self, nuisance: Nuisance, refusal: Refusal | None, motion: MotionConfig, notes: Sequence[str]) -> Result:
         """The Result, with the extrinsic that it started from where it is refused. nuisance: see there. notes: for its reason."""
         shared, by_lens, clocks = nuisance
         objective, features, search = self.objective, self.optimised.features, self.optimised.search
         names = [f.name or str(k) for k, f in enumerate(features)]
         outliers = [names[k] for k in self.alignment.outliers]
         used = len(features) - len(outliers)
-        offset = self.optimised.offset
+        offset, whole = self.optimised.offset, self.covariance + shared
+        moves, moment = (np.zeros((6, 1)), np.eye(1)) if by_lens is None else by_lens
         known = None if refusal or offset is None or not offset.observable(motion) else self.optimised
         reasons = [
             str(refusal) if refusal else "",
@@ -131,11 +128,15 @@ class Estimate:
             frame_scores=tuple(float(s) for s in objective.frame_scores(self.T)),
             starts=None if search is None else (search.agreed, search.optimised),
             intrinsics={} if self.lens is None else self.lens.in_files(),
-            covariance=None if refusal else self.covariance + shared,
-            covariance_with_intrinsics=None if refusal else self.covariance + shared + by_lens,
+            covariance=None if refusal else whole,
+            covariance_with_intrinsics=None if refusal else whole + moves @ moment @ moves.T,
+            lens_effect=None if refusal else by_lens,
             shared_covariance=None if refusal else shared,
             clock_direction=None if refusal or clocks is None else clocks.direction,
             clock_sigma_s=None if refusal or clocks is None else clocks.sigma(motion.max_time_offset_s),
+            clock_offset_s=None
+            if refusal or offset is None
+            else motion.time_offset_s + (self.optimised.seconds or offset.seconds),
             time_offset_s=None if known is None else motion.time_offset_s + known.seconds,
             time_offset_sigma_s=None if known is None else known.clocks(motion)[0],
             stamping=None if known is None else known.stamping,

@@ -157,10 +157,7 @@ class FeatureExtractor:
         still, reflectivity, edges = self._scan_edges(frame, twist)
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
         points = deskewed_edges(edges, still, self.config.motion)
-        if plain is not None:
-            levels = plain.levels
-        else:
-            levels = edge_levels(image, float(self.camera.K[0, 0]), used=self.used, across=self.across)
+        levels = self._levels(image, points) if plain is None else plain.levels
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
         facts = (self.camera, frame.stamp, frame.name, reflectivity, twist, by_azimuth)
         features = FrameFeatures(points, levels, *facts)
@@ -184,9 +181,14 @@ class FeatureExtractor:
             self.scans[key] = found
         return still, *found
 
+    def _levels(self, image: NDArray[np.uint8], points: EdgePoints, semantic: Map | None = None) -> list[EdgeLevel]:
+        """Edge maps of a working image, no sharper than the scanner's edges are placed: evenly within a step."""
+        blunt = points.azimuth_step / np.sqrt(12)
+        return edge_levels(image, float(self.camera.K[0, 0]), semantic, EDGE_SHARE, self.used, self.across, blunt)
+
     def seen_anew(self, features: FrameFeatures, image: NDArray[np.uint8]) -> FrameFeatures:
         """Features of the same scan, had this camera taken the image; without semantics."""
-        levels = edge_levels(self.working_image(image), float(self.camera.K[0, 0]), used=self.used, across=self.across)
+        levels = self._levels(self.working_image(image), features.points)
         return replace(features, levels=levels, camera=self.camera, plain=None, view=None)
 
     def _with_semantics(
@@ -198,8 +200,7 @@ class FeatureExtractor:
         if points.label is not None:
             points = replace(points, strength=points.strength * edge_weights(points.label))
         if edges is not None:
-            focal = float(features.camera.K[0, 0])
-            levels = edge_levels(image, focal, edges, EDGE_SHARE, self.used, self.across)
+            levels = self._levels(image, points, edges)
         out = replace(features, points=points, levels=levels, plain=features)
         if models is None or semantics.classes is None or frame.cloud.label is None:
             return out

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
-from calib_ros.config import Config, update
+from calib_ros.config import Config, MotionConfig, update
 from calib_ros.datasets.positions import frame_positions, spread_positions
 from calib_ros.datasets.rig_source import RigSource
 from calib_ros.datasets.source import Source, neighbours
@@ -25,11 +26,13 @@ from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
 from calib_ros.rig.description import RigDescription
-from calib_ros.rig.graph import Edge, RigSolution, solve
+from calib_ros.rig.graph import SIGNIFICANCE, Edge, RigSolution, solve
 from calib_ros.rig.lidars import MOTION_KIND, SCANS_KIND, SHARED, UNKNOWN_M, LidarScans, motion_edge, scan_edge, shared_view
 
 # Half width of a search: two standard deviations of what the priors say, but no less than the odd centimetre of a mount.
 SIGMAS, LEAST_DEG, LEAST_M = 2.0, 0.5, 0.05
+LEAST_S, UNKNOWN_S = 1e-6, 1.0  # standard deviations, s, of one clock for all, and of one of which nothing is known
+FAR = float(chi2.isf(SIGNIFICANCE, 1))  # squared deviations
 GRID, SEEN = (16, 9), 0.1  # cells of a picture, and the share of them with points which is a shared view
 Progress = Callable[[str, float], None]
 
@@ -104,6 +107,7 @@ class RigMeasurer:
         for k, (camera, lidar) in enumerate(pairs):
             self.progress(f"{camera} with {lidar}", k / len(pairs))
             out.append(self.camera_edge(camera, lidar, known))
+        out = in_step(out, self.config.motion)
         joined = {m.target for m in out if m.edge is not None}
         for camera in (name for name in self.description.cameras if name not in joined):
             out += self.by_motion(camera, known)
@@ -203,6 +207,47 @@ class RigMeasurer:
             return frame
         own = np.flatnonzero(self.scans[lidar].stamps == frame.moment_of_cloud + _ahead(source))
         return replace(frame, twist=self.scans[lidar].twist(int(own[0])) if len(own) else None)
+
+
+def in_step(measured: Sequence[Measurement], motion: MotionConfig) -> list[Measurement]:
+    """The same by one clock of every sensor and one lens of every camera, where each registration came with its own.
+
+    Offsets that several pairs tell of are put together, and extrinsics moved to them. A lens that is off moves all extrinsics of
+    its camera alike, to where it projects right as it is stated: an error is how else the others move than the most certain one.
+    """
+    edges = {m.edge: m.result for m in measured if m.edge is not None}
+    names = sorted({name for edge in edges for name in (edge.target, edge.source)})
+
+    def way(edge: Edge) -> Matrix:
+        return np.array([(name == edge.source) - (name == edge.target) for name in names], float)
+
+    given_s, prior_s, lenses = motion.time_offset_s, max(motion.time_offset_sigma_s, LEAST_S), dict[str, Result]()
+    # Half of the variance of a difference; of a clock that a camera's frames have shown to be elsewhere nothing is known.
+    prior, information, late = np.full(len(names), 2 / prior_s**2), np.zeros((len(names), len(names))), np.zeros(len(names))
+    for edge in sorted(edges, key=lambda edge: float(np.trace(edge.covariance))):
+        r, a, seconds, sigma, used = edges[edge], way(edge), edge.time_offset_s, edge.time_sigma_s, True
+        if r is not None:
+            used = seconds is not None and seconds != given_s
+            seconds, sigma = None if r.clock_offset_s is None else r.clock_offset_s - given_s, r.clock_sigma_s
+            prior[names.index(edge.target)] *= not used
+            lenses.setdefault(edge.target, r)
+        # What is farther off than clocks are is the best match of chance, unless it is told so well that it was used.
+        if seconds is not None and sigma and (used or seconds**2 < FAR * (sigma**2 + prior_s**2)):
+            information, late = information + np.outer(a, a) / sigma**2, late + a * seconds / sigma**2
+    covariance, out = np.linalg.inv(information + np.diag(prior + UNKNOWN_S**-2.0)), []
+    for m in measured:
+        if m.edge is not None and m.result is not None and m.result.shared_covariance is not None:
+            a, at, lens, along = way(m.edge), m.edge.time_offset_s, m.result.lens_effect, m.result.clock_direction
+            seconds, sigma = given_s + float(a @ covariance @ late), float(np.sqrt(a @ covariance @ a))
+            along = np.zeros(6) if along is None else along
+            C = m.edge.covariance - m.result.shared_covariance + sigma**2 * np.outer(along, along)
+            if lens is not None and (best := lenses[m.target].lens_effect) is not None:
+                C += (lens[0] - best[0]) @ best[1] @ (lens[0] - best[0]).T - lens[0] @ lens[1] @ lens[0].T
+            T = se3.exp(along * (seconds - (given_s if at is None else at))) @ m.edge.T
+            told = m.edge if at is None else replace(m.edge, time_offset_s=seconds, time_sigma_s=sigma)
+            m = replace(m, edge=replace(told, T=T, covariance=C))
+        out.append(m)
+    return out
 
 
 def _ahead(source: Source) -> int:

@@ -24,6 +24,7 @@ from calib_ros.lidar.ego_motion import (
     Motion,
     align,
     estimate_motion,
+    prepared,
     thinned,
 )  # fmt: skip
 from calib_ros.registration.motion_guess.guess import FLOOR_DEG
@@ -67,6 +68,7 @@ class LidarScans:
         first, last = window or (self.stamps[:1].sum(), self.stamps[-1:].sum())
         self.used = np.flatnonzero((self.stamps >= first) & (self.stamps <= last))  # their positions
         self._motions: dict[int, Matrix | None] = {}
+        self._still: dict[int, tuple[Matrix, Matrix | None]] = {}
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -100,13 +102,16 @@ class LidarScans:
 
     def still(self, k: int) -> tuple[Matrix, Matrix | None]:
         """Points (n, 3) of scan k, thinned, as they are at its stamp, and the velocity there."""
-        cloud, twist = self.scans[k][1], self.twist(k)
-        points, time = thinned(cloud, self._times(cloud), VOXEL_M)
-        return points if twist is None or self.config.deskew == "off" else moved(points, twist, time), twist
+        if k not in self._still:
+            cloud, twist = self.scans[k][1], self.twist(k)
+            points, time = thinned(cloud, self._times(cloud), VOXEL_M)
+            self._still[k] = points if twist is None or self.config.deskew == "off" else moved(points, twist, time), twist
+        return self._still[k]
 
     def chosen(self, n: int) -> list[int]:
-        """Up to n positions, spread evenly."""
-        return [int(self.used[round(k)]) for k in np.linspace(0, len(self.used) - 1, min(n, len(self.used)))]
+        """Up to n positions, spread evenly, few of them among SCANS."""
+        own = self.used if n >= SCANS else self.chosen(SCANS)
+        return [int(own[round(k)]) for k in np.linspace(0, len(own) - 1, min(n, len(own)))]
 
     @cached_property
     def glimpses(self) -> list[Matrix]:
@@ -193,16 +198,14 @@ def register(A: Matrix, B: Matrix, T: Transform, twist: Matrix | None, late_s: f
     guess = between @ T
     # The narrower scanner's points are looked for among the wider one's.
     turned = len(B) > len(A)
+    wide, narrow = (prepared(points) for points in ((B, A) if turned else (A, B)))
     inliers: list[int] = []
     for reach in REACHES_M:
         if not np.isfinite(guess).all():
             break
-        if turned:
-            result = align(B, A, se3.inverse(guess), reach)
-            guess = se3.inverse(np.asarray(result.T_target_source, float))
-        else:
-            result = align(A, B, guess, reach)
-            guess = np.asarray(result.T_target_source, float)
+        result = align(wide, narrow, se3.inverse(guess) if turned else guess, reach)
+        guess = np.asarray(result.T_target_source, float)
+        guess = se3.inverse(guess) if turned else guess
         inliers.append(result.num_inliers)
     # Of what both see, since either sees other things, too.
     matched, H = inliers[1] / max(inliers[0], 1) if len(inliers) > 1 else 0.0, np.asarray(result.H, float)

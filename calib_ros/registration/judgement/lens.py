@@ -223,17 +223,16 @@ class LensEstimate:
         weighed = self.information @ self.change
         return self.directions + np.outer(missing, weighed) / (float(self.change @ weighed) + 1)
 
-    def added_covariance(self, constraints: PoseConstraints, covariance: Covariance, kept: Sequence[int] = ()) -> Covariance:
-        """Second moment (6, 6) of the extrinsic about the optimum by the lens as it is, whose own covariance is `covariance`, if
-        it is another. kept: axes that are those of the start, whatever the lens."""
+    def effect(self, constraints: PoseConstraints, covariance: Covariance, kept: Sequence[int] = ()) -> tuple[Matrix, Covariance]:
+        """Twist (6, n) of the extrinsic from the optimum by the lens as it is, whose own covariance is `covariance`, per unit of
+        each change, and the second moment (n, n) of these. kept: axes that are those of the start, whatever the lens."""
         moves, (mean, spread) = self.moves.copy(), self.posterior
         moves[list(kept)] = 0.0
         if constraints.prior:
             moves = moves - covariance @ (constraints.information()[:, None] * moves)
         moment = spread + np.outer(mean, mean)
         farthest = constraints.limits.half[:, None] / np.sqrt(np.diag(moment))
-        moves = np.clip(moves, -farthest, farthest)
-        return np.asarray(moves @ moment @ moves.T)
+        return np.clip(moves, -farthest, farthest), np.asarray(moment)
 
     @property
     def left_open(self) -> Covariance:

@@ -131,6 +131,13 @@ def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
     assert [level.maps.shape for level in levels] == [(2, 240 // s, 320 // s) for s in scales]
 
 
+def test_no_level_is_sharper_than_what_meets_it_is_placed():
+    levels = edge_levels(texture(), 720, least=2.5 / 720)
+    assert [level.sigma for level in levels] == pytest.approx([16, 8, 4, 2.5, 2.5])
+    assert [level.scale for level in levels] == [8, 4, 2, 1, 1]
+    assert np.array_equal(levels[3].packed, levels[4].packed)
+
+
 def test_maps_are_standardised():
     for shape in ((240, 320), (239, 317), (61, 83), (50, 400)):
         for level in edge_levels(texture(shape=shape), FOCAL):

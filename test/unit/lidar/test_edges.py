@@ -65,6 +65,12 @@ def test_side_edges_lie_on_the_outline(step):
     assert abs(np.mean(errors)) < 0.1
 
 
+def test_rays_tell_how_well_side_edges_are_placed_unless_they_lie_between_points() -> None:
+    shapes = [BOX, WALL, GROUND]
+    assert np.rad2deg(edges_of(shapes).azimuth_step) == pytest.approx(STEP, abs=1e-4)
+    assert edges_of(shapes, LidarConfig(layout="projection")).azimuth_step == 0
+
+
 @pytest.mark.parametrize("rings", [24, 48])
 def test_top_edges_lie_on_the_top(rings):
     spacing = np.deg2rad(24 / (rings - 1))

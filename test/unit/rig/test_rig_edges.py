@@ -14,10 +14,13 @@ from two_halves import HALVES, TwoHalves
 
 from calib_ros import se3
 from calib_ros.cli.main import main
+from calib_ros.config import MotionConfig
 from calib_ros.errors import BadInputError
 from calib_ros.registration.features import FeatureExtractor, ScanEdges, ScanKey
+from calib_ros.result import CONVERGED, Result
 from calib_ros.rig.description import RigDescription, Sensor
-from calib_ros.rig.edges import RigMeasurer, box_of, priors_of, seen_share
+from calib_ros.rig.edges import Measurement, RigMeasurer, box_of, in_step, priors_of, seen_share
+from calib_ros.rig.graph import Edge
 from calib_ros.rig.report import RigReport
 
 
@@ -96,6 +99,38 @@ def test_a_pair_shares_a_view_although_some_scans_pass_a_gap(
     assert len(glimpses) == 5
     own.glimpses = glimpses
     assert measurer.camera_pairs(measurer.solution([])) == [("left", "top"), ("right", "top")] * seen
+
+
+def test_clocks_and_lens_of_a_sensor_are_the_same_for_all_its_pairs() -> None:
+    """A camera whose clock is 4 ms off, which one pair has found and the other one has not, 5 m/s ahead; its lens is off by one
+    unit, which turns either extrinsic, one of them by half as much again. Its LiDARs' clocks are 1 ms apart."""
+    forward, alone, motion = np.eye(6)[5] * 5, np.eye(6) * 1e-6, MotionConfig()
+    truth = {lidar: se3.exp([0.1, 0.2, 0.3, k, 0, 1]) for k, lidar in enumerate("ab")}
+    shared, measured = 0.01**2 * np.outer(forward, forward), []
+    for lidar, late_s, used, turn in (("a", 0.004, True, 1.0), ("b", 0.003, False, 1.5)):
+        lens = np.eye(6)[:, :1] * turn, np.array([[0.005**2]])
+        at = late_s if used else 0.0
+        T = se3.exp(forward * (at - late_s) + lens[0][:, 0] * 0.005) @ truth[lidar]
+        C = alone + shared
+        whole = C + lens[0] @ lens[1] @ lens[0].T
+        clocks = {"clock_direction": forward, "clock_sigma_s": 1e-3, "clock_offset_s": late_s, "time_offset_s": at}
+        r = Result(
+            T, CONVERGED, covariance=C, covariance_with_intrinsics=whole, shared_covariance=shared, lens_effect=lens, **clocks
+        )
+        measured.append(Measurement("c", lidar, "registration", Edge("c", lidar, T, whole, "registration", at, 1e-3), "", r))
+    measured.append(Measurement("a", "b", "scans", Edge("a", "b", np.eye(4), alone, "scans", -0.001, 1e-5)))
+    a, b, scans = in_step(measured, motion)
+    assert scans.edge is measured[2].edge
+    assert a.edge is not None
+    assert b.edge is not None
+    assert a.edge.time_offset_s == pytest.approx(0.004, abs=2e-5)
+    assert b.edge.time_offset_s == pytest.approx(0.003, abs=2e-5)
+    assert a.edge.time_sigma_s == pytest.approx(1e-3 / np.sqrt(2), rel=0.02)
+    # What is left is the lens, alike but for half of it, by which b may be off.
+    for edge, turn in ((a.edge, 1.0), (b.edge, 1.5)):
+        np.testing.assert_allclose(se3.log(edge.T @ se3.inverse(truth[edge.source])), np.eye(6)[0] * turn * 0.005, atol=1e-4)
+    np.testing.assert_allclose(a.edge.covariance[:5, :5], alone[:5, :5], atol=1e-12)
+    assert b.edge.covariance[0, 0] == pytest.approx(1e-6 + 0.0025**2)
 
 
 def test_the_search_follows_the_prior() -> None:
