@@ -23,6 +23,7 @@ from calib_ros.io import write_atomically
 from calib_ros.version import __version__
 
 VERSION = __version__
+LensEffect = tuple[Matrix, Covariance]  # see Result.lens_effect
 CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"
 INITIAL = "initial"  # status of an extrinsic that no frame has confirmed yet
 # Statuses of the online recalibrator. The transform is the last good one; while moved, the newest that nothing confirms yet.
@@ -199,7 +200,7 @@ class Result:
     origin: InitialSource | None = None
     covariance_with_intrinsics: Covariance | None = None
     shared_covariance: Covariance | None = None
-    lens_effect: tuple[Matrix, Covariance] | None = None
+    lens_effect: LensEffect | None = None
     clock_direction: Matrix | None = None
     clock_sigma_s: float | None = None
     clock_offset_s: float | None = None

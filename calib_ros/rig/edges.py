@@ -24,7 +24,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor, ScanEdges
 from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros.result import Result
+from calib_ros.result import LensEffect, Result
 from calib_ros.rig.description import RigDescription
 from calib_ros.rig.graph import SIGNIFICANCE, Edge, RigSolution, solve
 from calib_ros.rig.lidars import MOTION_KIND, SCANS_KIND, SHARED, UNKNOWN_M, LidarScans, motion_edge, scan_edge, shared_view
@@ -242,12 +242,17 @@ def in_step(measured: Sequence[Measurement], motion: MotionConfig) -> list[Measu
             along = np.zeros(6) if along is None else along
             C = m.edge.covariance - m.result.shared_covariance + sigma**2 * np.outer(along, along)
             if lens is not None and (best := lenses[m.target].lens_effect) is not None:
-                C += (lens[0] - best[0]) @ best[1] @ (lens[0] - best[0]).T - lens[0] @ lens[1] @ lens[0].T
+                C += apart(lens, best) - lens[0] @ lens[1] @ lens[0].T
             T = se3.exp(along * (seconds - (given_s if at is None else at))) @ m.edge.T
             told = m.edge if at is None else replace(m.edge, time_offset_s=seconds, time_sigma_s=sigma)
             m = replace(m, edge=replace(told, T=T, covariance=C))
         out.append(m)
     return out
+
+
+def apart(lens: LensEffect, other: LensEffect) -> Covariance:
+    """How far a lens that is off moves two extrinsics of its camera apart, second moment (6, 6): see `Result.lens_effect`."""
+    return np.asarray((lens[0] - other[0]) @ other[1] @ (lens[0] - other[0]).T)
 
 
 def _ahead(source: Source) -> int:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import RefineConfig
-from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
+from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, LensEffect
 from calib_ros.rig.description import RigDescription
-from calib_ros.rig.edges import Measurement
+from calib_ros.rig.edges import Measurement, apart
 from calib_ros.rig.graph import PRIOR, Edge, RigSolution, joined_to, solve
 from calib_ros.rig.moved import MOVED as KNOCKED
 from calib_ros.rig.moved import hypotheses, verdict
@@ -48,15 +48,18 @@ class PairState:
         own = "" if self.extrinsic is None else self.extrinsic.result.reason
         return self.unchecked or f"{self.target} with {self.source}: {own or self.status}"
 
-    def edge(self) -> Edge | None:
-        """What it has measured; None while it has not, or what it had does not hold any more."""
+    def edge(self, of_camera: LensEffect | None = None) -> Edge | None:
+        """What it has measured; None while it has not, or what it had does not hold any more. of_camera: what the lens does to
+        another pair of its camera, from which this one is known as far as it does the same here."""
         extrinsic = self.extrinsic
         if extrinsic is None or self.status in (INITIAL, MOVED) or not (extrinsic.accepted or extrinsic.usable):
             return None
         r = extrinsic.result
-        C = r.covariance if r.covariance_with_intrinsics is None else r.covariance_with_intrinsics
+        C = r.covariance
         if C is None:
             return None
+        if of_camera is not None and r.lens_effect is not None:
+            C = C + apart(r.lens_effect, of_camera)
         offset = (r.time_offset_s, r.time_offset_sigma_s)
         return Edge(*self.pair, r.T_camera_lidar, C, self.kind, *offset, samples=r.frames_used)
 
@@ -116,7 +119,11 @@ class LiveRig:
         """The state from what all pairs say. priors: T_reference_sensor and its covariance, of the sensors that have one."""
         reference = self._description.reference
         known = [p for p in pairs if all(name in priors or name == reference for name in p.pair)]
-        edges = {p.pair: e for p in known if (e := p.edge()) is not None}
+        lenses: dict[str, LensEffect] = {}
+        for p in known:
+            if p.edge() is not None and p.extrinsic is not None and p.extrinsic.result.lens_effect is not None:
+                lenses.setdefault(p.target, p.extrinsic.result.lens_effect)
+        edges = {p.pair: e for p in known if (e := p.edge(lenses.get(p.target))) is not None}
         solution = solve(list(edges.values()), priors, reference)
         moved = self._moved(known, edges)
         if not self._lost and not any(p.status == SUSPECT for p in known):
