@@ -15,9 +15,8 @@ import numpy as np
 from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.io import write_atomically
-from calib_ros_check.fleet.certificates import Certificate
 from calib_ros_check.fleet.changes import FALSE_ALARMS
-from calib_ros_check.fleet.history import ERROR, UNITS, VERDICTS, Row, Vehicle, VehicleChange
+from calib_ros_check.fleet.history import ERROR, UNITS, VERDICTS, Certificate, Row, Vehicle, VehicleChange
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_check.recording import CheckOptions
 

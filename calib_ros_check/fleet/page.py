@@ -14,9 +14,8 @@ import numpy as np
 from calib_ros.arrays import Matrix
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import CalibrationError
-from calib_ros_check.fleet.certificates import Certificate
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
-from calib_ros_check.fleet.history import ERROR, VERDICTS, Row, Vehicle, VehicleChange
+from calib_ros_check.fleet.history import ERROR, VERDICTS, Certificate, Row, Vehicle, VehicleChange
 from calib_ros_check.page import page_template, write_page
 from calib_ros_check.recording import CheckOptions, opened, positions_of, read_frames
 from calib_ros_check.report import DEVIATIONS, SHEET, STYLE, deviation_rows, picture_of
