@@ -31,6 +31,8 @@ from calib_ros_check.rig.check import as_given, as_row, check_recording
 
 # What an error comes from: the recording, which stays as it is until its files change, or anything else, which is tried again.
 INPUT, OTHER = "input", "other"
+Progress = Callable[[int, int], None]
+ABOUT = {"format": "calib-ros fleet 1"}  # of the journal: options and versions belong to its jobs
 
 
 def _weights(config: SemanticsConfig) -> list[str | None]:
@@ -115,10 +117,6 @@ def _peak() -> int:
         return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
     except (OSError, StopIteration):
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1024 if os.uname().sysname == "Linux" else 1)
-
-
-Progress = Callable[[int, int], None]
-ABOUT = {"format": "calib-ros fleet 1"}  # of the journal: options and versions belong to its jobs
 
 
 def check_fleet(

@@ -20,6 +20,9 @@ from calib_ros_check.fleet.history import ERROR, UNITS, VERDICTS, Certificate, R
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_check.recording import CheckOptions
 
+AXES = [f"{axis}_{unit}" for axis, unit in UNITS.items()]
+CHANGES = ("vehicle", "before", "time_before", "after", "time_after", "confirmed", "rotation_deg", "translation_m")
+
 
 @dataclass(frozen=True)
 class FleetOptions:
@@ -87,10 +90,6 @@ class Fleet:
         if CheckVerdict.FAIL.value in found:
             return 1
         return 0 if found == {CheckVerdict.PASS.value} else 3
-
-
-AXES = [f"{axis}_{unit}" for axis, unit in UNITS.items()]
-CHANGES = ("vehicle", "before", "time_before", "after", "time_after", "confirmed", "rotation_deg", "translation_m")
 
 
 def write_csv(path: Path, lines: Sequence[Mapping[str, Any]], header: Iterable[str] | None = None) -> None:

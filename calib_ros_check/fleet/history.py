@@ -34,6 +34,7 @@ ERRORS = tuple(
 )
 MOST_SIGMAS = 38.0  # where probabilities end
 OWN = ("of", "result")  # of a row, no columns
+WORST_FIRST = {CheckVerdict.PASS: 0, CheckVerdict.INCONCLUSIVE: 1, CheckVerdict.FAIL: 2}
 
 
 @dataclass
@@ -205,9 +206,6 @@ def _mark(known: Sequence[Row], sequence: Extrinsics, found: Segments) -> None:
         row.drift_deg = float(np.rad2deg(np.linalg.norm(drift[:3])))
         row.drift_m = float(np.linalg.norm(drift[3:]))
         row.drift_sigma = float(np.minimum(np.sqrt(2) * erfcinv(chi2.sf(square, 6)), MOST_SIGMAS))
-
-
-WORST_FIRST = {CheckVerdict.PASS: 0, CheckVerdict.INCONCLUSIVE: 1, CheckVerdict.FAIL: 2}
 
 
 @dataclass(frozen=True, eq=False)
