@@ -28,6 +28,7 @@ from calib_ros_check.report import check_report, write_report, write_rig_check
 from calib_ros_check.rig.check import RigCheck, check_recording
 
 EXIT = {CheckVerdict.PASS: 0, CheckVerdict.FAIL: 1, CheckVerdict.INCONCLUSIVE: 3}
+SHOWN = 20  # changes, and errors, that are printed; all are in the tables
 
 
 def options_of(args: argparse.Namespace) -> CheckOptions:
@@ -90,9 +91,6 @@ def rig_summary(found: RigCheck) -> str:
     width = max(len(row[0]) for row in rows)
     lines = [f"  {name:<{width}}  {verdict:<12}  {reason}" for name, verdict, reason in rows]
     return "\n".join([f"{found.verdict.value}: {found.reason}", *lines, *(f"  {note}" for note in found.notes)])
-
-
-SHOWN = 20  # changes, and errors, that are printed; all are in the tables
 
 
 def check_many(args: argparse.Namespace) -> int:

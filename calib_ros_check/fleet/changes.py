@@ -23,7 +23,11 @@ FLOOR = 1e-12  # rad^2, m^2; keeps a covariance of zeros invertible
 # Differences of an axis from which its own scatter is estimated; of fewer, the median is less certain than the assumption that
 # the three axes of rotation, and those of translation, scatter alike.
 OWN_SCATTER = 60
-MOST = 1e3  # times the usual variance: how much scatter is looked for
+MOST_SCATTER = 1e3  # times the usual variance: how much scatter is looked for
+FALSE_ALARMS = 0.001  # per recording
+# Simulated sequences: enough that a hundred of them exceed the penalty.
+EXCEEDING, FEWEST, MOST = 100, 2000, 100_000
+BATCH = 2_000_000  # numbers held at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,17 +96,11 @@ def _excess(squares: Matrix, variances: Matrix) -> float:
 
     if median(0.0) <= wanted:
         return 0.0
-    low, high = 0.0, MOST * float(np.median(squares))
+    low, high = 0.0, MOST_SCATTER * float(np.median(squares))
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (middle, high) if median(middle) > wanted else (low, middle)
     return high
-
-
-FALSE_ALARMS = 0.001  # per recording
-# Simulated sequences: enough that a hundred of them exceed the penalty.
-EXCEEDING, FEWEST, MOST = 100, 2000, 100_000
-BATCH = 2_000_000  # numbers held at a time
 
 
 @dataclass(frozen=True, eq=False)

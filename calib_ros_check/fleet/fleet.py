@@ -15,11 +15,13 @@ import numpy as np
 from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.io import write_atomically
-from calib_ros_check.fleet.certificates import Certificate
 from calib_ros_check.fleet.changes import FALSE_ALARMS
-from calib_ros_check.fleet.history import ERROR, UNITS, VERDICTS, Row, Vehicle, VehicleChange
+from calib_ros_check.fleet.history import ERROR, UNITS, VERDICTS, Certificate, Row, Vehicle, VehicleChange
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_check.recording import CheckOptions
+
+AXES = [f"{axis}_{unit}" for axis, unit in UNITS.items()]
+CHANGES = ("vehicle", "before", "time_before", "after", "time_after", "confirmed", "rotation_deg", "translation_m")
 
 
 @dataclass(frozen=True)
@@ -88,10 +90,6 @@ class Fleet:
         if CheckVerdict.FAIL.value in found:
             return 1
         return 0 if found == {CheckVerdict.PASS.value} else 3
-
-
-AXES = [f"{axis}_{unit}" for axis, unit in UNITS.items()]
-CHANGES = ("vehicle", "before", "time_before", "after", "time_after", "confirmed", "rotation_deg", "translation_m")
 
 
 def write_csv(path: Path, lines: Sequence[Mapping[str, Any]], header: Iterable[str] | None = None) -> None:

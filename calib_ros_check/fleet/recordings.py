@@ -1,4 +1,5 @@
-"""The recordings of a fleet: found below folders, each of a vehicle, and to be checked by itself."""
+"""The recordings of a fleet: found below folders, each of a vehicle, or of a calibration that a data set claims, and to be
+checked by itself."""
 
 from __future__ import annotations
 
@@ -29,6 +30,7 @@ STORES = (".mcap", ".db3")  # a bag that is one file
 OTHERS = (".bag",)  # ROS 1: reported with what to do
 VEHICLE = "vehicle"  # the named group of a pattern
 UNKNOWN = "unknown"
+DIGITS = 9  # of numbers in files, which copies round
 
 
 @dataclass(frozen=True)
@@ -167,9 +169,6 @@ def _by_folder(paths: list[str]) -> list[str]:
         names = [""]
     named = dict(zip(distinct, names, strict=True))
     return [named[parent].strip("/") or UNKNOWN for parent in parents]
-
-
-DIGITS = 9  # of numbers in files, which copies round
 
 
 def find_claims(sources: Sequence[str], options: CheckOptions, count: int = FRAMES) -> list[Recording]:

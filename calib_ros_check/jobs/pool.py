@@ -33,6 +33,20 @@ Answer = dict[str, Any]  # what a job found, as JSON has it: numbers, texts, lis
 NAME = "results.jsonl"
 BEGINNING = b'{"about":'  # of every journal
 SHOWN = 60  # characters of a value in an error
+Group: TypeAlias = Sequence[Any]  # jobs that share work, see Journal
+RunJobs: TypeAlias = Callable[[Any], list[Answer]]  # the answers of a group, one per job, in its order; picklable
+Results: TypeAlias = Generator[tuple[Group, list[Answer] | str], None, None]  # answers of groups, or how their workers ended
+ADDRESS = re.compile(r"([a-z]+://)?[^/\s]+:\d{1,5}")  # a client that was given another one waits in vain
+CONNECT_S, WITHOUT_WORKERS_S, LOOK_S, POLL_S = 8.0, 60.0, 1.0, 0.02
+# A job that ends its worker ends no other, and workers leave Ctrl-C to this process.
+LOCAL = {
+    "distributed.scheduler.allowed-failures": 0,
+    # Dask's own value for MALLOC_TRIM_THRESHOLD_ besides would cost a third of the CPU time: images are allocated all the time.
+    "distributed.nanny.pre-spawn-environ": dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), 1),
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
+}
+HANG_S = 1800.0  # for one job: checks and trials take seconds, with large models minutes
+GOES_ON = "the same command goes on where it stopped"
 
 
 class Journal:
@@ -130,22 +144,6 @@ def _difference(before: Any, now: Any, name: str = "") -> str:
         return next(filter(None, inner), "")
     was, new = (text if len(text) <= SHOWN else f"{text[:SHOWN]}..." for text in map(json.dumps, (before, now)))
     return "" if before == now else f"{name} was {was}, is now {new}"
-
-
-Group: TypeAlias = Sequence[Any]  # jobs that share work, see Journal
-RunJobs: TypeAlias = Callable[[Any], list[Answer]]  # the answers of a group, one per job, in its order; picklable
-Results: TypeAlias = Generator[tuple[Group, list[Answer] | str], None, None]  # answers of groups, or how their workers ended
-ADDRESS = re.compile(r"([a-z]+://)?[^/\s]+:\d{1,5}")  # a client that was given another one waits in vain
-CONNECT_S, WITHOUT_WORKERS_S, LOOK_S, POLL_S = 8.0, 60.0, 1.0, 0.02
-# A job that ends its worker ends no other, and workers leave Ctrl-C to this process.
-LOCAL = {
-    "distributed.scheduler.allowed-failures": 0,
-    # Dask's own value for MALLOC_TRIM_THRESHOLD_ besides would cost a third of the CPU time: images are allocated all the time.
-    "distributed.nanny.pre-spawn-environ": dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), 1),
-    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
-}
-HANG_S = 1800.0  # for one job: checks and trials take seconds, with large models minutes
-GOES_ON = "the same command goes on where it stopped"
 
 
 def run(

@@ -27,6 +27,8 @@ from calib_ros_check.recording import FRAMES, REFERENCE, TF, CheckOptions
 from calib_ros_check.tolerance import INTERVAL, MORE_FRAMES, Judgement, judge, unknown
 
 CLAIMED_S = 0.005  # standard deviation of a claimed offset of clocks: what drivers leave
+PASS, FAIL, INCONCLUSIVE = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE
+OF_ONE_PAIR = ("camera", "image_topic", "points_topic", "camera_info_topic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +106,6 @@ def _after(before: RigSolution, found: RigHypothesis) -> RigSolution:
     poses = {name: D @ T if name in moves else T for name, T in before.poses.items()}
     covariance: Matrix = before.covariance + share @ found.covariance @ share.T
     return replace(before, poses=poses, covariance=covariance)
-
-
-PASS, FAIL, INCONCLUSIVE = CheckVerdict.PASS, CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE
-OF_ONE_PAIR = ("camera", "image_topic", "points_topic", "camera_info_topic")
 
 
 @dataclass(frozen=True, eq=False)

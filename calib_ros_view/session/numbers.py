@@ -1,4 +1,5 @@
-"""The numbers beside a picture: scores around an extrinsic, frame by frame, and what the scenes know of it.
+"""The numbers beside a picture, and their plots: the six that move an extrinsic, scores around it, frame by frame, and what the
+scenes know of it.
 
 All of it is of the edges alone, which are extracted once per frame; an extrinsic that is moved by hand costs a few ten thousand
 projections, not new edges.
@@ -31,6 +32,20 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 
 STEP_DEG, STEP_CM, LARGE = 0.05, 1.0, 10  # of a key, and with shift so many times as far
+CURVE_DEG, CURVE_M, SAMPLES = 2.0, 0.3, 41  # half widths of the curves, and scores along each
+POINTS = 40_000  # edge points that tell a curve; more take longer and change nothing
+REACH = np.array([np.deg2rad(2.0)] * 3 + [0.3] * 3)  # rad, m; how far the optimum is sought: what a hand has left
+UNKNOWN_DEG, UNKNOWN_M = 0.5, 0.1  # standard deviations from which a direction counts as not shown, as the tolerances of a check
+ELLIPSE_POINTS = 64
+PROBABILITY = 0.95  # inside an ellipse
+# Axes of the twist that compensate each other, and are looked at together: a rotation moves points as a shift does.
+PAIRS = ((1, 3), (0, 4), (2, 5))
+WIDTH, HEIGHT, MARGIN = 200, 96, 16  # px of one plot
+BAR_WIDTH, BARS = 300, 46  # px of the bars of all frames
+SIDE = 140  # px of an ellipse's plot
+LEAST_DEG, LEAST_CM = 0.1, 1.0  # half widths of an ellipse's plot, at least
+AROUND = 1.25  # of the ellipse and the cross
+FLAT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -82,16 +97,6 @@ def step_of(key: str, shift: bool) -> tuple[int, float] | None:
             if own in (key, key.lower()):  # shift makes letters capital
                 return k, sign * (STEP_DEG if axis.unit == "deg" else STEP_CM) * (LARGE if shift else 1)
     return None
-
-
-CURVE_DEG, CURVE_M, SAMPLES = 2.0, 0.3, 41  # half widths of the curves, and scores along each
-POINTS = 40_000  # edge points that tell a curve; more take longer and change nothing
-REACH = np.array([np.deg2rad(2.0)] * 3 + [0.3] * 3)  # rad, m; how far the optimum is sought: what a hand has left
-UNKNOWN_DEG, UNKNOWN_M = 0.5, 0.1  # standard deviations from which a direction counts as not shown, as the tolerances of a check
-ELLIPSE_POINTS = 64
-PROBABILITY = 0.95  # inside an ellipse
-# Axes of the twist that compensate each other, and are looked at together: a rotation moves points as a shift does.
-PAIRS = ((1, 3), (0, 4), (2, 5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,14 +206,6 @@ def ellipse(covariance: Matrix, pair: tuple[int, int]) -> Matrix:
     turn = np.linspace(0, 2 * np.pi, ELLIPSE_POINTS)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     return np.asarray(circle * np.sqrt(chi2.ppf(PROBABILITY, 2) * np.maximum(values, 0)) @ vectors.T)
-
-
-WIDTH, HEIGHT, MARGIN = 200, 96, 16  # px of one plot
-BAR_WIDTH, BARS = 300, 46  # px of the bars of all frames
-SIDE = 140  # px of an ellipse's plot
-LEAST_DEG, LEAST_CM = 0.1, 1.0  # half widths of an ellipse's plot, at least
-AROUND = 1.25  # of the ellipse and the cross
-FLAT = 1e-12
 
 
 def curve_plots(numbers: Numbers) -> str:

@@ -1,4 +1,4 @@
-"""The picture of a frame with the point cloud over it, drawn anew for every extrinsic."""
+"""The picture of a frame with the point cloud over it, and the cloud in its colours, drawn anew for every extrinsic."""
 
 from __future__ import annotations
 
@@ -44,6 +44,11 @@ GAP = 6  # px between two pictures
 MOST_SIZE, WIDEST, NARROWEST = 9, 2600, 64  # px: a point, the picture
 QUALITY = 85  # of JPEG
 CANNY = (60.0, 150.0)  # thresholds of the edges that are shown, which are those of people
+CELLS_ACROSS = 320  # of the depth buffer over the image's width; wider than the gaps between rings would let points shine through
+BEHIND = 1.05  # times the least depth of a cell, and BEHIND_M more, from which a point is hidden
+BEHIND_M = 0.5
+UNSEEN = (110, 110, 110)  # RGB of points that the camera does not see
+MOST_POINTS = 60_000  # that a phone still turns smoothly
 
 
 @dataclass(frozen=True)
@@ -244,13 +249,6 @@ def _draw(picture: Image, uv: NDArray[np.int32], colors: Image, size: int, opaci
             top[v, u] = colors
     if opacity < 1:
         cv2.addWeighted(top, opacity, picture, 1 - opacity, 0, dst=picture)
-
-
-CELLS_ACROSS = 320  # of the depth buffer over the image's width; wider than the gaps between rings would let points shine through
-BEHIND = 1.05  # times the least depth of a cell, and BEHIND_M more, from which a point is hidden
-BEHIND_M = 0.5
-UNSEEN = (110, 110, 110)  # RGB of points that the camera does not see
-MOST_POINTS = 60_000  # that a phone still turns smoothly
 
 
 def colored_cloud(

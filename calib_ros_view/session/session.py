@@ -37,6 +37,8 @@ MOST_UNDO = 200
 MOST_TIME_OFFSET_S = 0.2
 MOST = np.repeat([180.0, 10_000.0], 3)  # deg, cm; how far from the start an extrinsic is moved
 BY_HAND = "set by hand"
+SEARCH_DEG, SEARCH_M = 10.0, 0.5  # half widths of "search around here"
+REFINE, SEARCH, CHECK = "refine", "search", "check"
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,10 +245,6 @@ class Session:
     def error(self) -> tuple[float, float] | None:
         """Rotation, deg, and translation, m, from the source's reference; None if it has none."""
         return None if self.reference is None else se3.error(self.reference, self._state.T)
-
-
-SEARCH_DEG, SEARCH_M = 10.0, 0.5  # half widths of "search around here"
-REFINE, SEARCH, CHECK = "refine", "search", "check"
 
 
 class StoppedError(Exception):

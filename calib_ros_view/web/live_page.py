@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 from nicegui import run, ui
 from nicegui.events import GenericEventArguments, KeyEventArguments
 
-from calib_ros.arrays import Matrix
 from calib_ros_check.rig import shown as html
 from calib_ros_view.session.live import HOUR, Event, Pair, Presence, moment_of
 from calib_ros_view.session.rig_session import RigSession
@@ -344,18 +343,16 @@ class PairPart:
             strip = history.strip(since, now)
             if now >= self._charts_due:
                 self._charts_due = now + CHARTS_S
-                poses, measures = history.poses(since, self._relative_to()), history.measures.rows(since, 300)
+                newest = None if history.state is None else history.state.result.T_camera_lidar
+                chosen = {"newest": newest, "moment": history.pose_at(self._moment)}  # else the first one heard
+                poses, measures = history.poses(since, chosen.get(self._reference)), history.measures.rows(since, 300)
                 for chart, made in zip(self._charts, words.charts(poses, measures, since, now), strict=True):
                     chart.options.clear()
                     chart.options.update(made)
                     chart.update()
         self._from, self._to = since, now
-        self._badge.text, self._usable.text, self._words.text, self._reason.text = (
-            said.badge,
-            said.usable,
-            said.words,
-            said.reason,
-        )
+        self._badge.text, self._usable.text = said.badge, said.usable
+        self._words.text, self._reason.text = said.words, said.reason
         self._advice.text = f"To do: {said.advice}" if said.advice else ""
         self._badge.style(f"background: {said.colour}")
         self._strip.style(f"background-image: {words.strip_css(strip, since, now)}")
@@ -365,13 +362,6 @@ class PairPart:
             self._events.content = "".join(map(words.event_html, events)) or '<p class="soft">nothing yet</p>'
         self._update_answers()
         self._update_pictures(now)
-
-    def _relative_to(self) -> Matrix | None:
-        """T_camera_lidar (4, 4) that the charts are relative to; None = the first one heard."""
-        history = self._watch.history
-        if self._reference == "newest":
-            return None if history.state is None else history.state.result.T_camera_lidar
-        return history.pose_at(self._moment) if self._reference == "moment" else None
 
     def _update_answers(self) -> None:
         busy, answers, progress = self._watch.busy, dict(self._watch.answers), self._watch.progress

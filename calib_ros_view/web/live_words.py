@@ -25,32 +25,8 @@ if TYPE_CHECKING:
     from calib_ros_msgs.srv import Check
 
 LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
-
-
-@dataclass(frozen=True)
-class Action:
-    """A service with a button. question: asked before it is called."""
-
-    service: str
-    key: str
-    label: str
-    icon: str
-    question: str = ""
-
-
-ACTIONS = (
-    Action(CALIBRATE, "c", "Calibrate", "my_location", "Search and estimate now? An accepted estimate replaces the extrinsic."),
-    Action(CHECK, "k", "Check", "fact_check"),
-    Action(SAVE, "s", "Save", "save", "Write the state file, from which the node starts next time?"),
-    Action(CAPTURE, "p", "Capture", "inventory_2", "Write the raw frames of the newest keyframes as a bag on the node's disk?"),
-    Action(RESET, "r", "Reset", "restart_alt", "Forget all keyframes, and go back to the initial extrinsic?"),
-)  # fmt: skip
 SHARED = {"d, t": "dark or light", "?": "these keys"}
 KEYS_OF_RIG = {"n / p": "next / previous moment of a recording", **SHARED}
-KEYS_OF_PAIR = {action.key: f"{action.label}: ~/{action.service}" for action in ACTIONS} | {
-    "g": "draw the keyframes anew", "o": "overlay on or off", "1 2 3": "the last 5 min, 15 min, hour",
-    "Enter, Esc": "yes or no to a question", "Esc": "stop the calibration", **SHARED,
-}  # fmt: skip
 CSS = """
 .live { display: grid; gap: .6rem; align-items: start; padding: .6rem; width: 100%; max-width: 1500px; margin: 0 auto;
   grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); overflow-wrap: anywhere; }
@@ -79,6 +55,40 @@ FIGURES = {
     "estimates accepted": "estimates accepted", "age of the last estimate, s": "last estimate, s ago",
     "images per s": "images/s", "clouds per s": "clouds/s", "pairs per s": "pairs/s",
     "pairs dropped by a busy worker": "pairs dropped", "CPU, share of a core": "CPU, of a core",
+}  # fmt: skip
+Options = dict[str, Any]
+X, Y, Z = "#e5534b", "#2ea043", "#4a90e2"
+GREY, RULE = "#8b949e", "rgba(139,148,158,0.22)"
+AMBER, VIOLET = "#d29922", "#a371f7"
+COLOURS = {
+    "converged": "#2ea043", "tentative": "#4a90e2", "initial": "#8b949e", "refused": "#d29922", "insufficient": "#d29922",
+    "suspect": "#e8912d", "moved": "#e5534b", "blinded": "#b62324", "gone": "rgba(139,148,158,0.35)",
+}  # fmt: skip
+SMALLEST_P = 1e-6
+CLOCK = {"hour": "{HH}:{mm}", "minute": "{HH}:{mm}", "second": "{HH}:{mm}:{ss}"}
+
+
+@dataclass(frozen=True)
+class Action:
+    """A service with a button. question: asked before it is called."""
+
+    service: str
+    key: str
+    label: str
+    icon: str
+    question: str = ""
+
+
+ACTIONS = (
+    Action(CALIBRATE, "c", "Calibrate", "my_location", "Search and estimate now? An accepted estimate replaces the extrinsic."),
+    Action(CHECK, "k", "Check", "fact_check"),
+    Action(SAVE, "s", "Save", "save", "Write the state file, from which the node starts next time?"),
+    Action(CAPTURE, "p", "Capture", "inventory_2", "Write the raw frames of the newest keyframes as a bag on the node's disk?"),
+    Action(RESET, "r", "Reset", "restart_alt", "Forget all keyframes, and go back to the initial extrinsic?"),
+)  # fmt: skip
+KEYS_OF_PAIR = {action.key: f"{action.label}: ~/{action.service}" for action in ACTIONS} | {
+    "g": "draw the keyframes anew", "o": "overlay on or off", "1 2 3": "the last 5 min, 15 min, hour",
+    "Enter, Esc": "yes or no to a question", "Esc": "stop the calibration", **SHARED,
 }  # fmt: skip
 
 
@@ -203,18 +213,6 @@ def ago(seconds: float) -> str:
 
 def _number(value: float, decimals: int) -> str:
     return f"{value:.{decimals}f}" if math.isfinite(value) else "none"
-
-
-Options = dict[str, Any]
-X, Y, Z = "#e5534b", "#2ea043", "#4a90e2"
-GREY, RULE = "#8b949e", "rgba(139,148,158,0.22)"
-AMBER, VIOLET = "#d29922", "#a371f7"
-COLOURS = {
-    "converged": "#2ea043", "tentative": "#4a90e2", "initial": "#8b949e", "refused": "#d29922", "insufficient": "#d29922",
-    "suspect": "#e8912d", "moved": "#e5534b", "blinded": "#b62324", "gone": "rgba(139,148,158,0.35)",
-}  # fmt: skip
-SMALLEST_P = 1e-6
-CLOCK = {"hour": "{HH}:{mm}", "minute": "{HH}:{mm}", "second": "{HH}:{mm}:{ss}"}
 
 
 def charts(poses: Matrix, measures: Matrix, since: float, now: float) -> list[Options]:

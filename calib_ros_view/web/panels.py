@@ -1,5 +1,5 @@
-"""What is computed when the extrinsic rests, and only while it is looked at: numbers, the contact sheet of all frames, and the
-cloud in three dimensions."""
+"""Parts of the pages: the picture of a source with its controls, and what is computed when the extrinsic rests and only while it
+is looked at: numbers, the contact sheet of all frames, clouds in three dimensions."""
 
 from __future__ import annotations
 
@@ -58,6 +58,11 @@ STEPS = (
     ("zoom_in", "come near", (0.0, 0.0), 0.0, 0.75),
     ("zoom_out", "go away", (0.0, 0.0), 0.0, 1.33),
 )
+WIDEST, LARGE = 1920, 1600  # px of the picture, and from where points of 2 px are too small to see
+ZOOM, LEAST_WINDOW = 1.6, 0.02  # per step, and the smallest part of the image
+PAN = 0.25  # per step, of the part that is shown
+# Where the wheel turned, as shares of the picture, and which way.
+WHEEL = "(e) => emit(e.offsetX / e.target.clientWidth, e.offsetY / e.target.clientHeight, e.deltaY)"
 
 
 class NumberPanel:
@@ -275,13 +280,6 @@ def _colored_clouds(
 def _rounded(values: NDArray[np.floating]) -> list[list[float]]:
     """To a thousandth: they go over the wire as text."""
     return np.asarray(np.round(values.astype(float), 3)).tolist()  # type: ignore[no-any-return]
-
-
-WIDEST, LARGE = 1920, 1600  # px of the picture, and from where points of 2 px are too small to see
-ZOOM, LEAST_WINDOW = 1.6, 0.02  # per step, and the smallest part of the image
-PAN = 0.25  # per step, of the part that is shown
-# Where the wheel turned, as shares of the picture, and which way.
-WHEEL = "(e) => emit(e.offsetX / e.target.clientWidth, e.offsetY / e.target.clientHeight, e.deltaY)"
 
 
 class Viewer:

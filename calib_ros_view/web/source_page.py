@@ -61,7 +61,14 @@ class SourcePage:
         self._do = {key: do for _, _, dos in commands for key, do in dos.items()} | {"t": switch, "?": self._keys.open}
         with ui.element("div").classes("w-full flex flex-col lg:flex-row flex-nowrap gap-2 p-2"):
             with ui.element("div").classes("grow min-w-0 flex flex-col flex-nowrap gap-2").style("flex-basis: 0"):
-                self._viewer()
+                self._view.build_picture()
+                with ui.element("div").classes("card p-2 flex flex-col gap-1"):
+                    self._words = ui.label().classes("figures").mark("position")
+                    with ui.row().classes("items-center gap-2 w-full"):
+                        self._bar = ui.linear_progress(0.0, show_value=False, size="6px").classes("grow")
+                        self._bar.visible = False
+                    self._message = ui.label().classes("soft").mark("message")
+                self._view.build_controls()
             with ui.element("div").classes("w-full shrink-0").style("flex: 0 0 min(100%, 27rem)"):
                 self._panels()
         ui.keyboard(on_key=self._key, ignore=["input", "select", "textarea"])
@@ -91,16 +98,6 @@ class SourcePage:
         with ui.button("Copy", icon="content_copy").props("dense no-caps flat"), ui.menu():
             for form, title in FORMATS.items():
                 ui.menu_item(title, on_click=lambda form=form: self._tell(partial(self._copy, form)))
-
-    def _viewer(self) -> None:
-        self._view.build_picture()
-        with ui.element("div").classes("card p-2 flex flex-col gap-1"):
-            self._words = ui.label().classes("figures").mark("position")
-            with ui.row().classes("items-center gap-2 w-full"):
-                self._bar = ui.linear_progress(0.0, show_value=False, size="6px").classes("grow")
-                self._bar.visible = False
-            self._message = ui.label().classes("soft").mark("message")
-        self._view.build_controls()
 
     def _panels(self) -> None:
         with ui.tabs(on_change=lambda e: self._chosen(e.value)).props("dense no-caps inline-label") as tabs:
@@ -176,7 +173,11 @@ class SourcePage:
         }
         return [
             ("n / p", "next / previous frame", {"n": partial(self._go, 1), "p": partial(self._go, -1)}),
-            ("x", "leave this frame out, or take it back in", {"x": self._leave_or_take}),
+            (
+                "x",
+                "leave this frame out, or take it back in",
+                {"x": lambda: self._leave(self._frame, self._frame not in session.state.left_out)},
+            ),
             ("z / y", "undo / redo", {"z": session.undo, "y": session.redo}),
             ("Enter", "refine from here", {"Enter": partial(self._begin, REFINE)}),
             ("h", "search around here", {"h": partial(self._begin, SEARCH)}),
@@ -194,9 +195,6 @@ class SourcePage:
             ("b", "now, side by side, blended with before", {"b": view.compare_next}),
             ("g", "LiDAR edges on or off", {"g": view.switch_edges}),
         ]
-
-    def _leave_or_take(self) -> None:
-        self._leave(self._frame, self._frame not in self._session.state.left_out)
 
     def _leave(self, frame: int, left: bool) -> None:
         self._tell(lambda: self._session.leave_out(frame, left))

@@ -24,8 +24,7 @@ from calib_ros import se3
 from calib_ros.cli.main import main
 from calib_ros.config import MotionConfig
 from calib_ros.lidar.deskew import deskewed_frame
-from calib_ros_check.fleet.certificates import Certificate, certificate_of
-from calib_ros_check.fleet.history import row_of, vehicles
+from calib_ros_check.fleet.history import Certificate, certificate_of, row_of, vehicles
 from calib_ros_check.fleet.recordings import find_claims
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.recording import CheckOptions

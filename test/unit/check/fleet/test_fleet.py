@@ -14,9 +14,8 @@ from calib_ros.config import Config, update
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros_check.fleet import check as module
-from calib_ros_check.fleet.check import check_fleet
+from calib_ros_check.fleet.check import check_fleet, options_key, run_checks
 from calib_ros_check.fleet.fleet import FleetOptions
-from calib_ros_check.fleet.jobs import options_key, run_checks
 from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.recording import CheckOptions
