@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import cv2
@@ -15,6 +15,7 @@ from calib_ros import extensions, se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera, Rectifier, across_meridians
 from calib_ros.config import Config
+from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import EdgeLevel, edge_levels
@@ -103,11 +104,14 @@ def scan_key(frame: Frame) -> ScanKey | None:
 
 class FeatureExtractor:
     """Turns frames of one camera into features; look-up tables for the lens are made once. scans: shared with the extractors of
-    other cameras beside the same LiDAR, whose scans are then searched once."""
+    other cameras beside the same LiDAR, whose scans are then searched once. pictures: the newest edge maps, shared with the
+    extractors of the same camera beside other LiDARs."""
 
-    def __init__(self, camera: Camera, config: Config | None = None, scans: ScanEdges | None = None) -> None:
+    def __init__(
+        self, camera: Camera, config: Config | None = None, scans: ScanEdges | None = None, pictures: Recent | None = None
+    ) -> None:
         self.config = config or Config()
-        self.scans = scans
+        self.scans, self._pictures = scans, pictures
         self.source_camera = camera
         self._other = other_objective(self.config)
         self._rectify = Rectifier(camera, rectified_camera(camera, self.config))
@@ -157,7 +161,7 @@ class FeatureExtractor:
         still, reflectivity, edges = self._scan_edges(frame, twist)
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
         points = deskewed_edges(edges, still, self.config.motion)
-        levels = self._levels(image, points) if plain is None else plain.levels
+        levels = self._levels(image, points, of=frame) if plain is None else plain.levels
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
         facts = (self.camera, frame.stamp, frame.name, reflectivity, twist, by_azimuth)
         features = FrameFeatures(points, levels, *facts)
@@ -181,10 +185,19 @@ class FeatureExtractor:
             self.scans[key] = found
         return still, *found
 
-    def _levels(self, image: NDArray[np.uint8], points: EdgePoints, semantic: Map | None = None) -> list[EdgeLevel]:
-        """Edge maps of a working image, no sharper than the scanner's edges are placed: evenly within a step."""
+    def _levels(
+        self, image: NDArray[np.uint8], points: EdgePoints, semantic: Map | None = None, of: Frame | None = None
+    ) -> list[EdgeLevel]:
+        """Edge maps of a working image, no sharper than the scanner's edges are placed: evenly within a step. of: the frame whose
+        maps other pairs of the camera may have made."""
         blunt = points.azimuth_step / np.sqrt(12)
-        return edge_levels(image, float(self.camera.K[0, 0]), semantic, EDGE_SHARE, self.used, self.across, blunt)
+        focal = float(self.camera.K[0, 0])
+        make = partial(edge_levels, image, focal, semantic, EDGE_SHARE, self.used, self.across, blunt)
+        if of is None or self._pictures is None:
+            return make()
+        own = self.source_camera
+        lens = own.model, own.K.tobytes(), own.D.tobytes(), own.said_rectified
+        return self._pictures((of.stamp, of.image[::KEY_STEP].tobytes(), self.config.image, lens, blunt), make)
 
     def seen_anew(self, features: FrameFeatures, image: NDArray[np.uint8]) -> FrameFeatures:
         """Features of the same scan, had this camera taken the image; without semantics."""
