@@ -19,7 +19,7 @@ from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
-from calib_ros.datasets.positions import spread_positions
+from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import CENTRE

@@ -12,8 +12,8 @@ from typing import Any
 
 from calib_ros.cli.inputs import configuration
 from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
-from calib_ros.datasets.positions import selected
 from calib_ros.datasets.rig import is_folder_rig
+from calib_ros.datasets.source import selected
 from calib_ros.errors import BadInputError
 from calib_ros.result import VERSION
 from calib_ros.rig.description import read_rig

@@ -13,8 +13,7 @@ from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.capture import RESULT, capture_config, is_capture
 from calib_ros.datasets.open import is_bag
-from calib_ros.datasets.positions import frame_positions, spread_positions
-from calib_ros.datasets.source import Source, WithMotion
+from calib_ros.datasets.source import Source, WithMotion, frame_positions, spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.online.clocks import with_clocks

@@ -16,7 +16,7 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.config import Config
-from calib_ros.datasets.positions import spread_positions
+from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.io import check_output

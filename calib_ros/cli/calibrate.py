@@ -15,8 +15,7 @@ from calib_ros.arrays import Transform
 from calib_ros.cli.inputs import initial_extrinsic, require_classes, search_box
 from calib_ros.cli.output import motion, note, progress_bar
 from calib_ros.config import Config, update
-from calib_ros.datasets.positions import frame_positions
-from calib_ros.datasets.source import Source, WithMotion, neighbours
+from calib_ros.datasets.source import Source, WithMotion, frame_positions, neighbours
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.io import check_output

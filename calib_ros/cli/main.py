@@ -165,8 +165,8 @@ def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import open_named_source
     from calib_ros.cli.output import progress_bar
     from calib_ros.datasets.bag_writer import write_bag
-    from calib_ros.datasets.positions import frame_positions
     from calib_ros.datasets.rig import named_rig
+    from calib_ros.datasets.source import frame_positions
 
     rig = named_rig(args.source) if args.camera is None else None
     if rig is not None:

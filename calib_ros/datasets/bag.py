@@ -27,9 +27,8 @@ from calib_ros.datasets.bag_index import (
 )  # fmt: skip
 from calib_ros.datasets.bag_topics import COMPRESSED, choose_camera_info, choose_image, choose_points, is_rectified
 from calib_ros.datasets.bag_video import KEY_FRAMES, BagVideo
-from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.recent import Recent
-from calib_ros.datasets.source import describe_camera
+from calib_ros.datasets.source import describe_camera, spread_positions
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.sweep import BLIND_CLOUDS, SweepOffset

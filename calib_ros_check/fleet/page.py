@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib_ros.arrays import Matrix
-from calib_ros.datasets.positions import spread_positions
+from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import CalibrationError
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
 from calib_ros_check.fleet.history import ERROR, VERDICTS, Certificate, Row, Vehicle, VehicleChange

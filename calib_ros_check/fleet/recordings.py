@@ -21,8 +21,7 @@ from calib_ros.datasets.kitti import drives_in, layout_name
 from calib_ros.datasets.nuscenes import NuScenesSource
 from calib_ros.datasets.once import is_once
 from calib_ros.datasets.open import is_nuscenes, is_single
-from calib_ros.datasets.positions import spread_positions
-from calib_ros.datasets.source import Source
+from calib_ros.datasets.source import Source, spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.recording import FRAMES, CheckOptions, opened
 

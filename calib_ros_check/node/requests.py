@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
-from calib_ros.datasets.positions import spread_positions
+from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator

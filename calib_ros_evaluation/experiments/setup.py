@@ -23,8 +23,7 @@ import calib_ros_synthetic
 import calib_ros_thesis
 from calib_ros.config import Config
 from calib_ros.datasets import Source, open_dataset
-from calib_ros.datasets.positions import frame_positions
-from calib_ros.datasets.source import WithMotion
+from calib_ros.datasets.source import WithMotion, frame_positions
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame
 from calib_ros_check.checker import Checker

@@ -16,7 +16,7 @@ from paths import FORMER_VERSION, ROOT
 from calib_ros import io, se3
 from calib_ros.camera import Camera
 from calib_ros.cli.output import summary
-from calib_ros.datasets.positions import frame_positions
+from calib_ros.datasets.source import frame_positions
 from calib_ros.errors import BadInputError
 from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.io import write_atomically

@@ -18,7 +18,7 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig, Config
-from calib_ros.datasets.positions import spread_positions
+from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.intrinsics import FOCAL
 from calib_ros.registration.features import FrameFeatures, at_time_offset
