@@ -51,6 +51,9 @@ class NodeService:
     def check(self) -> None:
         """To be called about once a second while it is active."""
 
+    def again(self) -> None:
+        """To be called every publish_period_s while it is active."""
+
     def pause(self) -> None:
         """It is not active any more; what has been found stays."""
 

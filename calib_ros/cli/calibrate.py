@@ -160,7 +160,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
                 "frame": frame.name,
                 "frame_stamp": frame.stamp,
                 "estimated": estimated,
-                "keyframes": len(recalibrator.buffer),
+                "keyframes": len(recalibrator.keyframes),
                 "advice": asdict(recalibrator.advice(extrinsic)),
                 "drift": extrinsic.normalised_innovation,
                 **result.to_dict(),

@@ -140,7 +140,7 @@ class BlackBox:
                 self._pending.append(Occasion(kind, used, capture, now + LONGEST_AFTER_S))
 
     def _keyframe(self, stamp: int) -> dict[str, Any]:
-        pipeline, counts = self._pipeline, self._pipeline.synchronizer.counts
+        pipeline, counts = self._pipeline, self._pipeline.pairing.synchronizer.counts
         came: dict[str, Any] = {"images": counts.images, "clouds": counts.clouds, "pairs": counts.pairs}
         if (recalibrator := pipeline.recalibrator) is not None:
             current, newest = recalibrator.current, recalibrator.newest()

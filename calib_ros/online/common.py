@@ -8,6 +8,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,14 @@ from calib_ros.frame import PointCloud
 from calib_ros.lidar.edges import EdgePoints
 from calib_ros.lidar.ego_motion import Motion, estimate_motion
 from calib_ros.online.pacing import Purse
+from calib_ros.online.worker import Worker
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import ScanEdges, ScanKey
 
+PICTURES_KEPT = 4  # of a camera, whose edge maps take as much memory as all the rest of a keyframe: the newest
 SCANS_KEPT = 8  # of a LiDAR: the newest, and those before them that cameras out of step look at
+ROUND_NS = 60_000_000  # between scans of several LiDARs at 10 Hz that were taken at the same time
 POLL_S = 0.1  # between two looks whether who waits for a turn is to stop
 
 
@@ -34,19 +38,17 @@ class Turns:
         self._queue: deque[object] = deque()
 
     @contextmanager
-    def mine(self, check: Callable[[], object] = lambda: None) -> Iterator[bool]:
-        """Context of one's own turn: whether others had theirs before. check: asked now and then while waiting; may raise to give
-        up."""
+    def mine(self, check: Callable[[], object] = lambda: None) -> Iterator[None]:
+        """Context of one's own turn. check: asked now and then while waiting; may raise to give up."""
         ticket = object()
         with self._changed:
             self._queue.append(ticket)
         try:
             with self._changed:
-                waits = self._queue[0] is not ticket
                 while self._queue[0] is not ticket:
                     self._changed.wait(POLL_S)
                     check()
-            yield waits
+            yield
         finally:
             with self._changed:
                 self._queue.remove(ticket)
@@ -85,17 +87,31 @@ class SharedScans:
 
 
 class Common:
-    """Of all pipelines of a rig. scans: of the LiDAR of this one."""
+    """Of all pipelines of a rig."""
 
     def __init__(self, config: OnlineConfig) -> None:
         self.purse = Purse(config)
         self.intake, self.estimates, self.classes = Turns(), Turns(), Turns()
+        self.ingesters: list[Worker[Any]] = []
+        self._round = 0  # stamp, ns
         self._models = Recent(1)
         self._scans: dict[str, SharedScans] = {}
+        self._pictures: dict[str, Recent] = {}
 
     def scans(self, lidar: str) -> SharedScans:
         """Of a LiDAR by its name."""
         return self._scans.setdefault(lidar, SharedScans())
+
+    def pictures(self, camera: str) -> Recent:
+        """Edge maps of a camera's pictures, see `FeatureExtractor`."""
+        return self._pictures.setdefault(camera, Recent(PICTURES_KEPT))
+
+    def joins(self, stamp: int) -> bool:
+        """Whether a pair may be taken in by the stamp of its scan, ns: all take in the same scans, one after the other, and only
+        when all are done with one is the next chosen, by whoever comes first."""
+        if not any(worker.busy for worker in self.ingesters):
+            self._round = stamp
+        return abs(stamp - self._round) <= ROUND_NS
 
     def models(self, config: SemanticsConfig) -> Segmentation:
         """Loaded once; for one at a time."""

@@ -25,7 +25,7 @@ from calib_ros.lidar.deskew import image_times, moved, used_twist
 from calib_ros.online.pacing import is_due
 
 # Between looks, s of the data's stamps, for a knock is to be told within a second: at 10 Hz every fourth frame, at rest every
-# sixth.
+# sixth. Of cameras in step, half as far apart as at rest: then they look at the same scans.
 EVERY_S, REST_EVERY_S = 0.35, 0.55
 KEPT = 50  # looks that tell what is usual: of as many more, one is by chance worse than all of these, in a quarter of a minute
 LEAST_KEPT = 10
@@ -58,7 +58,8 @@ class Glance:
 
     def is_due(self, stamp: int, at_rest: bool = False) -> bool:
         """Whether the last look is long enough ago."""
-        return is_due(self._looked_at, stamp, REST_EVERY_S if at_rest else EVERY_S, self._in_step)
+        every_s = REST_EVERY_S if at_rest else REST_EVERY_S / 2 if self._in_step else EVERY_S
+        return is_due(self._looked_at, stamp, every_s, self._in_step)
 
     def put_off(self, stamp: int) -> None:
         """A keyframe tells more than a look."""

@@ -29,6 +29,7 @@ CLASSES_EVERY_S = 30.0  # of one keyframe
 # At rest estimates are at most so far apart, s: the tracker expects the mount to drift in a minute. Keyframes come so many times
 # as often, from the first distance to the longest, s: within the 5 s in which a displacement is to be told that no look sees.
 LONGEST_REST_S, KEYFRAMES_PER_REST, REST_SPACING_S = 60.0, 6, (2.0, 5.0)
+WAITS_IN_STEP = 5  # times online.rest_period_s, between estimates that others let wait: most of the buffer is new by then
 CLASSES_RESERVE = 0.5  # share of what can be saved up that must be there for classes: keyframes and estimates have the rest
 
 
@@ -208,11 +209,11 @@ class Schedule:
 
     While the extrinsic is at rest less is done, the less, the longer it has been steady: an estimate is worth its time once there
     is as much to go on again as there was, and keyframes only test the extrinsic. config may be replaced at any time. newest:
-    stamp of the newest frame. Stamps are in ns.
+    stamp of the newest frame. in_step: with others, see `is_due`. Stamps are in ns.
     """
 
-    def __init__(self, config: OnlineConfig) -> None:
-        self.config = config
+    def __init__(self, config: OnlineConfig, in_step: bool = False) -> None:
+        self.config, self._in_step = config, in_step
         self.newest: int | None = None
         self._estimated: int | None = None
         self._estimated_before: int | None = None
@@ -249,6 +250,8 @@ class Schedule:
         if self.newest is None or self._estimated is None or (periodic and urgent):
             return True
         wait_s = self.config.rest_period_s if at_rest or waits else 0.0
+        if waits and self._in_step:
+            wait_s *= WAITS_IN_STEP
         if at_rest:
             wait_s = max(wait_s, min(self._steady_by_estimate_s, LONGEST_REST_S))
         elapsed = (self.newest - self._estimated) / NANOSECONDS
@@ -258,4 +261,7 @@ class Schedule:
     def keyframes_at_rest_s(self) -> float:
         """Smallest time between keyframes, s."""
         shortest, longest = REST_SPACING_S
-        return min(max(shortest, self._steady_s / KEYFRAMES_PER_REST), longest)
+        spacing_s = min(max(shortest, self._steady_s / KEYFRAMES_PER_REST), longest)
+        if not self._in_step or spacing_s == longest:
+            return spacing_s
+        return longest / 2 if self._steady_s else longest / 4  # cameras come to rest at different times, and stay in step

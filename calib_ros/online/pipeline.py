@@ -1,6 +1,6 @@
 """From messages to the current extrinsic, on threads, without ROS.
 
-    add_image, add_cloud -> Synchronizer -> [ingest worker: decode, Recalibrator.ingest] -> [estimate worker:
+    add -> Pairing -> [ingest worker: decode, Recalibrator.ingest] -> [estimate worker:
     Recalibrator.estimate] -> events
 
 Callers hand messages over and return at once. One thread decodes pairs and extracts keyframe features, another estimates, a third
@@ -30,7 +30,6 @@ from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inpu
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Work
 from calib_ros.online.pairing.pairing import Intake, Pairing
-from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.requests import ESTIMATE, Pending, Requests
 from calib_ros.online.worker import Worker
@@ -47,21 +46,28 @@ class Pipeline:
 
     sink: called with every event, on the worker threads, and after reset() on the thread that called it. Extrinsics come in
     order: the last one is the current one. camera: intrinsics of the images, None before any. recalibrator: None before the
-    first pair. last_keyframe: the newest keyframe's frame. load: the CPU time of the threads' work, and what it allows for.
-    common: shared with the pipelines of other pairs of a rig. lidar: name of the LiDAR in there.
+    first pair. pairing: of the messages. last_keyframe: the newest keyframe's frame. load: the CPU time of the threads' work, and
+    what it allows for.
+    common: shared with the pipelines of other pairs of a rig. sensors: names of camera and LiDAR in there.
     """
 
     def __init__(
-        self, config: Config, inputs: Inputs, sink: Callable[[Event], None], common: Common | None = None, lidar: str = ""
+        self,
+        config: Config,
+        inputs: Inputs,
+        sink: Callable[[Event], None],
+        common: Common | None = None,
+        sensors: tuple[str, str] = ("", ""),
     ) -> None:
         self.config = config
         self.camera: Camera | None = None
         self.recalibrator: Recalibrator | None = None
         self.last_keyframe: Frame | None = None
-        self._pairing = Pairing(config, inputs.decode_cloud is not None)
+        self.pairing = Pairing(config, inputs.decode_cloud is not None)
         self.speed_gate = SpeedGate(config.online)
         self._common = common or Common(config.online)
-        self._scans = None if common is None else common.scans(lidar)
+        self._scans = None if common is None else common.scans(sensors[1])
+        self._pictures = None if common is None else common.pictures(sensors[0])
         self.load = LoadBudget(config.online, purse=self._common.purse)
         self._inputs = inputs
         self._requests = Requests()
@@ -75,6 +81,7 @@ class Pipeline:
         self._handed = -float("inf")  # when the newest pair was handed over to be ingested
         report = self._remarks.report
         self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, report, on_idle=lambda: sink(IntakeIdle()))
+        self._common.ingesters.append(self._ingester)
         self._estimator: Worker[None] = Worker("calib_estimate", self._do_what_is_due, report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, report, SEMANTICS_NICE)
 
@@ -99,44 +106,32 @@ class Pipeline:
     def _recalibrator_at(self, camera: Camera, initial: Result, current: Result | None = None) -> Recalibrator:
         """A new one; its frames are those of the initial extrinsic."""
         names, gate, models = (initial.camera_frame, initial.lidar_frame), self.speed_gate, self._common.models
-        return Recalibrator(camera, initial, self.config, *names, current, gate, self._scans, models)
-
-    def add_image(self, stamp: int, message: Any) -> None:
-        """An image message, stamp in ns."""
-        self._add(self._pairing.add_image, stamp, message)
-
-    def add_cloud(self, stamp: int, message: Any) -> None:
-        """A cloud message, stamp in ns."""
-        self._add(self._pairing.add_cloud, stamp, message)
-
-    @property
-    def synchronizer(self) -> Synchronizer:
-        """What pairs the messages."""
-        return self._pairing.synchronizer
-
-    @property
-    def clock_difference(self) -> str:
-        """What is said of clocks of other epochs, whose difference is taken out of the clouds' stamps; "" if there is none."""
-        return self._pairing.clocks.describe()
+        return Recalibrator(camera, initial, self.config, *names, current, gate, self._scans, self._pictures, models)
 
     def _hand_over(self, found: list[Intake], stamp: int | None = None) -> None:
         """With the lock held: to the ingest worker, unless it needs none of this stamp, ns, or of that of the scan in a rig."""
         if found and self._scans is not None and stamp is not None:
             stamp = found[-1].cloud_stamp or stamp
-        if found and stamp is not None and self.recalibrator is not None and not self.recalibrator.wants(stamp):
-            self.rested_pairs += len(found)
-            return
+        if found and stamp is not None and self.recalibrator is not None:
+            if not self.recalibrator.wants(stamp):
+                self.rested_pairs += len(found)
+                return
+            if self._scans is not None and not self._common.joins(stamp):
+                self.dropped_pairs += sum(intake.paired for intake in found)
+                return
         if found:
             self._handed = time.monotonic()
         for intake in found:
             self.dropped_pairs += sum(replaced.paired for replaced in self._ingester.put(intake))
 
-    def _add(self, take: Callable[[int, Any], list[Intake]], stamp: int, message: Any) -> None:
+    def add(self, is_image: bool, stamp: int, message: Any) -> None:
+        """An image or a cloud message, stamp in ns."""
         with self._lock:
-            jumps, ahead = self.synchronizer.counts.jumps_back, self._pairing.clocks.ahead
-            self._hand_over(take(stamp, message), stamp)
-            jumped = self.synchronizer.counts.jumps_back > jumps
-            clocks = self.clock_difference if self._pairing.clocks.ahead != ahead else ""
+            counts, clocks_of = self.pairing.synchronizer.counts, self.pairing.clocks
+            jumps, ahead = counts.jumps_back, clocks_of.ahead
+            self._hand_over(self.pairing.add(is_image, stamp, message), stamp)
+            jumped = counts.jumps_back > jumps
+            clocks = clocks_of.describe() if clocks_of.ahead != ahead else ""
         if jumped:
             jump = "time stamps jumped back (a looping bag, or a clock was set back)"
             self._tell(Problem(f"{jump}: messages that waited for a partner were dropped", "stamps"))
@@ -210,7 +205,7 @@ class Pipeline:
             if self.recalibrator is not None:
                 self.recalibrator.configure(config)
                 config = replace(config, motion=self.recalibrator.config.motion)
-            self._hand_over(self._pairing.configure(config))
+            self._hand_over(self.pairing.configure(config))
 
     def read_current(self, reader: Callable[[Extrinsic, int], None], wait: bool = True) -> None:
         """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile. wait:
@@ -264,12 +259,8 @@ class Pipeline:
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
     def _ingest(self, intake: Intake) -> None:
-        with self._common.intake.mine(self._ingester.check_cancelled) as waited, self.load.counting(Work.INTAKE) as begin:
-            newest = self._ingester.newer(intake) if waited else intake
-            if newest is not intake:  # of an older one the scan before, which tells the motion, may be gone
-                with self._lock:
-                    self.dropped_pairs += intake.paired
-            self._take_in(newest, begin)
+        with self._common.intake.mine(self._ingester.check_cancelled), self.load.counting(Work.INTAKE) as begin:
+            self._take_in(intake, begin)
 
     def _take_in(self, intake: Intake, begin: Callable[[Work], None]) -> None:
         if self.paused:
@@ -278,7 +269,7 @@ class Pipeline:
             recalibrator = self._prepare(intake)
         finally:
             with self._lock:
-                self._hand_over(self._pairing.use_stamps())
+                self._hand_over(self.pairing.use_stamps())
         if recalibrator is None:
             return
         pair = intake.image, intake.cloud
@@ -298,10 +289,10 @@ class Pipeline:
             return allowed
 
         frame = self._inputs.decode(*pair, recalibrator.camera)
-        if (ahead := self._pairing.clocks.ahead) and frame.cloud_stamp is not None:
+        if (ahead := self.pairing.clocks.ahead) and frame.cloud_stamp is not None:
             frame = replace(frame, cloud_stamp=frame.cloud_stamp - ahead)
         try:
-            is_keyframe = recalibrator.ingest(frame, lambda since: self._scan_before(frame, since), permit)
+            is_keyframe = recalibrator.ingest(frame, lambda since: self._scan_before(intake, since), permit)
             self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
@@ -331,22 +322,21 @@ class Pipeline:
         recalibrator = self.recalibrator or self._start(camera, *self._inputs.frame_ids(intake.image, intake.cloud))
         if recalibrator is None:
             return None
-        paired_by = self.synchronizer.cloud_offset
-        if self._pairing.sweep.ns is None and self._inputs.decode_cloud is not None:
+        paired_by = self.pairing.synchronizer.cloud_offset
+        if self.pairing.sweep.ns is None and self._inputs.decode_cloud is not None:
             self._learn_sweep(self._inputs.decode_cloud(intake.cloud), recalibrator)
-        return recalibrator if intake.paired and self.synchronizer.cloud_offset == paired_by else None
+        return recalibrator if intake.paired and self.pairing.synchronizer.cloud_offset == paired_by else None
 
     def _learn_sweep(self, cloud: PointCloud, recalibrator: Recalibrator) -> None:
         """From a decoded cloud, in a millisecond: when scans sweep the view of the camera where it is by now."""
-        self._pairing.sweep.add(cloud, recalibrator.camera, recalibrator.tracker.T)
+        self.pairing.sweep.add(cloud, recalibrator.camera, recalibrator.tracker.T)
         with self._lock:
-            self._hand_over(self._pairing.use_sweep())
+            self._hand_over(self.pairing.use_sweep())
 
-    def _scan_before(self, frame: Frame, since: int) -> tuple[int, PointCloud] | None:
-        """The newest scan before a frame's, after `since` (ns), whose pair was dropped by a busy worker, with its stamp."""
-        with self._lock:
-            earlier = self._pairing.newest_cloud_between(since, frame.moment_of_cloud)
-        if self._inputs.decode_cloud is None or earlier is None:
+    def _scan_before(self, intake: Intake, since: int) -> tuple[int, PointCloud] | None:
+        """The newest scan before a pair's, after `since` (ns), that no pair was taken in with, with its stamp."""
+        earlier = intake.before
+        if self._inputs.decode_cloud is None or earlier is None or earlier[0] <= since:
             return None
         try:
             return earlier[0], self._inputs.decode_cloud(earlier[1])
@@ -407,11 +397,11 @@ class Pipeline:
         """Pair by the time offset that the recalibrator has found."""
         with self._lock:
             motion = recalibrator.config.motion
-            if motion != self._pairing.sweep.config and recalibrator is self.recalibrator:
-                self._hand_over(self._pairing.configure(replace(self.config, motion=motion)))
+            if motion != self.pairing.sweep.config and recalibrator is self.recalibrator:
+                self._hand_over(self.pairing.configure(replace(self.config, motion=motion)))
 
     def _keyframes_seen(self) -> int:
-        return 0 if self.recalibrator is None else self.recalibrator.keyframes_seen
+        return 0 if self.recalibrator is None else self.recalibrator.keyframes.seen
 
     def _segment(self, _: None) -> None:
         recalibrator = self.recalibrator

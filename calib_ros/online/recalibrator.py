@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.config import Config, SemanticsConfig
 from calib_ros.config.online import CONTINUOUS
+from calib_ros.datasets.recent import Recent
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.intrinsics import RefinedCamera
 from calib_ros.lidar.ego_motion import estimate_motion, unknown_motion_s
@@ -52,24 +52,11 @@ class Recalibrator:
     `ingest` takes frames, `segment_keyframe` adds semantics to a keyframe, `estimate` estimates from all keyframes. Each of them
     may run on a thread of its own: an estimate works on a copy of the buffer's references.
 
-    Parameters
-    ----------
-    camera : Camera
-        Intrinsics of all frames.
-    initial : (4, 4) array or Result
-        T_camera_lidar to start from, which `reset` goes back to.
-    config : Config, optional
-        All constants; replaced by `configure`.
-    camera_frame, lidar_frame : str
-        Names of the frames, for the results.
-    current : Result, optional
-        The extrinsic to go on with, where it is another than the initial one.
-    speed_gate : SpeedGate, optional
-        One that is fed with odometry from outside.
-    scans : SharedScans, optional
-        What is found out of the LiDAR's scans, shared with the recalibrators of other cameras beside it.
-    models : callable, optional
-        The models of a configuration, which are loaded already where others use them.
+    camera: intrinsics of all frames. initial: T_camera_lidar (4, 4), or a Result, to start from, which `reset` goes back to.
+    config: replaced by `configure`. camera_frame, lidar_frame: names, for the results. current: the extrinsic to go on with,
+    where it is another than the initial one. speed_gate: one that is fed with odometry from outside. scans, pictures: what is
+    found out of those of the LiDAR and of the camera, shared with the recalibrators of other pairs. models: those of a
+    configuration, which are loaded already where others use them.
     """
 
     def __init__(
@@ -82,6 +69,7 @@ class Recalibrator:
         current: Result | None = None,
         speed_gate: SpeedGate | None = None,
         scans: SharedScans | None = None,
+        pictures: Recent | None = None,
         models: Callable[[SemanticsConfig], Segmentation] = models_of,
     ) -> None:
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
@@ -92,7 +80,7 @@ class Recalibrator:
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth()
-        self._scans, self._models = scans, models
+        self._scans, self._pictures, self._models = scans, pictures, models
         in_step = scans is not None
         self.glance, self.selector = Glance(in_step), KeyframeSelector(self.config.online, in_step)
         self.segmentation = models(self.config.semantics)
@@ -102,7 +90,7 @@ class Recalibrator:
             self.config.motion, self.config.lidar.accumulate_s, estimate_motion if scans is None else scans.motion
         )
         self.speed_gate = speed_gate or SpeedGate(self.config.online)
-        self.schedule = Schedule(self.config.online)
+        self.schedule = Schedule(self.config.online, in_step)
         self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
         self._calibrator = self._calibrator_for(self.config)
         self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
@@ -129,17 +117,7 @@ class Recalibrator:
 
     def _calibrator_for(self, config: Config) -> Calibrator:
         edges = None if self._scans is None else self._scans.edges(config.lidar)
-        return Calibrator(self.camera, config, self.segmentation, scans=edges)
-
-    @property
-    def buffer(self) -> deque[FrameFeatures]:
-        """Features of the keyframes, oldest first."""
-        return self.keyframes.features
-
-    @property
-    def keyframes_seen(self) -> int:
-        """Number of keyframes so far."""
-        return self.keyframes.seen
+        return Calibrator(self.camera, config, self.segmentation, scans=edges, pictures=self._pictures)
 
     @property
     def current(self) -> Extrinsic:
@@ -157,15 +135,28 @@ class Recalibrator:
         """True while the extrinsic is steady and every keyframe since the last estimate fits it: less is done then."""
         return self.config.online.rest_period_s > 0 and self.tracker.steady and self._keyframes_fit
 
+    @property
+    def only_tests(self) -> bool:
+        """True while keyframes are needed for tests alone: at rest; and for a camera of a rig, beside which others want the time,
+        while all that come move as those in the last estimate."""
+        return self.at_rest or (self._scans is not None and self._waits_for_motion())
+
+    def _waits_for_motion(self) -> bool:
+        """Whether another estimate would tell nothing new, as long as all new keyframes move as those in the last one."""
+        if not (self.tracker.awaits_motion and self._keyframes_fit):
+            return False
+        keyframes = list(self.keyframes.features)
+        return self._seen_motion.covers(keyframes[max(len(keyframes) - self.keyframes.new, 0) :])
+
     def newest(self) -> FrameFeatures | None:
         """Features of the newest keyframe, None before the first."""
         with self._lock:
-            return self.buffer[-1] if self.buffer else None
+            return self.keyframes.features[-1] if self.keyframes else None
 
     def snapshot(self) -> tuple[list[FrameFeatures], Config, Result]:
         """The keyframes that an estimate would use, oldest first, the configuration of their features, the current extrinsic."""
         with self._lock:
-            return self._informative() or list(self.buffer), self.config, self.current.result
+            return self._informative() or list(self.keyframes.features), self.config, self.current.result
 
     def advice(self, extrinsic: Extrinsic | None = None) -> Advice:
         """What an extrinsic of this recalibrator lacks, None = the current one, and what to do about it."""
@@ -184,16 +175,14 @@ class Recalibrator:
         with self._lock:
             if self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < self.config.online.min_keyframes:
                 return False
-            # Another estimate tells nothing new while all new keyframes move as those in the last one.
-            waits = self.tracker.awaits_motion and self._keyframes_fit
-            waits = waits and self._seen_motion.covers(list(self.buffer)[-self.keyframes.new :])
+            waits = self._waits_for_motion()
             urgent = self.tracker.lost or (self.tracker.tentative and not waits)
             return self.schedule.due(self.at_rest, waits, urgent) and self._has_enough()
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
         left out: an empty road would give a biased one."""
-        keyframes = list(self.buffer)
+        keyframes = list(self.keyframes.features)
         return self.monitor.informative(keyframes, self.tracker.T) if self.tracker.monitored else keyframes
 
     def _has_enough(self) -> bool:
@@ -209,10 +198,12 @@ class Recalibrator:
     # ---- frames -------------------------------------------------------------------------------------------------------
 
     def wants(self, stamp: int) -> bool:
-        """False if a frame of this `_moment`, ns, need not even be decoded: at rest, between two looks, and without any doubt."""
-        if not self.at_rest or self.config.lidar.accumulate_s > 0:
+        """False if a frame of this `_moment`, ns, need not even be decoded: between two looks, at rest and without any doubt. The
+        cameras of a rig look at the same scans, in each of which is searched once for all, at rest or not."""
+        if not (self.at_rest or self._scans is not None) or self.config.lidar.accumulate_s > 0:
             return True
-        return self.glance.struck or self.monitor.in_doubt or self.sensors.faulty_frames > 0 or self.glance.is_due(stamp, True)
+        doubt = self.glance.struck or self.monitor.in_doubt or self.sensors.faulty_frames > 0
+        return doubt or self.glance.is_due(stamp, self.only_tests)
 
     def ingest(
         self, frame: Frame, scan_before: ScanBefore = lambda since: None, permit: Callable[[], bool] = lambda: True
@@ -230,7 +221,7 @@ class Recalibrator:
         if self.first_guess.pending:
             self.first_guess.add(frame)
         self.schedule.add_frame(frame.stamp, self.tracker.steady)
-        spacing_s, moment = self.schedule.keyframes_at_rest_s if self.at_rest else 0.0, self._moment(frame)
+        spacing_s, moment = self.schedule.keyframes_at_rest_s if self.only_tests else 0.0, self._moment(frame)
         if problem is not None or not self.speed_gate.allows(frame):
             return False
         is_keyframe = self.selector.select(frame.image, moment, permit, spacing_s)
@@ -273,7 +264,7 @@ class Recalibrator:
     def _worth_a_test(self, frame: Frame) -> bool:
         """Whether a frame that is no keyframe is to be tested by the monitor: it matches worse than others, or there is doubt."""
         moment = self._moment(frame)
-        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(moment, self.at_rest)):
+        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(moment, self.only_tests)):
             return False
         self.glance.put_off(moment)
         if self.glance.struck or self.monitor.in_doubt or self.tracker.suspect:
@@ -325,7 +316,7 @@ class Recalibrator:
             return
         self.glance.struck = False
         with self._lock:
-            generation, tracker, keyframes = self.keyframes.generation, self.tracker, list(self.buffer)
+            generation, tracker, keyframes = self.keyframes.generation, self.tracker, list(self.keyframes.features)
             if self._restart_monitor or not tracker.monitored or not keyframes:
                 self.monitor.reset()
                 self._restart_monitor = False
@@ -365,7 +356,7 @@ class Recalibrator:
         `Calibrator.calibrate`. After a Cancelled that it raises, everything is as before the estimate.
         """
         with self._lock:
-            batch = self.keyframes.batch(self._informative() or list(self.buffer))
+            batch = self.keyframes.batch(self._informative() or list(self.keyframes.features))
             self.schedule.start_estimate()
             fitted, self._keyframes_fit = self._keyframes_fit, self.config.monitor.enabled  # until one from now on does not
         names, force_search, box = self.tracker.initial, force_search and bool(batch.features), None
@@ -392,14 +383,15 @@ class Recalibrator:
             raise
         result = replace(result, camera_frame=names.camera_frame, lidar_frame=names.lidar_frame)
         extrinsic = self._update_tracker(result, batch, force_search)
-        if self.config.online.mode != CONTINUOUS or self.tracker.steady:
+        # Beside others it is dear: as much as all keyframes take.
+        if self.config.online.mode != CONTINUOUS or self.tracker.steady or self._scans is not None:
             self.calibrator.objectives.free_memory()
         return extrinsic
 
     def _explained(self, result: Result, batch: Batch, box: SearchBox | None, progress: Callback | None) -> Result:
         """The result; where nothing has matched several times, with the cause that was found then, if any."""
         if result.converged:
-            self._forget_cause()
+            self._unmatched, self._mixed_up = 0, None
         if result.refusal not in NO_MATCH:
             return result
         if self._unmatched + 1 == JUDGED_AFTER:
@@ -409,9 +401,6 @@ class Recalibrator:
         if self._mixed_up is None or self._mixed_up.cause is None:
             return result
         return replace(result, cause=self._mixed_up.cause, reason=self._mixed_up.reason)
-
-    def _forget_cause(self) -> None:
-        self._unmatched, self._mixed_up = 0, None
 
     def _search_box(self, rounds: int | None = None) -> SearchBox:
         return SearchBox(self.config.search.rotation_deg, self.config.search.translation_m, rounds)
@@ -497,5 +486,5 @@ class Recalibrator:
         self.keyframes.clear()
         self._restart_monitor = self._in_doubt = True
         self._to_segment = None
-        self._forget_cause()
+        self._unmatched, self._mixed_up = 0, None
         self.selector.reset()

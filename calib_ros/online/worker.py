@@ -60,11 +60,6 @@ class Worker(Generic[Item]):
                 self.busy = False
             return []
 
-    def newer(self, item: Item) -> Item:
-        """For an item that is worked on: the newest that waits, which is taken in its place, or itself."""
-        with self._lock:
-            return self._waiting.pop() if self._waiting else item
-
     def check_cancelled(self, *_: object) -> None:
         """Raise Cancelled after stop(); to be called now and then from within long work."""
         if self.stopping:

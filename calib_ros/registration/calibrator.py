@@ -19,6 +19,7 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.config.sensors import REFINE
+from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import change_between
@@ -41,7 +42,7 @@ from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES,
 from calib_ros.registration.joint import JointSearch
 from calib_ros.registration.judgement.hypotheses import AsTaken
 from calib_ros.registration.judgement.judge import Judge, Question, is_only_off
-from calib_ros.registration.judgement.lens import LensEstimate, estimate_lens, lens_unknowns
+from calib_ros.registration.judgement.lens import LensEstimate, LensUnknown, estimate_lens, lens_unknowns
 from calib_ros.registration.motion_guess.registration import best_registration, from_anything, from_motion
 from calib_ros.registration.objective import Objective, ObjectiveMaker
 from calib_ros.registration.progress import Callback, Progress
@@ -73,6 +74,8 @@ class Calibrator:
         The intrinsics that were stated, where `camera` corrects them: what they leave open is then told by the joint estimate.
     scans : ScanEdges, optional
         Edges of scans by their stamps, shared with the calibrators of other cameras beside the same LiDAR.
+    pictures : Recent, optional
+        Those of pictures, shared with the calibrators of the same camera beside other LiDARs.
     """
 
     def __init__(
@@ -82,10 +85,12 @@ class Calibrator:
         segmentation: Segmentation | None = None,
         given: Camera | None = None,
         scans: ScanEdges | None = None,
+        pictures: Recent | None = None,
     ) -> None:
         self.config = config or Config()
         self._given = given
-        self.extract = FeatureExtractor(camera, self.config, scans)
+        self._unknowns: tuple[Camera, tuple[LensUnknown, ...]] | None = None  # of the lens, by the camera of the features
+        self.extract = FeatureExtractor(camera, self.config, scans, pictures)
         self.segmentation = segmentation or models_of(self.config.semantics)
         self.objectives = ObjectiveMaker(self.config, camera)
         self.judge = Judge(self.objectives, self.config, camera)
@@ -273,7 +278,9 @@ class Calibrator:
     def _lens(self, objective: Objective, T: Transform, inflated: float) -> LensEstimate | None:
         """What the scenes tell of the lens at an optimum (4, 4)."""
         camera, score = self.extract.source_camera, objective.edges.score
-        unknowns = lens_unknowns(self.config.camera, camera, score.camera)
+        if self._unknowns is None or self._unknowns[0] is not score.camera:
+            self._unknowns = score.camera, lens_unknowns(self.config.camera, camera, score.camera)
+        unknowns = self._unknowns[1]
         given = self._given or camera
         centre = np.array([-change_between(given, camera, own.name) / own.unit for own in unknowns])
         return estimate_lens(score, T, objective.constraints.limits, unknowns, inflated, centre)

@@ -15,6 +15,7 @@ from calib_ros import extensions, se3
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera, Rectifier, across_meridians
 from calib_ros.config import Config
+from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import EdgeLevel, edge_levels
@@ -103,11 +104,14 @@ def scan_key(frame: Frame) -> ScanKey | None:
 
 class FeatureExtractor:
     """Turns frames of one camera into features; look-up tables for the lens are made once. scans: shared with the extractors of
-    other cameras beside the same LiDAR, whose scans are then searched once."""
+    other cameras beside the same LiDAR, whose scans are then searched once. pictures: the newest edge maps, shared with the
+    extractors of the same camera beside other LiDARs."""
 
-    def __init__(self, camera: Camera, config: Config | None = None, scans: ScanEdges | None = None) -> None:
+    def __init__(
+        self, camera: Camera, config: Config | None = None, scans: ScanEdges | None = None, pictures: Recent | None = None
+    ) -> None:
         self.config = config or Config()
-        self.scans = scans
+        self.scans, self._pictures = scans, pictures
         self.source_camera = camera
         self._other = other_objective(self.config)
         self._rectify = Rectifier(camera, rectified_camera(camera, self.config))
@@ -157,10 +161,7 @@ class FeatureExtractor:
         still, reflectivity, edges = self._scan_edges(frame, twist)
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
         points = deskewed_edges(edges, still, self.config.motion)
-        if plain is not None:
-            levels = plain.levels
-        else:
-            levels = edge_levels(image, float(self.camera.K[0, 0]), used=self.used, across=self.across)
+        levels = plain.levels if plain is not None else self._levels(frame, image)
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
         facts = (self.camera, frame.stamp, frame.name, reflectivity, twist, by_azimuth)
         features = FrameFeatures(points, levels, *facts)
@@ -168,6 +169,17 @@ class FeatureExtractor:
             sweep_s = self.config.motion.scan_period_s * self.source_camera.field_deg / 720
             features = replace(features, unknown_motion_s=sweep_s)
         return features
+
+    def _levels(self, frame: Frame, image: NDArray[np.uint8]) -> list[EdgeLevel]:
+        """Edge maps of the working image of a frame."""
+
+        def make() -> list[EdgeLevel]:
+            return edge_levels(image, float(self.camera.K[0, 0]), used=self.used, across=self.across)
+
+        own = self.source_camera
+        lens = own.model, own.K.tobytes(), own.D.tobytes(), own.said_rectified
+        key = frame.stamp, frame.image[::KEY_STEP].tobytes(), self.config.image, lens
+        return make() if self._pictures is None else self._pictures(key, make)
 
     def _scan_edges(self, frame: Frame, twist: NDArray[np.float64] | None) -> tuple[Frame, bool, EdgePoints]:
         """A frame as its scan was searched, whether that has reflectivities, and its edges."""

@@ -12,8 +12,6 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from concurrent.futures import Executor
 from contextlib import suppress
 from datetime import datetime, timezone
 from itertools import chain, count
@@ -23,22 +21,19 @@ from typing import Any, NamedTuple
 
 import yaml
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 
 from calib_ros.datasets.capture import BAG, CONFIG, EVENTS, MASK, RESULT
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
-from calib_ros.extensions import NodeService
 from calib_ros.io import ABANDONED_S, flush
 from calib_ros.messages import stamp_ns
 from calib_ros.online.black_box import BlackBox, Occasion
 from calib_ros.online.events import FrameIngested
-from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
 from calib_ros.ros.answers import after_answers, done, serve
 from calib_ros.ros.conversions import Serialized
-from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.interface import PairPart
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.subscriptions import type_name
 
@@ -57,26 +52,15 @@ class RawKeyframe(NamedTuple):
     camera_info: Serialized
 
 
-class Capture(NodeService):
-    """Keeps the raw messages of at most capture_frames keyframes; writes them on ~/capture and for its black box. Thread-safe.
+class Capture(PairPart):
+    """Keeps the raw messages of at most capture_frames keyframes; writes them on ~/capture and for its black box. Thread-safe."""
 
-    parameters: gives the current ones. files: writes them. camera_info: gives the newest CameraInfo message.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        pipeline: Pipeline,
-        parameters: Callable[[], Parameters],
-        health: Health,
-        files: Executor,
-        camera_info: Callable[[], Any],
-    ) -> None:
-        self._node, self._pipeline, self._parameters, self._health, self._files = node, pipeline, parameters, health, files
-        self._camera_info = camera_info
-        self.black_box = BlackBox(pipeline, lambda: parameters()["capture.on"], self._record)
-        self._service = serve(Trigger, "~/capture", node, health, self._answer, MutuallyExclusiveCallbackGroup())
-        self._frames: deque[RawKeyframe] = deque(maxlen=parameters()["capture_frames"])
+    def __init__(self, own: Any) -> None:
+        super().__init__(own)
+        self._files = own.files
+        self.black_box = BlackBox(own.pipeline, lambda: self._parameters["capture.on"], self._record)
+        self._service = serve(Trigger, "~/capture", own.node, own.health, self._answer, MutuallyExclusiveCallbackGroup())
+        self._frames: deque[RawKeyframe] = deque(maxlen=self._parameters["capture_frames"])
         self._lock = threading.Lock()
         if self._frames.maxlen:
             with suppress(MissingDependencyError):  # reported when somebody asks for a capture
@@ -90,7 +74,7 @@ class Capture(NodeService):
         if isinstance(event, FrameIngested) and self.black_box.wants(event):
             self._resize()
             with self._lock:
-                self._frames.append(RawKeyframe(event.image, event.cloud, self._camera_info()))
+                self._frames.append(RawKeyframe(event.image, event.cloud, self._own.sensors.camera_info))
         self.black_box.add(event)
 
     def check(self) -> None:
@@ -125,7 +109,7 @@ class Capture(NodeService):
         response.message, response.success = written.result(), True
 
     def _resize(self) -> None:
-        wanted = self._parameters()["capture_frames"]
+        wanted = self._parameters["capture_frames"]
         with self._lock:
             if self._frames.maxlen != wanted:
                 self._frames = deque(self._frames, maxlen=wanted)
@@ -140,7 +124,7 @@ class Capture(NodeService):
 
         The folder is there when it is whole, or not at all. BadInputError if nothing is kept or it cannot be written.
         """
-        parameters, recalibrator, frames = self._parameters(), self._pipeline.recalibrator, self._kept()
+        parameters, recalibrator, frames = self._parameters, self._pipeline.recalibrator, self._kept()
         if not parameters["capture_dir"] or not parameters["capture_frames"]:
             raise BadInputError(
                 "nothing captured: set the parameters capture_dir to a folder and capture_frames to how many keyframes are to be "
@@ -154,7 +138,7 @@ class Capture(NodeService):
     def write_occasion(self, kind: str, result: Result, events: str) -> str:
         """The same for the black box. The oldest of its captures make room by KEPT and MOST_BYTES; keyframes that do
         not fit, the oldest ones, are left out."""
-        parameters, frames = self._parameters(), self._kept()
+        parameters, frames = self._parameters, self._kept()
         files = _files(parameters, result, events)
         rest = MOST_BYTES - BAG_BYTES - sum(map(len, files.values()))
         while frames and sum(map(_size, frames)) > rest:

@@ -6,6 +6,7 @@ import array
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -29,6 +30,7 @@ from calib_ros.result import Consumer, Extrinsic
 
 # ROS orders covariances of poses translation first; calib_ros has rotation first. The way back is the same.
 _ROS_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+STARVED = "starved: pairs of image and cloud wait for CPU time; give the node a core of its own, or let other work yield (nice)"
 LIVOX_DATATYPES = {"u4": PointField.UINT32, "f4": PointField.FLOAT32, "u1": PointField.UINT8}
 
 
@@ -95,8 +97,14 @@ def transform_message(T: NDArray[np.float64], parent: str, child: str, stamp: in
     msg.header.frame_id, msg.child_frame_id, msg.header.stamp = parent, child, time_message(stamp)
     t, q = msg.transform.translation, msg.transform.rotation
     t.x, t.y, t.z = (float(x) for x in T[:3, 3])
-    q.x, q.y, q.z, q.w = (float(x) for x in se3.quaternion_from_rotation(T[:3, :3]))
+    q.x, q.y, q.z, q.w = _quaternion(T[:3, :3].astype(float).tobytes())
     return msg
+
+
+@lru_cache(128)
+def _quaternion(rotation: bytes) -> tuple[float, ...]:
+    """Of a (3, 3): SciPy takes half a millisecond, and what is published again and again hardly ever changes."""
+    return tuple(map(float, se3.quaternion_from_rotation(np.frombuffer(rotation).reshape(3, 3))))
 
 
 def matrix_from_transform(transform: Any) -> NDArray[np.float64]:

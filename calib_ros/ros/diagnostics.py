@@ -23,7 +23,7 @@ from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
-from calib_ros.ros.publishers import STARVED
+from calib_ros.ros.conversions import STARVED
 
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 SILENCE_S = 5.0  # a topic without messages for this long is reported
@@ -147,7 +147,7 @@ class _Sample(NamedTuple):
 
     @classmethod
     def of(cls, pipeline: Pipeline) -> _Sample:
-        counts, recalibrator = pipeline.synchronizer.counts, pipeline.recalibrator
+        counts, recalibrator = pipeline.pairing.synchronizer.counts, pipeline.recalibrator
         came = counts.images, counts.clouds, counts.pairs, pipeline.dropped_pairs
         left_out = recalibrator.motion.left_out if recalibrator else 0
         return cls(time.monotonic(), *came, *pipeline.busy_seconds(), left_out, pipeline.load.counts())
@@ -162,7 +162,7 @@ class Diagnostics:
 
     def __init__(self, name: str, health: Health, pipeline: Pipeline) -> None:
         self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
-        self._pairing = PairingHealth(pipeline.synchronizer)
+        self._pairing = PairingHealth(pipeline.pairing.synchronizer)
         self._samples = deque([_Sample.of(pipeline)], maxlen=int(LOAD_WINDOW_S) + 1)
         self._unpaired = ""  # what is said of messages without partner
 
@@ -193,7 +193,7 @@ class Diagnostics:
         return message
 
     def _flow(self) -> dict[str, str]:
-        pipeline, counts = self._pipeline, self._pipeline.synchronizer.counts
+        pipeline, counts = self._pipeline, self._pipeline.pairing.synchronizer.counts
         recalibrator, gate = pipeline.recalibrator, pipeline.speed_gate
         first, last = self._window()
         before, span = self._samples[max(len(self._samples) - 2, 0)], max(last.at - first.at, 1e-3)
@@ -214,8 +214,8 @@ class Diagnostics:
             "stamps jumped back": str(counts.jumps_back),
             "pairs dropped by a busy worker": str(pipeline.dropped_pairs),
             "pairs left out at rest": str(pipeline.rested_pairs),
-            "keyframes in the buffer": str(len(recalibrator.buffer) if recalibrator else 0),
-            "keyframes so far": str(recalibrator.keyframes_seen if recalibrator else 0),
+            "keyframes in the buffer": str(len(recalibrator.keyframes) if recalibrator else 0),
+            "keyframes so far": str(recalibrator.keyframes.seen if recalibrator else 0),
             "frames too fast for a keyframe": str(gate.rejected),
             "the newest of them": gate.last_rejection or "none",
             "motion from scans": _motion(recalibrator),
@@ -280,7 +280,8 @@ class Diagnostics:
             return level, text
         if (silent := self._silence()) is not None:
             return silent
-        input_problems = [*self._health.losses.values(), *filter(None, [self._unpaired, self._pipeline.clock_difference])]
+        told = *self._health.losses.values(), self._unpaired, self._pipeline.pairing.clocks.describe()
+        input_problems = list(filter(None, told))
         if level == WARN or input_problems:
             return WARN, "; ".join([text, *input_problems])
         problem, at = self._health.last_error

@@ -3,48 +3,33 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
-from calib_ros.extensions import NodeService
 from calib_ros.online.events import ExtrinsicUpdated
-from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.state import load_state, provenance_of, read_state, save_state
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.result import CONVERGED, INITIAL, InitialSource, Result
-from calib_ros.ros.parameters import Parameters
-from calib_ros.ros.tf import StaticTf
+from calib_ros.ros.interface import PairPart
 
 
-class InitialExtrinsic(NodeService):
-    """Chooses the initial extrinsic of a pipeline, and saves accepted ones.
+class InitialExtrinsic(PairPart):
+    """Chooses the initial extrinsic of a pipeline, and saves accepted ones."""
 
-    parameters: gives the current ones. error: takes one line for a person, and its kind for the log.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        pipeline: Pipeline,
-        parameters: Callable[[], Parameters],
-        tf: StaticTf,
-        error: Callable[[str, str], None],
-    ) -> None:
-        self._node, self._pipeline, self._parameters, self._tf, self._error = node, pipeline, parameters, tf, error
+    def __init__(self, own: Any) -> None:
+        super().__init__(own)
         self._reported = ""
         self._saved = 0  # accepted estimates when the extrinsic was saved
         self._stamp = 0  # of the newest data, ns
 
     def choose(self, camera: Camera, camera_frame: str, lidar_frame: str) -> Result | None:
         """The extrinsic to start from; None while TF may still come."""
-        parameters = self._parameters()
+        parameters = self._parameters
         path = parameters["state_file"]
         if path and os.path.exists(path):
             try:
@@ -53,11 +38,11 @@ class InitialExtrinsic(NodeService):
             except BadInputError as error:
                 if str(error) != self._reported:  # asked again with every pair while TF may still come
                     self._reported = str(error)
-                    self._error(str(error), "state file read")
+                    self._health.error(str(error), "state file read")
         given = parameters.initial()
         if given is not None:
             return given
-        T, pending = self._tf.lookup(camera_frame, lidar_frame)
+        T, pending = self._own.tf.lookup(camera_frame, lidar_frame)
         if T is not None:
             return Result(T, INITIAL, "from TF", origin=InitialSource.TF)
         if pending:
@@ -66,7 +51,7 @@ class InitialExtrinsic(NodeService):
 
     def before_messages(self) -> Result:
         """The initial extrinsic before any message has named the sensors, as far as the parameters allow it; without TF."""
-        parameters = self._parameters()
+        parameters = self._parameters
         if os.path.exists(parameters["state_file"]):
             with suppress(BadInputError):  # reported when the sensors are known and the start is chosen
                 saved = read_state(parameters["state_file"]).result
@@ -83,7 +68,7 @@ class InitialExtrinsic(NodeService):
         initial = recalibrator.tracker.initial
         if initial.origin is not InitialSource.NOMINAL:
             return
-        T = self._tf.lookup(initial.camera_frame, initial.lidar_frame)[0]
+        T = self._own.tf.lookup(initial.camera_frame, initial.lidar_frame)[0]
         if T is not None and not np.allclose(T, initial.T_camera_lidar, atol=1e-6):
             self._node.get_logger().info("TF connects camera and LiDAR by now: starting anew from it")
             self._pipeline.restart()
@@ -100,14 +85,14 @@ class InitialExtrinsic(NodeService):
 
     def save(self, result: Result) -> tuple[bool, str]:
         """Write an accepted estimate to the state file; whether it was, and where or why not, for a person."""
-        path, camera, recalibrator = self._parameters()["state_file"], self._pipeline.camera, self._pipeline.recalibrator
+        path, camera, recalibrator = self._parameters["state_file"], self._pipeline.camera, self._pipeline.recalibrator
         if not path or camera is None or recalibrator is None:
             return False, "nothing saved: set the parameter state_file to a path"
-        accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
+        accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes.seen
         try:
             newest = result.data_stamp or self._stamp
             save_state(path, result, camera, provenance_of(recalibrator.config, accepted, keyframes, newest))
         except BadInputError as error:
-            self._error(str(error), "state file written")
+            self._health.error(str(error), "state file written")
             return False, str(error)
         return True, f"saved to {path}"

@@ -5,7 +5,6 @@ Each message is received and decoded once for all pairs that look at it.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -18,23 +17,19 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
-from std_msgs.msg import Header
 
 from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
-from calib_ros.extensions import NodeService
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.messages import decode_camera_info, stamp_ns
 from calib_ros.online.common import Common
 from calib_ros.online.pairing.health import MISSING_SHARE
-from calib_ros.online.pipeline import Pipeline
 from calib_ros.rig.description import CAMERA
 from calib_ros.rig.edges import SEEN, seen_share
 from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message
-from calib_ros.ros.diagnostics import Health
-from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.interface import PairPart
 from calib_ros.ros.subscriptions import BEST_EFFORT, AdaptiveSubscription, Form, livox_forms, loss_advice, serialized
 
 Guard = Callable[[], AbstractContextManager[None]]
@@ -43,7 +38,6 @@ UNSEEN_SCANS = 10  # one after the other without a point in view: a second
 SILENT_S = 1.0  # without a message: slower sensors than this are of no use
 AFTER_STAMP = 12  # bytes of a message: what comes behind is the same in nearly every CameraInfo
 MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
-CHECKED_AGAIN_S = 0.5  # everybody who listens checks once a second
 
 
 class SharedTopics:
@@ -70,7 +64,7 @@ class SharedTopics:
 class _Topic:
     def __init__(self, make: Callable[..., AdaptiveSubscription]) -> None:
         self.listeners: list[Listener] = []
-        self.checked, self.problem = 0.0, ""
+        self.problem = ""
         self.subscription = make(callback=self._receive)
 
     def _receive(self, stamp: int, message: Any) -> None:
@@ -103,9 +97,9 @@ class Listener:
 
     def check(self) -> str:
         """See `AdaptiveSubscription`."""
-        own, now = self._topic, time.monotonic()
-        if now - own.checked >= CHECKED_AGAIN_S:
-            own.checked, own.subscription.preference = now, self.preference
+        own = self._topic
+        if self.tells:
+            own.subscription.preference = self.preference
             own.problem = own.subscription.check()
         return own.problem
 
@@ -168,39 +162,29 @@ class PairInputs:
 MotionSource = tuple[type[Any], Callable[[Any], tuple[float | None, float | None]]]
 
 
-class SensorSubscriptions(NodeService):
+class SensorSubscriptions(PairPart):
     """Image, cloud, CameraInfo and motion; while the node is active every message goes to the pipeline.
 
-    camera_info: the newest usable CameraInfo. parameters: gives the current ones. motion: what measures the vehicle's motion,
-    from motion_source(). on_received: called with the header of every image and cloud, once the pipeline has been given it.
+    camera_info: the newest usable CameraInfo. motion: what measures the vehicle's motion, from motion_source().
     """
 
-    def __init__(
-        self,
-        inputs: PairInputs,
-        parameters: Callable[[], Parameters],
-        motion: MotionSource | None,
-        pipeline: Pipeline,
-        health: Health,
-        on_received: Callable[[Header], None],
-    ) -> None:
+    def __init__(self, own: Any, motion: MotionSource | None) -> None:
+        super().__init__(own)
         self.camera_info: Serialized | None = None
         self.adaptive: tuple[Any, ...] = ()  # of `Listener`
-        self._inputs, self._parameters, self._pipeline, self._health = inputs, parameters, pipeline, health
-        self._on_received = on_received
-        self._rectified = parameters()["image_is_rectified"]
+        self._inputs, self._rectified = own.inputs, self._parameters["image_is_rectified"]
         self._motion = motion
         self._motion_subscription: Any = None
 
     def start(self) -> None:
         """Subscribe."""
-        pipeline, parameters, shared = self._pipeline, self._parameters(), self._inputs.shared
+        pipeline, parameters, shared = self._pipeline, self._parameters, self._inputs.shared
         subscribe = partial(shared.subscribe, preference=parameters["reliability"], guard=self._health.guard)
         image, points, camera_info = self._inputs.topics
         kind = CompressedImage if parameters["image_transport"] == "compressed" else Image
         self.adaptive = (
-            subscribe([serialized(kind)], image, partial(self._forward, pipeline.add_image)),
-            subscribe([serialized(PointCloud2), *livox_forms()], points, partial(self._forward, pipeline.add_cloud)),
+            subscribe([serialized(kind)], image, partial(self._forward, True)),
+            subscribe([serialized(PointCloud2), *livox_forms()], points, partial(self._forward, False)),
             # A camera's driver may publish once, latched, what never changes.
             subscribe([serialized(CameraInfo)], camera_info, self._on_camera_info, latched=True),
         )
@@ -225,7 +209,7 @@ class SensorSubscriptions(NodeService):
 
     def check(self) -> None:
         """Follow the publishers and the parameters."""
-        parameters = self._parameters()
+        parameters = self._parameters
         for subscription in self.adaptive:
             subscription.preference = parameters["reliability"]
             problem = subscription.check()
@@ -243,11 +227,11 @@ class SensorSubscriptions(NodeService):
         told = zip((self._inputs.camera, self._inputs.lidar), self.adaptive, strict=False)
         return ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told if name and own.silent_s > SILENT_S)
 
-    def _forward(self, add: Callable[[int, Any], None], stamp: int, message: Any) -> None:
+    def _forward(self, is_image: bool, stamp: int, message: Any) -> None:
         try:
-            add(stamp, message)
+            self._pipeline.add(is_image, stamp, message)
         finally:
-            self._on_received(message.header)
+            self._own.processed.receive(message.header)
 
     def _losses(self) -> dict[str, str]:
         """Topic -> how many of its messages get lost, and what to do, for a person; of images and clouds, where many do.
@@ -256,7 +240,7 @@ class SensorSubscriptions(NodeService):
         period.
         """
         losses: dict[str, str] = {}
-        for subscription, missing in zip(self.adaptive, self._pipeline.synchronizer.missing_shares(), strict=False):
+        for subscription, missing in zip(self.adaptive, self._pipeline.pairing.synchronizer.missing_shares(), strict=False):
             share = max(subscription.lost_share(), missing)
             if share >= MISSING_SHARE:
                 losses[subscription.topic] = (

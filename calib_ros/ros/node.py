@@ -28,7 +28,9 @@ class _Calibrating(Node):
 
     def stop(self) -> bool:
         """End all threads of the node; True if they ended, and those of former calibrations too."""
-        return (self.calibration is None or self.calibration.stop()) and self._ended
+        if self.calibration is not None:
+            self.calibration.stop()
+        return self._ended and (self.calibration is None or bool(self.calibration.ended))
 
     def destroy_node(self) -> None:
         """Ends the threads first: they publish through this node."""
@@ -44,7 +46,7 @@ class CalibNode(_Calibrating):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("calib_ros", allow_undeclared_parameters=True, **kwargs)  # which are refused, with the nearest name
         self.calibration = interface(self)
-        self.calibration.activate()
+        self.calibration.start()
 
 
 class CalibLifecycleNode(_Calibrating, LifecycleNode):
@@ -63,11 +65,11 @@ class CalibLifecycleNode(_Calibrating, LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe to the sensors, and estimate."""
-        return self._transition(lambda: self._configured().activate())
+        return self._transition(lambda: self._configured().start())
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Unsubscribe and end estimates; keyframes and extrinsic stay."""
-        return self._transition(lambda: self._configured().deactivate())
+        return self._transition(lambda: self._configured().pause())
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Back to where the node was before it was configured, but for parameters that were changed."""
@@ -91,7 +93,8 @@ class CalibLifecycleNode(_Calibrating, LifecycleNode):
     def _clean_up(self) -> None:
         calibration, self.calibration = self.calibration, None
         if calibration is not None:
-            self._ended = calibration.destroy() and self._ended
+            calibration.destroy()
+            self._ended = bool(calibration.ended) and self._ended
             calibration.destroy_nodes()
 
     def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:

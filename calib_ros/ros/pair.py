@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from calib_ros.extensions import NodeService, node_services
+from calib_ros.extensions import node_services
 from calib_ros.image.mask import check_mask
 from calib_ros.online.events import Event, ExtrinsicUpdated, Inputs
 from calib_ros.online.pipeline import Pipeline
@@ -33,63 +33,73 @@ class PairInterface(Interface):
     """Of a pair, as docs/vehicle.md lists it. inputs: what a pair shares with others of a rig; None = it is alone."""
 
     def __init__(self, node: Node, inputs: PairInputs | None = None) -> None:
-        declared, self._inputs = parameters.declare(node), inputs or PairInputs(SharedTopics(node))
+        declared, self.inputs = parameters.declare(node), inputs or PairInputs(SharedTopics(node))
         # What may be missing is asked for before anything is made that would have to be taken back.
         motion = motion_source(declared["motion_source"])
-        super().__init__(node, declared, self._inputs.shared.node)
+        super().__init__(node, declared, self.inputs.shared.node)
         for line in parameters.replaced(declared["preset"], declared.config, self.given):
             node.get_logger().info(line)
         self._nameless: set[str] = set()  # sensors whose messages have no frame_id
         asked = Inputs(
-            self._inputs.frame,
+            self.inputs.frame,
             self._frame_ids,
             lambda *sensors: self.initial.choose(*sensors),
-            self._inputs.cloud,
+            self.inputs.cloud,
             self.tf.tree.others,
         )
-        self.pipeline = Pipeline(declared.config, asked, self._on_event, self._inputs.common, self._inputs.lidar)
+        sensors = self.inputs.camera, self.inputs.lidar
+        self.pipeline = Pipeline(declared.config, asked, self._on_event, self.inputs.common, sensors)
         self.pipeline.pause(INACTIVE)
-        of_pipeline = node, self.pipeline, lambda: self.parameters
-        self.initial = InitialExtrinsic(*of_pipeline, self.tf, self.health.error)
-        processed = ProcessedPublisher(node, self.pipeline)
-        given = self._inputs, lambda: self.parameters, motion
-        self.sensors = SensorSubscriptions(*given, self.pipeline, self.health, processed.receive)
-        self.extrinsic = ExtrinsicPublisher(*of_pipeline, self.sensors.silent)
-        self.capture = Capture(*of_pipeline, self.health, self.files, lambda: self.sensors.camera_info)
-        self.overlay = OverlayPublisher(*of_pipeline)
-        services = Services(node, self.pipeline, self.health, self.initial, self.extrinsic, self.reset)
-        of_others = [make(node, self.pipeline, self.health) for make in node_services(node.get_logger().warning).values()]
-        self.parts += [self.sensors, self.extrinsic, self.initial, self.capture, self.overlay, processed, services, *of_others]
-        self.parts.append(DiagnosticsPublisher(self))
-        self.again, self.end_threads = self.extrinsic.again, self.pipeline.stop
+        self.sensors, self.extrinsic = SensorSubscriptions(self, motion), ExtrinsicPublisher(self)
+        self.initial, self.capture, self.overlay = InitialExtrinsic(self), Capture(self), OverlayPublisher(self)
+        self.processed = ProcessedPublisher(self)
+        self.parts += [self.sensors, self.extrinsic, self.initial, self.capture, self.overlay, self.processed, Services(self)]
+        self.parts += [make(node, self.pipeline, self.health) for make in node_services(node.get_logger().warning).values()]
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._status_changed = node.create_guard_condition(self._on_status_change)
+        self._status = self._noted = ""  # the newest, and the newest line
+        self._published_at = 0.0  # for a change of status, by time.monotonic()
+        self._diagnostics: Diagnostics | None = None  # while the node is active
+        self.end_threads = self.pipeline.stop
         node.add_on_set_parameters_callback(self._on_parameters)
 
     def reset(self) -> None:
         """Forget the keyframes, and go back to the initial extrinsic."""
         self.pipeline.reset()
         self.capture.clear()
-        self._inputs.on_reset()
+        self.inputs.on_reset()
 
-    def activate(self) -> None:
+    def start(self) -> None:
         """See `Interface`."""
         self.pipeline.resume()
-        super().activate()
+        super().start()
+        self._diagnostics = Diagnostics(self.node.get_fully_qualified_name(), self.health, self.pipeline)  # rates count from now
         models = self.pipeline.segmentation.in_use()
         self.node.get_logger().info(f"semantics: {'; '.join(models) or 'no models'}")
         if said := remark():
             self.node.get_logger().info(said)
         self.node.get_logger().info("waiting for images, clouds and CameraInfo")
 
-    def deactivate(self) -> None:
+    def pause(self) -> None:
         """See `Interface`."""
+        self._diagnostics = None
         self.pipeline.pause(INACTIVE)
-        super().deactivate()
+        super().pause()
 
-    def check(self) -> None:
+    def destroy(self) -> None:
         """See `Interface`."""
-        if self._inputs.common is None:  # else the rig receives them
+        super().destroy()
+        self.node.destroy_guard_condition(self._status_changed)
+        self.node.destroy_publisher(self._publisher)
+
+    def look(self) -> None:
+        """See `Interface`."""
+        if self.inputs.common is None:  # else the rig receives them
             self.pipeline.load.count_messages()
-        super().check()
+        super().look()
+        if self._diagnostics is not None:
+            self._diagnostics.count()
+            self._publish(self._diagnostics)
 
     def _frame_ids(self, image: Any, cloud: Any) -> tuple[str, str]:
         names = []
@@ -104,9 +114,12 @@ class PairInterface(Interface):
 
     def _on_event(self, event: Event) -> None:
         """On the pipeline's threads."""
-        if self._ended is None:  # else of a thread in a long computation that did not end in time
+        if self.ended is None:  # else of a thread in a long computation that did not end in time
             for part in self.parts:
                 part.add(event)
+            if isinstance(event, ExtrinsicUpdated) and event.extrinsic.result.status != self._status:
+                self._status = event.extrinsic.result.status
+                self._status_changed.trigger()
 
     def _take(self, new: Parameters, changed: list[Parameter]) -> None:
         if new.config.image != self.parameters.config.image:
@@ -115,62 +128,24 @@ class PairInterface(Interface):
         self.parameters = new
         self.pipeline.configure(new.config)
 
-
-class DiagnosticsPublisher(NodeService):
-    """/diagnostics of a pair: every second, and when the status changes."""
-
-    def __init__(self, own: PairInterface) -> None:
-        self._own, self._node = own, own.node
-        self._publisher = own.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._status_changed = own.node.create_guard_condition(self._on_status_change)
-        self._status = ""
-        self._published_at = 0.0  # for a change of status, by time.monotonic()
-        self._noted = ""  # the newest line
-        self._diagnostics: Diagnostics | None = None  # while the node is active
-
-    def start(self) -> None:
-        """Rates count from now on."""
-        self._diagnostics = Diagnostics(self._node.get_fully_qualified_name(), self._own.health, self._own.pipeline)
-
-    def pause(self) -> None:
-        """See `NodeService`."""
-        self._diagnostics = None
-
-    def destroy(self) -> None:
-        """See `NodeService`."""
-        self._node.destroy_guard_condition(self._status_changed)
-        self._node.destroy_publisher(self._publisher)
-
-    def add(self, event: Event) -> None:
-        """The status may have changed."""
-        if isinstance(event, ExtrinsicUpdated) and event.extrinsic.result.status != self._status:
-            self._status = event.extrinsic.result.status
-            self._status_changed.trigger()
-
     def _on_status_change(self) -> None:
         """At once, but not for a status that flickers: the next second is soon enough then."""
-        with self._own.health.guard():
+        with self.health.guard():
             now = time.monotonic()
             if self._diagnostics is not None and now - self._published_at >= DIAGNOSED_AGAIN_S:
                 self._published_at = now
                 self._publish(self._diagnostics)
 
-    def check(self) -> None:
-        """See `NodeService`."""
-        if self._diagnostics is not None:
-            self._diagnostics.count()
-            self._publish(self._diagnostics)
-
     def _publish(self, diagnostics: Diagnostics) -> None:
-        own = self._own
-        extra = {"reliable topics": " ".join(s.topic for s in own.sensors.adaptive if s.reliable) or "none"}
-        extra["raw keyframes kept"] = str(len(own.capture))
-        if own.parameters["consumers"]:
-            extra["usable for"] = " ".join(own.extrinsic.served) or "none"
-        message = diagnostics.message(self._node.get_clock().now().to_msg(), extra)
-        message.status += [status for part in own.parts if (status := part.status()) is not None]
+        """/diagnostics: every second, and when the status changes."""
+        extra = {"reliable topics": " ".join(s.topic for s in self.sensors.adaptive if s.reliable) or "none"}
+        extra["raw keyframes kept"] = str(len(self.capture))
+        if self.parameters["consumers"]:
+            extra["usable for"] = " ".join(self.extrinsic.served) or "none"
+        message = diagnostics.message(self.node.get_clock().now().to_msg(), extra)
+        message.status += [status for part in self.parts if (status := part.status()) is not None]
         # The vehicle and both sensors, as far as they are known.
-        given, recalibrator = own.parameters, own.pipeline.recalibrator
+        given, recalibrator = self.parameters, self.pipeline.recalibrator
         frames = [given["camera_frame"], given["lidar_frame"]]
         if recalibrator is not None:
             frames = [recalibrator.tracker.initial.camera_frame, recalibrator.tracker.initial.lidar_frame]
@@ -179,4 +154,4 @@ class DiagnosticsPublisher(NodeService):
         self._publisher.publish(message)
         if (health := message.status[0].message) != self._noted:
             self._noted = health
-            own.capture.black_box.note(health, "health")
+            self.capture.black_box.note(health, "health")

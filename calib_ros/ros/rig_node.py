@@ -48,8 +48,10 @@ from calib_ros.ros.publishers import VALID_PERIODS
 from calib_ros.ros.rig_lidars import LidarsOfRig
 from calib_ros.ros.rig_messages import rig_message, rig_status
 from calib_ros.ros.write_back import check_files
+from calib_ros.runtime import trim_memory
 
 TF_CURE = "take what says otherwise out of the robot's description, or write the rig to its joints with calib-ros rig --out"
+CHECKS_PER_TRIM = 20  # keyframes of many pairs leave gaps
 TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")  # of the name of a node
 # Settings of a node of one pair that a rig has in another way, or a pair each by itself.
 OF_RIG = {"rig_file", "publish_tf", "tf_parent", "tf_child", "export.on_converged", "export.joint"}
@@ -100,19 +102,20 @@ class RigInterface(Interface):
                     inputs.unseen = lambda why, made=made: self._unseen(made, why)
                     self._views.append(inputs)
         except BaseException:  # of one pair: the others must not go on
-            self._destroy_pairs()
+            for made in self.pairs.values():
+                made.destroy()
+            self._finish_answers()
             self._beside.destroy()
             self.tf.destroy()
             raise
         topics_of = {name: self._topics(name, name)[1] for name in self.description.lidars}
         of_all = shared, topics_of, decoded, common, lambda: self.parameters, self.health
         self.lidars = [LidarsOfRig(pair, *of_all, partial(self._start_of, *pair)) for pair in self.description.lidar_pairs]
-        self.parts += self.lidars
-        self._lock = threading.Lock()  # of state, active and what is published of them
-        self._active = False
+        self.parts += [*self.pairs.values(), *self.lidars]
+        self._lock = threading.Lock()  # of state and what is published of them
         self._priors_now: Priors = dict(self._priors_given)
         self._told: list[PairState] = []  # what the newest solution rests on
-        self._text = ""
+        self._text, self._checks = "", 0
         self._edges: list[TransformStamped] = []  # of the newest solution
         self._solver: Worker[tuple[LiveRig, list[PairState], Priors]] = Worker("calib_rig", self._solve, self._failed)
         self.publisher = node.create_publisher(Rig, "~/rig", LATCHED)
@@ -122,42 +125,35 @@ class RigInterface(Interface):
 
     # ---- states -------------------------------------------------------------------------------------------------------
 
-    def activate(self) -> None:
+    def start(self) -> None:
         """See `Interface`."""
-        self._active = True
-        for pair in self.pairs.values():
-            pair.activate()
-        super().activate()
+        super().start()
         names = ", ".join(f"{camera} with {lidar}" for camera, lidar in self.pairs)
         self.node.get_logger().info(f"a rig of {len(self.description.sensors)} sensors: {names}")
 
-    def deactivate(self) -> None:
+    def pause(self) -> None:
         """See `Interface`."""
-        for pair in self.pairs.values():
-            pair.deactivate()
-        super().deactivate()
+        super().pause()
         with self._lock:
-            self._active = False
             self._forget()
 
     def end_threads(self) -> bool:
         """See `Interface`."""
         with ThreadPoolExecutor(max(len(self.pairs), 1)) as all_at_once:
-            ended = list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
+            list(all_at_once.map(lambda pair: pair.stop(), self.pairs.values()))
+        ended = [bool(pair.ended) for pair in self.pairs.values()]
         return all([*ended, *(lidars.worker.stop() for lidars in self.lidars), self._solver.stop()])
 
-    def destroy(self) -> bool:
+    def destroy(self) -> None:
         """See `Interface`."""
-        ended = super().destroy()
-        self._destroy_pairs()
+        super().destroy()
+        self._finish_answers()
         after_answers(self.node, partial(self.node.destroy_service, self._service))
         for publisher in (self.publisher, self._diagnostics_pub):
             self.node.destroy_publisher(publisher)
-        return ended
 
-    def _destroy_pairs(self) -> None:
-        for pair in self.pairs.values():
-            pair.destroy()
+    def _finish_answers(self) -> None:
+        """Of pairs that are destroyed."""
         for _ in range(ROUNDS + 1):  # so that `after_answers` comes to its end
             self._beside.spin_ready()
 
@@ -207,10 +203,13 @@ class RigInterface(Interface):
 
     # ---- every second ---------------------------------------------------------------------------------------------------
 
-    def check(self) -> None:
+    def look(self) -> None:
         """See `Interface`."""
         self.load.count_messages()
-        super().check()
+        super().look()
+        self._checks += 1
+        if self._checks % CHECKS_PER_TRIM == 0:
+            trim_memory()
         states, priors = [self._state_of(*names, pair) for names, pair in self.pairs.items()], self._priors()
         self._priors_now = priors
         doubt, lost = any(own.status in (SUSPECT, MOVED) for own in states), {own.pair for own in states if own.status == MOVED}
@@ -252,7 +251,7 @@ class RigInterface(Interface):
         live, states, priors = item
         state = live.update(states, priors)
         with self._lock:
-            if not self._active or self._ended is not None or live is not self._live:  # its last message has been sent
+            if not self.active or self.ended is not None or live is not self._live:  # its last message has been sent
                 return
             self.state = state
             self.publisher.publish(self._message(state))
@@ -308,6 +307,7 @@ class RigInterface(Interface):
 
     def again(self) -> None:
         """See `Interface`."""
+        super().again()
         with self._lock:
             if self.state is not None:
                 self.publisher.publish(self._message(self.state))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from concurrent.futures import Future as Promise
 from typing import Any
 
@@ -14,39 +13,23 @@ from calib_ros_msgs.srv import GetExtrinsic
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from calib_ros.extensions import NodeService
-from calib_ros.online.pipeline import Pipeline
 from calib_ros.registration.progress import Callback
 from calib_ros.result import CONVERGED, TENTATIVE, Extrinsic
 from calib_ros.ros.answers import after_answers, done, serve
-from calib_ros.ros.diagnostics import Health
-from calib_ros.ros.initial_extrinsic import InitialExtrinsic
-from calib_ros.ros.publishers import ExtrinsicPublisher
+from calib_ros.ros.interface import PairPart
 
 FEEDBACK_PERIOD_S = 0.1  # as often as a person can follow; a search reports some hundred times a second
 
 
-class Services(NodeService):
+class Services(PairPart):
     """~/get_extrinsic, ~/reset, ~/save and ~/calibrate, whose requests over the same keyframes share one estimate, which ends
-    when all are cancelled.
+    when all are cancelled."""
 
-    publisher: of ~/extrinsic. reset: forgets what was found.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        pipeline: Pipeline,
-        health: Health,
-        initial: InitialExtrinsic,
-        publisher: ExtrinsicPublisher,
-        reset: Callable[[], None],
-    ) -> None:
-        self._node, self._pipeline, self._health, self._initial = node, pipeline, health, initial
-        self._publisher, self._forget = publisher, reset
+    def __init__(self, own: Any) -> None:
+        super().__init__(own)
+        node, health = own.node, own.health
         self._promises: dict[bytes, Promise[Extrinsic]] = {}  # of the goals under way, by their ids
         group = ReentrantCallbackGroup()  # requests for an estimate share one, and must not wait for each other
         self._services = [
@@ -61,7 +44,7 @@ class Services(NodeService):
             "~/calibrate",
             self._execute,
             callback_group=ReentrantCallbackGroup(),
-            goal_callback=lambda _: GoalResponse.REJECT if pipeline.paused else GoalResponse.ACCEPT,
+            goal_callback=lambda _: GoalResponse.REJECT if self._pipeline.paused else GoalResponse.ACCEPT,
             handle_accepted_callback=self._begin,
             cancel_callback=self._cancel,
         )
@@ -81,8 +64,8 @@ class Services(NodeService):
         if extrinsic is None and recalibrator is not None:
             extrinsic = recalibrator.current
         if extrinsic is None:
-            return self._publisher.message(Extrinsic(self._initial.before_messages()), 0)
-        return self._publisher.message(extrinsic)
+            return self._own.extrinsic.message(Extrinsic(self._own.initial.before_messages()), 0)
+        return self._own.extrinsic.message(extrinsic)
 
     def _get_extrinsic(self, request: GetExtrinsic.Request, response: GetExtrinsic.Response) -> None:
         recalibrator = self._pipeline.recalibrator
@@ -93,16 +76,16 @@ class Services(NodeService):
         extrinsic = recalibrator.current
         response.extrinsic = self._message(extrinsic)
         response.success = response.extrinsic.usable
-        last_good = self._publisher.last_good()
+        last_good = self._own.extrinsic.last_good()
         if last_good is not None:
             response.last_good_known, response.last_good = True, last_good
-        more = recalibrator.config.online.min_keyframes - len(recalibrator.buffer)
+        more = recalibrator.config.online.min_keyframes - len(recalibrator.keyframes)
         waiting = f"waiting for {more} more keyframes" if more > 0 else "no estimate yet"
         made = f"estimated from {extrinsic.result.frames_used} keyframes"
         response.message = response.extrinsic.reason or (made if response.success else waiting)
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> None:
-        self._forget()
+        self._own.reset()
         response.success, response.message = True, "keyframes forgotten, back to the initial extrinsic"
 
     def _save(self, request: Trigger.Request, response: Trigger.Response) -> None:
@@ -115,7 +98,7 @@ class Services(NodeService):
         elif recalibrator.tracker.tentative:
             response.message = f"nothing saved: {recalibrator.current.result.reason}"
         else:
-            response.success, response.message = self._initial.save(last_good)
+            response.success, response.message = self._own.initial.save(last_good)
 
     async def _calibrate(self, request: Trigger.Request, response: Trigger.Response) -> None:
         response.success, response.message = _outcome(await done(self._node, self._pipeline.request_estimate()))

@@ -84,7 +84,7 @@ def request_check(pipeline: Pipeline, request: CheckRequest) -> Future[CheckOutc
         return check_keyframes(pipeline.recalibrator, request, progress, pipeline.vehicle_frames())
 
     recalibrator = pipeline.recalibrator
-    obstacle = NO_PAIR if recalibrator is None else "" if len(recalibrator.buffer) else NO_KEYFRAME
+    obstacle = NO_PAIR if recalibrator is None else "" if len(recalibrator.keyframes) else NO_KEYFRAME
     return pipeline.defer(Pending("check", request.key, work), obstacle)
 
 

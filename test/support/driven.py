@@ -52,8 +52,8 @@ class Driven:
     def feed(self, *frames: Frame) -> None:
         """One after the other."""
         for frame in frames:
-            self.pipeline.add_image(frame.stamp, frame)
-            self.pipeline.add_cloud(frame.stamp, frame)
+            self.pipeline.add(True, frame.stamp, frame)
+            self.pipeline.add(False, frame.stamp, frame)
             assert self.pipeline.wait_idle(60)
 
     @property

@@ -121,7 +121,7 @@ class RigPeer(NodeAndPeer):
                 pairs, stream = (name,), "images"
             self._sent[stream, name] += 1
             for camera in pairs:
-                counts = self.pair(camera).pipeline.synchronizer.counts
+                counts = self.pair(camera).pipeline.pairing.synchronizer.counts
                 want = self._sent[stream, name]
                 self.until(lambda c=counts, s=stream, w=want: getattr(c, s) >= w, f"{stream} of {name}")
                 with self.pair(camera).pipeline._lock:

@@ -232,7 +232,7 @@ class Peer(NodeAndPeer):
 
     def publish(self, frame: Frame, settle: bool = True, **cloud_options: Any) -> None:
         """One frame as three messages; settle = wait until the node has worked it off."""
-        counts = self.pipeline.synchronizer.counts
+        counts = self.pipeline.pairing.synchronizer.counts
         pairs = counts.pairs
         self.publish_camera(frame)
         self.image_pub.publish(image_message(frame.image, "camera", frame.stamp))
@@ -260,7 +260,7 @@ class Peer(NodeAndPeer):
 
     def send(self, image: Any, cloud: Any) -> None:
         """An image and a cloud that may not become a pair; the node has worked them off afterwards."""
-        counts = self.pipeline.synchronizer.counts
+        counts = self.pipeline.pairing.synchronizer.counts
         images, clouds = counts.images, counts.clouds
         self.image_pub.publish(image)
         self.cloud_pub.publish(cloud)

@@ -63,12 +63,12 @@ class Vehicle:
         peer.info_pub.publish(camera_info_message(self.frame()))
         peer.until(lambda: peer.pipeline.camera == self.frame(0).camera, "the right camera")
         recalibrator = peer.recalibrator
-        accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
+        accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes.seen
         for _ in range(8):
             peer.publish(self.frame())
             if recalibrator.current.accepted > accepted:
                 break
-        assert recalibrator.keyframes_seen > keyframes, peer.last_error()
+        assert recalibrator.keyframes.seen > keyframes, peer.last_error()
         assert recalibrator.current.accepted > accepted, recalibrator.current.result.reason
         answer = peer.get_extrinsic()
         assert answer.success

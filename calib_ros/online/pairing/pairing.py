@@ -15,7 +15,7 @@ from calib_ros.online.pairing.epochs import ClockDifference
 from calib_ros.online.pairing.synchronizer import Synchronizer
 
 # Cloud messages kept: the one before a keyframe's is needed for the vehicle's motion, and the keyframe's own may wait for its
-# image and in the queue meanwhile.
+# image meanwhile.
 CLOUDS_KEPT = 6
 QUEUE = 8  # images and clouds that wait for their counterpart: twice what a stream of twice the rate brings in a late scan's time
 
@@ -23,12 +23,13 @@ QUEUE = 8  # images and clouds that wait for their counterpart: twice what a str
 @dataclass(frozen=True, eq=False)
 class Intake:
     """An image and a cloud to be looked at. paired: they belong together; else any two, before it is known which do.
-    cloud_stamp: ns, by the clock of the images; None = not known any more."""
+    cloud_stamp: ns, by the clock of the images; None = not known any more. before: the cloud before it, with its stamp."""
 
     image: Any
     cloud: Any
     paired: bool = True
     cloud_stamp: int | None = None
+    before: tuple[int, Any] | None = None
 
 
 class Pairing:
@@ -51,26 +52,19 @@ class Pairing:
         self.sweep.config = config.motion
         return self.use_sweep()
 
-    def add_image(self, stamp: int, message: Any) -> list[Intake]:
-        """An image message, stamp in ns."""
-        if self.clocks.add(True, stamp, self.synchronizer.counts.pairs > 0):
-            self._begin_anew()
-        self._newest_image = message
-        return self._to_take_in(self.synchronizer.add_image(stamp, message))
-
-    def add_cloud(self, stamp: int, message: Any) -> list[Intake]:
-        """A cloud message, stamp in ns, from which the difference of the clocks is taken out."""
-        if self.clocks.add(False, stamp, self.synchronizer.counts.pairs > 0):
-            self._begin_anew()
-        stamp -= self.clocks.ahead
-        self._clouds.append((stamp, message))
-        self._newest_cloud = message
-        return self._to_take_in(self.synchronizer.add_cloud(stamp, message))
-
-    def _begin_anew(self) -> None:
-        """What waits is stamped by other clocks than what comes."""
-        self.synchronizer.clear()
-        self._clouds.clear()
+    def add(self, is_image: bool, stamp: int, message: Any) -> list[Intake]:
+        """An image or a cloud message, stamp in ns, from which for a cloud the difference of the clocks is taken out."""
+        if self.clocks.add(is_image, stamp, self.synchronizer.counts.pairs > 0):
+            # What waits is stamped by other clocks than what comes.
+            self.synchronizer.clear()
+            self._clouds.clear()
+        if is_image:
+            self._newest_image = message
+        else:
+            stamp -= self.clocks.ahead
+            self._clouds.append((stamp, message))
+            self._newest_cloud = message
+        return self._to_take_in(self.synchronizer.add(is_image, stamp, message))
 
     def use_sweep(self) -> list[Intake]:
         """Pair by what is known of the sweep. Of pairs that become final by it, the newest is to be taken in."""
@@ -83,14 +77,14 @@ class Pairing:
             return []
         return self._to_take_in(self.synchronizer.set_cloud_offset(self.sweep.stamped_ns)[-1:])
 
-    def newest_cloud_between(self, since: int, until: int) -> tuple[int, Any] | None:
-        """The newest cloud message stamped after `since` and before `until` (ns), with its stamp."""
-        return max((item for item in self._clouds if since < item[0] < until), key=lambda item: item[0], default=None)
-
     def _to_take_in(self, pairs: list[tuple[Any, Any]]) -> list[Intake]:
         """The pairs, or, while nothing is known of the sweep, what is to be looked at."""
         stamps = {id(message): stamp for stamp, message in self._clouds}
-        found = [Intake(image, cloud, True, stamps.get(id(cloud))) for image, cloud in pairs]
+        found = []
+        for image, cloud in pairs:
+            at = stamps.get(id(cloud))
+            earlier = [item for item in self._clouds if at is not None and item[0] < at]
+            found.append(Intake(image, cloud, True, at, max(earlier, key=lambda item: item[0], default=None)))
         if self.sweep.ns is not None:
             self._newest_image = self._newest_cloud = None
         elif not pairs and self._newest_image is not None and self._newest_cloud is not None:

@@ -66,7 +66,7 @@ class Synchronizer:
         self.cloud_offset = cloud_offset
         self.counts = SynchronizerCounts()
         self._images, self._clouds = _Stream(capacity), _Stream(capacity)
-        self._newest: _Stream | None = None
+        self._newest_is_image: bool | None = None
         self._lead: int | None = None  # ns, see lead_s
 
     def set_cloud_offset(self, cloud_offset: int) -> list[tuple[Any, Any]]:
@@ -121,37 +121,28 @@ class Synchronizer:
     def clear(self) -> None:
         """Drop the waiting messages, keep the counts."""
         self._images, self._clouds = _Stream(self._images.capacity), _Stream(self._clouds.capacity)
-        self._newest = self._lead = None
+        self._newest_is_image = self._lead = None
 
     # ---- messages -----------------------------------------------------------------------------------------------------
 
-    def add_image(self, stamp: int, image: Any) -> list[tuple[Any, Any]]:
-        """Add an image, stamp in ns; returns the pairs that are now final."""
-        self._handle_jump(self._images, stamp)
-        self.counts.images += 1
-        self.counts.unpaired_images += self._images.push(stamp, image)
-        self._follow(self._images)
-        return self._final_pairs()
-
-    def add_cloud(self, stamp: int, cloud: Any) -> list[tuple[Any, Any]]:
-        """Add a cloud, stamp in ns; returns the pairs that are now final."""
-        self._handle_jump(self._clouds, stamp)
-        self.counts.clouds += 1
-        self.counts.unpaired_clouds += self._clouds.push(stamp, cloud)
-        self._follow(self._clouds)
-        return self._final_pairs()
-
-    def _handle_jump(self, stream: _Stream, stamp: int) -> None:
-        if stream.latest is not None and stamp < stream.latest - JUMP_BACK_S * NANOSECONDS:
-            self.counts.jumps_back += 1
-            self.counts.unpaired_images += len(self._images.waiting)
-            self.counts.unpaired_clouds += len(self._clouds.waiting)
+    def add(self, is_image: bool, stamp: int, message: Any) -> list[tuple[Any, Any]]:
+        """Add an image or a cloud, stamp in ns; returns the pairs that are now final."""
+        counts, latest = self.counts, (self._images if is_image else self._clouds).latest
+        if latest is not None and stamp < latest - JUMP_BACK_S * NANOSECONDS:
+            counts.jumps_back += 1
+            counts.unpaired_images += len(self._images.waiting)
+            counts.unpaired_clouds += len(self._clouds.waiting)
             self.clear()
-
-    def _follow(self, stream: _Stream) -> None:
-        if stream is not self._newest and self._images.latest is not None and self._clouds.latest is not None:
+        if is_image:
+            counts.images += 1
+            counts.unpaired_images += self._images.push(stamp, message)
+        else:
+            counts.clouds += 1
+            counts.unpaired_clouds += self._clouds.push(stamp, message)
+        if is_image != self._newest_is_image and self._images.latest is not None and self._clouds.latest is not None:
             self._lead = self._images.latest - self._clouds.latest
-        self._newest = stream
+        self._newest_is_image = is_image
+        return self._final_pairs()
 
     def _cloud_moments(self) -> Stamps:
         return self._clouds.stamps() + (self.cloud_offset or 0)
@@ -161,6 +152,8 @@ class Synchronizer:
         if self.cloud_offset is None:
             return []
         images, clouds = self._images.waiting, self._clouds.waiting
+        if not images or not clouds:
+            return []
         at_image, at_cloud = self._images.stamps(), self._cloud_moments()
         pairs: list[tuple[Any, Any]] = []
         settled_images = settled_clouds = 0

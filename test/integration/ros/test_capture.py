@@ -126,7 +126,7 @@ def test_callbacks_go_on_during_a_capture_and_the_node_finishes_it_before_it_end
         answer = peer.call_async(peer._triggers["capture"], Trigger.Request())
         peer.until(lambda: threads)
         peer.drive(street[1:8])
-        assert peer.recalibrator.keyframes_seen == 8
+        assert peer.recalibrator.keyframes.seen == 8
         assert peer.get_extrinsic().extrinsic.status == "initial"
         assert not answer.done()
         threading.Timer(0.1, held.set).start()

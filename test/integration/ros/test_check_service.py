@@ -80,7 +80,7 @@ def test_a_node_without_keyframes_refuses_and_says_what_to_wait_for(checked):
 
 def test_a_right_extrinsic_passes_and_nothing_changes(checked):
     recalibrator = checked.peer.recalibrator
-    before, keyframes = recalibrator.current, recalibrator.keyframes_seen
+    before, keyframes = recalibrator.current, recalibrator.keyframes.seen
     answer = checked.check()
     assert (answer.success, answer.verdict, answer.cause, answer.cause_message) == (True, PASS, "", ""), answer.message
     assert answer.p_within > 0.9
@@ -95,7 +95,7 @@ def test_a_right_extrinsic_passes_and_nothing_changes(checked):
     assert answer.covariance[0] > 0
     assert 0 < answer.keyframes_used <= answer.keyframes == 4
     assert answer.stamp.sec * 10**9 + answer.stamp.nanosec == recalibrator.newest().stamp
-    assert (recalibrator.current, recalibrator.keyframes_seen) == (before, keyframes)
+    assert (recalibrator.current, recalibrator.keyframes.seen) == (before, keyframes)
     said = checked.status("pass")
     assert said["cause"] == "none"
     assert said["ry, deg"].endswith("pass")
@@ -134,12 +134,12 @@ def test_a_cause_is_named_while_the_node_goes_on(checked, monkeypatch):
     publisher.publish(TFMessage(transforms=[base]))
     peer.until(lambda: peer.calibration.tf.tree.others("camera", "velodyne"), "the other frame of the vehicle")
     recalibrator = peer.recalibrator
-    keyframes, published = recalibrator.keyframes_seen, len(peer.extrinsics)
+    keyframes, published = recalibrator.keyframes.seen, len(peer.extrinsics)
     under_way = checked.ask(se3.inverse(checked.reference))
     peer.until(lambda: peer.pipeline._estimator.busy, "the check to begin")
     assert peer.get_extrinsic().extrinsic.status == "initial"
     peer.publish(checked.vehicle.frame(), settle=False)
-    peer.until(lambda: recalibrator.keyframes_seen > keyframes and len(peer.extrinsics) > published, "that the node goes on")
+    peer.until(lambda: recalibrator.keyframes.seen > keyframes and len(peer.extrinsics) > published, "that the node goes on")
     assert not under_way.done()
     go_on.set()
     peer.until(under_way.done, "the answer")

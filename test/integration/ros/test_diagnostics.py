@@ -113,7 +113,7 @@ def pairs_dropped(watched: Watched, computed: float, **online: float) -> None:
     watched.pipeline.config = update(
         watched.pipeline.config, {"online": online or {"max_load": 0.5}, "image": {"max_width": 160}}
     )
-    watched.pipeline.synchronizer.counts.pairs += 20
+    watched.pipeline.pairing.synchronizer.counts.pairs += 20
     watched.pipeline.dropped_pairs += 15
     watched.pipeline._ingester.busy_s += 4.0
     watched.load.add(Work.KEYFRAMES, computed * 4.0)
@@ -179,7 +179,7 @@ def test_a_node_at_work(street, drive, monkeypatch):
             raise ZeroDivisionError("by hand")
 
         with monkeypatch.context() as patch:
-            patch.setattr(peer.pipeline.synchronizer, "add_image", broken)
+            patch.setattr(peer.pipeline.pairing.synchronizer, "add", broken)
             patch.setattr(peer.calibration.initial, "before_messages", broken)
             peer.image_pub.publish(Image())
             peer.until(lambda: peer.calibration.health.errors == 1)

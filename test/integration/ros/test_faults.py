@@ -105,7 +105,7 @@ def test_bad_messages_leave_node_and_extrinsic_alone(vehicle, capfd):
 
 @pytest.mark.parametrize("jump_s", [HOUR, -DAY])
 def test_the_clock_of_one_sensor_jumps_and_comes_back(vehicle, jump_s):
-    counts = vehicle.peer.pipeline.synchronizer.counts
+    counts = vehicle.peer.pipeline.pairing.synchronizer.counts
     pairs = counts.pairs
     for _ in range(12):  # more than may wait for a partner
         frame = vehicle.frame(0.1)
@@ -117,7 +117,7 @@ def test_the_clock_of_one_sensor_jumps_and_comes_back(vehicle, jump_s):
 
 def test_a_simulated_clock_that_stands_still_and_jumps(vehicle):
     """A paused simulation, where all stamps stay where they are, and a bag that loops. Diagnostics and services go on."""
-    peer, counts = vehicle.peer, vehicle.peer.pipeline.synchronizer.counts
+    peer, counts = vehicle.peer, vehicle.peer.pipeline.pairing.synchronizer.counts
     clock = peer.peer.create_publisher(Clock, "/clock", 10)
 
     def set_clock() -> None:

@@ -33,7 +33,7 @@ def test_scans_stamped_at_their_end_pair_with_the_images_in_their_middle(street,
     rng, first, n_frames = np.random.default_rng(0), street[0].stamp, 30
     keep = {"capture_frames": n_frames, "online__keyframe_spacing_s": 0.0, "online__mode": "manual"}
     with Peer(**start_parameters(drive.reference), **{**QUICK, **keep}, monitor__enabled=False) as peer:
-        counts = peer.pipeline.synchronizer.counts
+        counts = peer.pipeline.pairing.synchronizer.counts
         peer.publish_camera(street[0])
         for k, frame in enumerate(islice(cycle(street), n_frames)):
             middle = first + k * PERIOD
@@ -56,7 +56,7 @@ def test_a_stream_with_lost_messages_is_named(street):
         driver = peer.peer.create_publisher(Image, "image", BEST_EFFORT)
         peer.until(driver.get_subscription_count)
         picture, first = street[0].image[:8].copy(), street[0].stamp
-        counts = peer.pipeline.synchronizer.counts
+        counts = peer.pipeline.pairing.synchronizer.counts
         for sent, k in enumerate(np.flatnonzero(~lost).tolist()):
             driver.publish(image_message(picture, "camera", first + k * PERIOD))
             peer.until(lambda n=sent: counts.images > n)
@@ -132,7 +132,7 @@ def test_a_camera_that_is_stamped_late_is_found_with_the_mount():
         assert 0 < message.time_offset_sigma < 0.01
         assert is_right(drive.reference, message, 0.4)
         assert float(peer.new_values()["time offset, ms"].split()[0]) == pytest.approx(80, abs=5)
-        assert peer.pipeline._pairing.sweep.config.time_offset_s == pytest.approx(0.08, abs=0.005)
+        assert peer.pipeline.pairing.sweep.config.time_offset_s == pytest.approx(0.08, abs=0.005)
 
 
 @pytest.mark.parametrize(("source", "kind"), [("twist", TwistStamped), ("imu", Imu)])
@@ -150,7 +150,7 @@ def test_no_keyframe_in_a_sharp_turn(street, drive, source, kind):
             publisher.publish(message)
             peer.until(lambda stamp=stamp: gate.newest is not None and gate.newest[0] == stamp)
             peer.publish(frame)
-            assert peer.recalibrator.keyframes_seen == keyframes
+            assert peer.recalibrator.keyframes.seen == keyframes
         peer.until(lambda: peer.values.get("frames too fast for a keyframe") == "2")
         assert peer.values["the newest of them"] == "45.0 deg/s are above online.max_turn_deg_s = 30"
         assert gate.motion_at(street[3])[0] == (5.0 if source == "twist" else pytest.approx(3.0, abs=0.1))

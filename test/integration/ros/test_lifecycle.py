@@ -80,7 +80,7 @@ def test_a_drive_through_all_states(managed, street, drive):
     vehicle.assert_recovers()
     found = managed.get_extrinsic().extrinsic
     assert found.usable
-    recalibrator, keyframes = managed.recalibrator, managed.recalibrator.keyframes_seen
+    recalibrator, keyframes = managed.recalibrator, managed.recalibrator.keyframes.seen
 
     # Inactive: the last message says that nobody looks after the extrinsic, and no data are received.
     managed.deactivate()
@@ -97,12 +97,12 @@ def test_a_drive_through_all_states(managed, street, drive):
     managed.activate()
     assert not managed.get_extrinsic().extrinsic.usable
     assert managed.recalibrator is recalibrator
-    assert recalibrator.keyframes_seen == keyframes
+    assert recalibrator.keyframes.seen == keyframes
     managed.publish(vehicle.frame())
     again = managed.get_extrinsic().extrinsic
     assert again.usable
     assert is_right(drive.reference, again)
-    assert recalibrator.keyframes_seen == keyframes + 1
+    assert recalibrator.keyframes.seen == keyframes + 1
 
     # Nothing is left but the parameters, with their values; the next configuration begins anew from them.
     managed.change(online__buffer_size=7)

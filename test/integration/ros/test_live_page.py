@@ -61,7 +61,7 @@ def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(live, open_p
         ask("r", "Forget all keyframes")
         press(browser, ENTER)
         shows(browser, "~/reset (")
-        assert len(recalibrator.buffer) == 0
+        assert len(recalibrator.keyframes) == 0
         publisher = peer.calibration.overlay.publisher
         until(publisher.get_subscription_count, "somebody looks")
         browser.get("about:blank")

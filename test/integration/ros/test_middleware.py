@@ -85,7 +85,7 @@ def test_a_middleware_that_reports_no_losses_is_named_once(monkeypatch, capfd, s
     monkeypatch.setattr(subscriptions, "SubscriptionEventCallbacks", Unsupported)
     with Peer(online__mode="manual") as peer:
         peer.drive(street[:2])
-        assert peer.pipeline.synchronizer.counts.pairs == 2
+        assert peer.pipeline.pairing.synchronizer.counts.pairs == 2
         assert [subscription.lost_share() for subscription in peer.calibration.sensors.adaptive] == [0.0] * 3
     assert capfd.readouterr().err.count("does not report lost messages") == 1
 
@@ -98,7 +98,7 @@ def test_a_driver_on_cyclone_dds_is_received(street_bag, drive, street):
         Peer(**start, reliability="reliable", online__mode="manual") as peer,
         subprocess.Popen(driver) as process,
     ):
-        counts = peer.pipeline.synchronizer.counts
+        counts = peer.pipeline.pairing.synchronizer.counts
         assert process.wait(120) == 0
         peer.until(lambda: counts.pairs == len(street), "all pairs")
         peer.settle()

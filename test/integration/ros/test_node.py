@@ -192,7 +192,7 @@ def test_from_messages_to_a_published_extrinsic(peer, street, drive):
     assert (answer.extrinsic.transform.header.frame_id, answer.extrinsic.transform.child_frame_id) == ("camera", "velodyne")
     result = result_from_message(answer.extrinsic)
     assert is_near(drive.reference, result.T_camera_lidar, 0.3, 0.08)
-    assert result.frames_used == len(peer.recalibrator.buffer) >= 5
+    assert result.frames_used == len(peer.recalibrator.keyframes) >= 5
     assert (list(answer.extrinsic.advice.weak), answer.extrinsic.advice.text) == ([], "")
     assert (answer.extrinsic.advice.progress, seconds(answer.extrinsic.advice.remaining)) == (1.0, 0.0)
     values = {value.key: value.value for value in peer.until(lambda: peer.diagnostics, "diagnostics")[-1].status[0].values}
@@ -295,7 +295,7 @@ def test_other_intrinsics_start_anew_and_other_sensors_are_turned_away(peer, str
     peer.info_pub.publish(other)
     peer.until(lambda: "intrinsics changed" in peer.last_error())
     assert peer.recalibrator is not recalibrator
-    assert len(peer.recalibrator.buffer) == 0
+    assert len(peer.recalibrator.keyframes) == 0
     now = peer.get_extrinsic()
     assert (now.success, now.last_good_known) == (False, True)  # kept: with other intrinsics it is to be tested again
     np.testing.assert_allclose(matrix(now.extrinsic), matrix(kept), atol=1e-9)
@@ -303,4 +303,4 @@ def test_other_intrinsics_start_anew_and_other_sensors_are_turned_away(peer, str
     np.testing.assert_allclose(matrix(peer.get_extrinsic().extrinsic), off(drive.reference), atol=1e-9)
     peer.publish(street[5], frame_id="rear_lidar")
     assert "rear_lidar" in peer.last_error()
-    assert len(peer.recalibrator.buffer) == 0
+    assert len(peer.recalibrator.keyframes) == 0

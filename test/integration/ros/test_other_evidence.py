@@ -34,7 +34,7 @@ def test_estimates_go_on_and_the_node_ends_while_a_model_runs(street, drive, tmp
         peer.until(lambda: "calib_deadline" in _running(others), "a model that runs")
         for k, frame in enumerate(street[1:4]):
             peer.publish(frame, settle=False)
-            peer.until(lambda n=k + 2: peer.recalibrator.keyframes_seen == n, "a keyframe")
+            peer.until(lambda n=k + 2: peer.recalibrator.keyframes.seen == n, "a keyframe")
         peer.until(lambda: peer.recalibrator.current.accepted, "an estimate without classes")
         answer = peer.get_extrinsic().extrinsic
         assert answer.status == "converged"
@@ -61,10 +61,10 @@ def test_models_come_and_go_at_run_time(street, drive, tmp_path, monkeypatch):
 
         def drives(keyframes: int, classes: bool, said: str) -> None:
             """New keyframes with classes, or without; and what /diagnostics says."""
-            assert peer.recalibrator is None or len(peer.recalibrator.buffer) == 0
+            assert peer.recalibrator is None or len(peer.recalibrator.keyframes) == 0
             peer.drive(vehicle.frame(1.0) for _ in range(keyframes))
-            assert {f.plain is not None for f in peer.recalibrator.buffer} == {classes}
-            assert not classes or all(f.view is not None for f in peer.recalibrator.buffer)
+            assert {f.plain is not None for f in peer.recalibrator.keyframes.features} == {classes}
+            assert not classes or all(f.view is not None for f in peer.recalibrator.keyframes.features)
             assert semantics(peer, said).startswith(said)
 
         drives(3, True, "3 keyframes; image_classes ")  # the builtin one
@@ -76,7 +76,7 @@ def test_models_come_and_go_at_run_time(street, drive, tmp_path, monkeypatch):
         peer.change(search__starts=128, monitor__enabled=False)
         peer.publish(vehicle.frame(1.0))
         assert peer.recalibrator.segmentation is models
-        assert len(peer.recalibrator.buffer) == 5
+        assert len(peer.recalibrator.keyframes) == 5
         peer.change(semantics__segmentation="none")
         drives(3, False, "none: no models are configured")
         assert peer.calibration.health.errors == 0, peer.last_error()
@@ -99,7 +99,7 @@ def near(T: np.ndarray) -> np.ndarray:
 
 def test_the_objective_changes_at_run_time(street, drive, monkeypatch):
     def kinds() -> list[type]:
-        return [type(f.own) for f in peer.recalibrator.buffer]
+        return [type(f.own) for f in peer.recalibrator.keyframes.features]
 
     monkeypatch.setattr("calib_ros_thesis.config.ThesisConfig.evaluations", 30)
     with Peer(**start_parameters(near(drive.reference)), **REFINE_ONLY, online__mode="manual") as peer:
@@ -118,7 +118,7 @@ def test_the_objective_changes_at_run_time(street, drive, monkeypatch):
         peer.change(thesis__operator="canny")
         assert kinds() == []
         peer.publish(street[4])
-        assert [len(f.own.image_edges) for f in peer.recalibrator.buffer] == [2]
+        assert [len(f.own.image_edges) for f in peer.recalibrator.keyframes.features] == [2]
         peer.change(refine__objective="fast")
         peer.drive(street[5:7])
         assert kinds() == 2 * [type(None)]

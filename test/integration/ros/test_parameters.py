@@ -143,7 +143,7 @@ def test_rapid_changes_while_data_flow(vehicle, monkeypatch):
     monkeypatch.setattr(
         recalibrator_module, "Calibrator", lambda *given, **named: made.append(given) or original(*given, **named)
     )
-    counts, frames = peer.pipeline.synchronizer.counts, len(GOOD_VALUES)
+    counts, frames = peer.pipeline.pairing.synchronizer.counts, len(GOOD_VALUES)
     pairs, unpaired = counts.pairs, counts.unpaired_images
 
     def change(name: str, value: Any) -> Any:
@@ -207,7 +207,7 @@ def test_settings_take_effect_at_run_time(vehicle, tmp_path):
     peer, state = vehicle.peer, tmp_path / "state.json"
     recalibrator = peer.recalibrator
     peer.change(online__buffer_size=7)
-    assert recalibrator.buffer.maxlen == 7
+    assert recalibrator.keyframes.features.maxlen == 7
     peer.change(state_file=str(state))  # from the next accepted estimate on
     vehicle.assert_recovers()
     assert json.loads(state.read_text())["status"] == "converged"

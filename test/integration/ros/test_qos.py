@@ -256,7 +256,7 @@ def test_the_node_becomes_reliable_and_loses_nothing(street, drive):
         reliable = lambda: "/points" in peer.values.get("reliable topics", "")  # noqa: E731
         until(reliable, "reliable subscriptions", lambda: peer.publish(vehicle.frame()) or next(sent))
         peer.drive(vehicle.frame() for _ in range(4))
-        number, counts = next(sent) + 4, peer.pipeline.synchronizer.counts
+        number, counts = next(sent) + 4, peer.pipeline.pairing.synchronizer.counts
         assert (counts.images, counts.clouds, counts.pairs) == 3 * (number,)
         assert all(subscription.reliable for subscription in peer.calibration.sensors.adaptive)
         assert peer.calibration.sensors.adaptive[1]._forms[1:] == livox_forms()  # whose clouds it takes as well

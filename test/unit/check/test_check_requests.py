@@ -48,7 +48,7 @@ def driven(drive: SyntheticDrive, street: list[Frame]) -> Iterator[Driven]:
 def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: SyntheticDrive) -> None:
     pipeline = driven.pipeline
     recalibrator = pipeline.recalibrator
-    before, kept, states = recalibrator.current, list(recalibrator.buffer), len(driven.states)
+    before, kept, states = recalibrator.current, list(recalibrator.keyframes.features), len(driven.states)
     of_estimates = pipeline.load.counts().seconds[Work.ESTIMATES]
     own = request_check(pipeline, CheckRequest()).result(SOON)
     assert (own.of_current, own.result.verdict) == (True, CheckVerdict.PASS), own.result.reason
@@ -57,7 +57,7 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
     wrong = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
     given = request_check(pipeline, CheckRequest(Tolerance(1.0, 0.2), wrong, 2)).result(SOON)
     assert (given.of_current, given.result.verdict) == (False, CheckVerdict.FAIL)
-    assert (recalibrator.current, list(recalibrator.buffer), len(driven.states)) == (before, kept, states)
+    assert (recalibrator.current, list(recalibrator.keyframes.features), len(driven.states)) == (before, kept, states)
     assert driven.errors == []
     assert pipeline.wait_idle(SOON)
     counts = pipeline.load.counts()

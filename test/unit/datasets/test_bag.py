@@ -196,8 +196,8 @@ def test_scans_pair_by_when_they_sweep_the_view_as_in_the_node(tmp_path, stamped
     synchronizer = Synchronizer(0.0, 8, round(-stamped_s * 1e9))
     online = []
     for made in frames:
-        online += synchronizer.add_cloud(made.moment_of_cloud, made.moment_of_cloud)
-        online += synchronizer.add_image(made.stamp, made.stamp)
+        online += synchronizer.add(False, made.moment_of_cloud, made.moment_of_cloud)
+        online += synchronizer.add(True, made.stamp, made.stamp)
     for i, made in enumerate(frames):
         assert (bag[i].stamp, bag[i].cloud_stamp) == (made.stamp, made.cloud_stamp)
     assert online == [(made.stamp, made.cloud_stamp) for made in frames][: len(online)]

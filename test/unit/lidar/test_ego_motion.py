@@ -179,7 +179,7 @@ class TestEstimate:
         for frame in (bare[0], bare[1]):
             recalibrator.selector.reset()
             assert recalibrator.ingest(frame)
-        assert [f.stamp for f in recalibrator.buffer] == [bare[1].stamp]  # the first one's motion was not known yet
+        assert [f.stamp for f in recalibrator.keyframes.features] == [bare[1].stamp]  # the first one's motion was not known yet
 
         def later(seconds):
             shift = round(seconds * NANOSECONDS)
@@ -188,7 +188,7 @@ class TestEstimate:
         recalibrator.selector.reset()
         with pytest.raises(BadTimesError, match=r"moved at .* m/s and .* deg/s 1\.\d s ago, and its motion now is unknown"):
             recalibrator.ingest(later(1.0))
-        assert (recalibrator.keyframes_seen, recalibrator.motion.left_out) == (2, 1)
+        assert (recalibrator.keyframes.seen, recalibrator.motion.left_out) == (2, 1)
         assert recalibrator.ingest(later(9.0))  # nobody knows whether it still moves
         assert recalibrator.newest().unknown_motion_s > 0
 
@@ -241,11 +241,11 @@ def test_clouds_between_the_pairs_tell_the_motion_of_a_slow_camera(drive):
     pipeline.set_camera(drive.camera)
     bare = Bare(drive)
     for k in range(5):  # every fourth scan has an image
-        pipeline.add_cloud(bare[k].cloud_stamp, bare[k])
+        pipeline.add(False, bare[k].cloud_stamp, bare[k])
         if k in (0, 4):
-            pipeline.add_image(bare[k].stamp, bare[k])
+            pipeline.add(True, bare[k].stamp, bare[k])
         assert pipeline.wait_idle(60)
-    assert pipeline.recalibrator.keyframes_seen == 2
+    assert pipeline.recalibrator.keyframes.seen == 2
     assert pipeline.recalibrator.newest().twist[3] == pytest.approx(SPEED, rel=0.03)
     assert pipeline.stop()
 
@@ -262,11 +262,11 @@ def test_pipeline_reports_it_once(drive, without_library):
     for i in range(4):
         if pipeline.recalibrator is not None:
             pipeline.recalibrator.selector.reset()
-        pipeline.add_image(drive[i].stamp, None)
-        pipeline.add_cloud(drive[i].stamp, bare[i])
+        pipeline.add(True, drive[i].stamp, None)
+        pipeline.add(False, drive[i].stamp, bare[i])
         assert pipeline.wait_idle(10)
     pipeline.stop()
-    assert pipeline.recalibrator.keyframes_seen == 4
+    assert pipeline.recalibrator.keyframes.seen == 4
     assert len([e for e in events if isinstance(e, Problem) and "small_gicp" in e.message]) == 1
 
 

@@ -51,15 +51,15 @@ def test_the_offset_is_used_and_saved_until_another_one_or_a_reset_replaces_it(s
     learnt = result.time_offset_s
     assert learnt == pytest.approx(LATE_S, abs=0.003)
     assert found.config.motion.time_offset_s == found.motion.config.time_offset_s == learnt
-    assert len(found.buffer) == 4
+    assert len(found.keyframes) == 4
     truth = scene.calibrator.extract(scene.frames[0]).points.xyz
-    assert np.abs(found.buffer[0].points.xyz - truth).max() < 0.05  # 48 cm off before
+    assert np.abs(found.keyframes.features[0].points.xyz - truth).max() < 0.05  # 48 cm off before
     later = found.estimate().result
     assert later.time_offset_s == learnt
     assert scene.is_near(later.T_camera_lidar, 0.15, 0.03)
 
     found.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))  # other parameters leave it alone
-    assert (found.config.motion.time_offset_s, len(found.buffer)) == (learnt, 4)
+    assert (found.config.motion.time_offset_s, len(found.keyframes)) == (learnt, 4)
     found.configure(update(CONFIG, {"motion": {"max_time_offset_s": 0.06}}))  # those of the motion, too: the mount has not moved
     assert found.config.motion.time_offset_s == learnt
     assert found.config.motion.time_offset_sigma_s >= CONFIG.motion.time_offset_sigma_s  # by which stamps scatter
@@ -76,7 +76,7 @@ def test_the_offset_is_used_and_saved_until_another_one_or_a_reset_replaces_it(s
     assert again.config.motion.time_offset_s == learnt
     assert again.ingest(scene.frames[0])
     again.configure(update(CONFIG, {"motion": {"time_offset_s": 0.01}}))
-    assert (again.config.motion.time_offset_s, len(again.buffer)) == (0.01, 0)
+    assert (again.config.motion.time_offset_s, len(again.keyframes)) == (0.01, 0)
 
 
 def test_a_fixed_offset_is_not_replaced(scene):

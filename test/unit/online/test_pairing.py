@@ -96,9 +96,9 @@ class Drive:
         for _, kind, stamp, item in sorted(arrivals):
             at = T0 + round(stamp * MS)
             if kind == "image":
-                self.pairs += self.synchronizer.add_image(at, item)
+                self.pairs += self.synchronizer.add(True, at, item)
                 continue
-            self.pairs += self.synchronizer.add_cloud(at, item + 1000 * swept)
+            self.pairs += self.synchronizer.add(False, at, item + 1000 * swept)
             if sweep.ns is None:
                 sweep.add(spinner.cloud(), CAMERA, FORWARD)
                 assert sweep.ns is not None
@@ -194,7 +194,7 @@ def test_every_stamping_rate_and_phase_pairs_with_the_scan_that_swept_the_view(s
 def test_nothing_pairs_before_the_sweep_is_known():
     synchronizer = Synchronizer(0.0, 8, None)
     for k in range(20):
-        assert synchronizer.add_image(T0 + 100 * k * MS, k) == synchronizer.add_cloud(T0 + (100 * k - 60) * MS, k) == []
+        assert synchronizer.add(True, T0 + 100 * k * MS, k) == synchronizer.add(False, T0 + (100 * k - 60) * MS, k) == []
     pairs = synchronizer.set_cloud_offset(60 * MS)
     assert [image for image, _ in pairs] == [cloud for _, cloud in pairs]
     assert len(pairs) >= 7
@@ -219,7 +219,7 @@ class Watched:
             while at >= second:
                 said.append(self.health.check())
                 second += 1000.0
-            getattr(self.synchronizer, f"add_{kind}")(T0 + round(stamp * MS), None)
+            self.synchronizer.add(kind == "image", T0 + round(stamp * MS), None)
         return said
 
 

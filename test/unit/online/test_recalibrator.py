@@ -90,8 +90,8 @@ def test_on_an_empty_road_the_extrinsic_stays_and_nothing_is_estimated(drive, st
     assert extrinsic.result.frames_used == 2 * FRAMES - 1
     assert near(extrinsic.result.T_camera_lidar, truth)
     for f in nothing * 2:  # until nothing else is left in the buffer
-        recalibrator.ingest(replace(f, stamp=recalibrator.buffer[-1].stamp + 2 * NANOSECONDS))
-    assert (len(recalibrator.buffer), recalibrator.ready()) == (2 * FRAMES, False)
+        recalibrator.ingest(replace(f, stamp=recalibrator.keyframes.features[-1].stamp + 2 * NANOSECONDS))
+    assert (len(recalibrator.keyframes), recalibrator.ready()) == (2 * FRAMES, False)
     assert recalibrator.current.result.status == CONVERGED
     assert near(recalibrator.current.result.T_camera_lidar, truth)
 
@@ -125,8 +125,8 @@ def test_estimate_waits_for_min_keyframes_and_the_buffer_keeps_the_newest(drive,
         ready.append(recalibrator.ready())
     assert ready == [False, False, True, True]
     assert not recalibrator.ingest(later(drive[-1], 0.1))  # the same picture
-    assert recalibrator.keyframes_seen == FRAMES
-    assert [f.stamp for f in recalibrator.buffer] == [f.stamp for f in drive[-3:]]
+    assert recalibrator.keyframes.seen == FRAMES
+    assert [f.stamp for f in recalibrator.keyframes.features] == [f.stamp for f in drive[-3:]]
     assert recalibrator.newest().name == drive[-1].name
 
 
@@ -171,7 +171,7 @@ def test_blind_sensors_are_reported_and_make_no_keyframes(drive, start, truth):
         assert not recalibrator.ingest(black(frame))
         assert recalibrator.current.result.status == BLINDED
         assert np.array_equal(recalibrator.current.result.T_camera_lidar, good.result.T_camera_lidar)
-    assert (recalibrator.keyframes_seen, recalibrator.ready()) == (FRAMES, False)
+    assert (recalibrator.keyframes.seen, recalibrator.ready()) == (FRAMES, False)
     # Who asks gets an estimate over what was seen before; it still shows nothing now.
     assert recalibrator.estimate(force_search=True).result.status == BLINDED
     assert near(recalibrator.current.result.T_camera_lidar, truth)
@@ -234,7 +234,7 @@ def test_mount_displacement_is_reported_at_once_and_the_new_extrinsic_found(disp
     last = told[-1][1].result
     assert near(last.T_camera_lidar, displaced[-1].reference)
     assert last is good
-    assert all(f.stamp >= displaced[BEFORE].stamp for f in recalibrator.buffer)
+    assert all(f.stamp >= displaced[BEFORE].stamp for f in recalibrator.keyframes.features)
 
 
 def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrator:
@@ -331,7 +331,7 @@ def test_features_in_extraction_are_dropped_after(drive, start, interrupt, monke
 
     monkeypatch.setattr(recalibrator.calibrator, "extract", interrupted)
     recalibrator.ingest(drive[1])
-    assert (len(recalibrator.buffer), recalibrator.ready()) == (0, False)
+    assert (len(recalibrator.keyframes), recalibrator.ready()) == (0, False)
     monkeypatch.undo()
     assert recalibrator.ingest(drive[1])
 
@@ -341,10 +341,10 @@ def test_configure_keeps_keyframes_whose_features_stay_the_same(drive, start):
     recalibrator.estimate()
     changes = {"search": {"seed": 5}, "refine": {"max_p_value": 0.02}, "online": {"buffer_size": 3}}
     recalibrator.configure(update(CONFIG, changes))
-    assert [f.name for f in recalibrator.buffer] == [f.name for f in drive[-3:]]
+    assert [f.name for f in recalibrator.keyframes.features] == [f.name for f in drive[-3:]]
     assert (recalibrator.calibrator.config.search.seed, recalibrator.current.accepted) == (5, 1)
     recalibrator.configure(update(recalibrator.config, {"online": {"similarity_threshold": 0.5, "buffer_size": 10}}))
-    assert (recalibrator.selector.config.similarity_threshold, recalibrator.buffer.maxlen) == (0.5, 10)
+    assert (recalibrator.selector.config.similarity_threshold, recalibrator.keyframes.features.maxlen) == (0.5, 10)
 
 
 @pytest.mark.parametrize(
@@ -354,14 +354,15 @@ def test_configure_drops_keyframes_whose_features_change(drive, start, change):
     recalibrator = taken_in([drive[0], drive[-1]], start)
     recalibrator.estimate()
     recalibrator.configure(update(CONFIG, change))
-    assert len(recalibrator.buffer) == 0
+    assert len(recalibrator.keyframes) == 0
     assert not recalibrator.ready()
     assert recalibrator.current.accepted == 1  # the extrinsic stays
     # Even a standing vehicle's scene is taken in again, with the new constants.
     assert recalibrator.ingest(drive[-1])
     fresh = Calibrator(drive[0].camera, update(CONFIG, change)).extract(drive[-1])
-    assert np.array_equal(recalibrator.buffer[0].points.xyz, fresh.points.xyz)
-    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(recalibrator.buffer[0].levels, fresh.levels, strict=True))
+    oldest = recalibrator.keyframes.features[0]
+    assert np.array_equal(oldest.points.xyz, fresh.points.xyz)
+    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(oldest.levels, fresh.levels, strict=True))
 
 
 # ---- refined intrinsics -------------------------------------------------------------------------------------------------

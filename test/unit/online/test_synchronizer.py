@@ -23,8 +23,7 @@ class Streams:
         self.pairs: Pairs = []
 
     def add(self, kind: str, ms: float) -> Pairs:
-        take = self.synchronizer.add_image if kind == "i" else self.synchronizer.add_cloud
-        pairs = take(T0 + round(ms * MS), ms)
+        pairs = self.synchronizer.add(kind == "i", T0 + round(ms * MS), ms)
         self.pairs += pairs
         c, p = self.synchronizer.counts, self.synchronizer
         assert c.pairs == len(self.pairs)

@@ -127,17 +127,6 @@ def test_an_idle_worker_stops_at_once_and_takes_nothing_any_more(make):
         recorder.worker.check_cancelled("stage", 0.6)
 
 
-def test_what_waits_can_be_taken_in_place_of_what_is_worked_on(make) -> None:
-    recorder = make(blocked=True)
-    recorder.begin("old")
-    assert recorder.worker.newer("old") == "old"
-    recorder.worker.put("new")
-    assert recorder.worker.newer("old") == "new"
-    recorder.go.set()
-    assert recorder.worker.wait_idle(SOON)
-    assert recorder.items == ["old"]
-
-
 def test_an_interpreter_that_ends_waits_for_the_item_under_way_and_says_nothing():
     """Although nobody has stopped the worker, and it hands what it made to another one."""
     script = """

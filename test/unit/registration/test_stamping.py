@@ -75,7 +75,7 @@ def test_the_recalibrator_moves_its_keyframes_to_the_convention(end_of_the_scan)
     assert recalibrator.config.motion.spin == "counterclockwise"
     assert recalibrator.current.result.stamping == Stamping("counterclockwise", 0.0)
     expected = scene.calibrator.extract(scene.frames[0]).points.xyz
-    moved = recalibrator.buffer[0].points.xyz
+    moved = recalibrator.keyframes.features[0].points.xyz
     assert moved.shape == expected.shape
     assert np.median(np.abs(moved - expected)) < 0.005
 

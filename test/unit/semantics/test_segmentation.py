@@ -299,19 +299,19 @@ def test_models_stay_loaded_until_their_configuration_changes(drive, start):
     for stages, kept in (({"search": {"starts": 64}}, 1), ({"image": {"max_width": 320}}, 0)):
         recalibrator.configure(update(recalibrator.config, stages))
         assert [m.model for m in recalibrator.segmentation.models] == loaded
-        assert len(recalibrator.buffer) == kept
+        assert len(recalibrator.keyframes) == kept
     recalibrator.configure(with_models(recalibrator.config, cloud_classes="geometric"))
     assert recalibrator.segmentation is recalibrator.calibrator.segmentation is not models
-    assert len(recalibrator.buffer) == 0
+    assert len(recalibrator.keyframes) == 0
 
 
 def test_a_keyframe_is_replaced_by_its_semantic_features(drive, start):
     recalibrator = recalibrator_of(drive, start, with_models(**SOURCE))
     assert recalibrator.segment_keyframe() == ()  # there is nothing yet
     assert [recalibrator.ingest(f) for f in drive[:2]] == [True, True]
-    plain = list(recalibrator.buffer)
+    plain = list(recalibrator.keyframes.features)
     assert recalibrator.segment_keyframe() == ()
-    first, second = recalibrator.buffer
+    first, second = recalibrator.keyframes.features
     assert first is plain[0]  # the newest counts; this one was given up
     assert second is not plain[1]
     assert second.plain.points.xyz.tobytes() == plain[1].points.xyz.tobytes()
@@ -319,7 +319,7 @@ def test_a_keyframe_is_replaced_by_its_semantic_features(drive, start):
     assert second.points.label is not None
     assert second.view is not None
     assert recalibrator.segment_keyframe() == ()
-    assert list(recalibrator.buffer) == [first, second]
+    assert list(recalibrator.keyframes.features) == [first, second]
     assert recalibrator.segmented[0] == 1
     took = r"1 keyframes; image_classes \d+\.\d s; cloud_classes \d+\.\d s; image_classes source; cloud_classes source"
     assert re.fullmatch(took, recalibrator.describe_semantics())
@@ -364,13 +364,13 @@ def test_buffer_changes_during_segmentation(drive, start):
     recalibrator.ingest(drive[0])
     drives_on = [partial(recalibrator.ingest, frame) for frame in drive[1:3]]
     assert recalibrator.segment_keyframe(meanwhile(*drives_on)) == ()
-    assert [f.name for f in recalibrator.buffer] == [f.name for f in drive[1:3]]  # the first has left
-    assert all(f.plain is None for f in recalibrator.buffer)
+    assert [f.name for f in recalibrator.keyframes.features] == [f.name for f in drive[1:3]]  # the first has left
+    assert all(f.plain is None for f in recalibrator.keyframes.features)
     assert recalibrator.segment_keyframe() == ()
-    assert [f.plain is None for f in recalibrator.buffer] == [True, False]
+    assert [f.plain is None for f in recalibrator.keyframes.features] == [True, False]
     recalibrator.ingest(drive[3])
     assert recalibrator.segment_keyframe(meanwhile(recalibrator.reset, partial(recalibrator.ingest, drive[3]))) == ()
-    (only,) = recalibrator.buffer
+    (only,) = recalibrator.keyframes.features
     assert (only.name, only.plain) == (drive[3].name, None)  # what was seen is of the keyframe before the reset
     assert recalibrator.segment_keyframe() == ()
     assert recalibrator.newest().plain.points.xyz.tobytes() == only.points.xyz.tobytes()
@@ -393,7 +393,7 @@ def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
         assert recalibrator.ingest(frame)
         if k % 2:
             assert recalibrator.segment_keyframe() == ()
-    assert [f.plain is None for f in recalibrator.buffer] == [True, False, True, False]
+    assert [f.plain is None for f in recalibrator.keyframes.features] == [True, False, True, False]
     found = recalibrator.estimate().result
     assert found.status == CONVERGED, found.reason
     assert found.frames_used == FRAMES
@@ -409,8 +409,8 @@ def test_points_have_classes_for_another_objective_once_an_estimate_has_left_dou
         assert recalibrator.ingest(frame)
         assert recalibrator.segments_keyframes
         assert recalibrator.segment_keyframe() == ()
-    assert [f.own.blended for f in recalibrator.buffer] == 3 * [OF_CLASSES]
-    assert [f.view is None for f in recalibrator.buffer] == [True, True, False]
+    assert [f.own.blended for f in recalibrator.keyframes.features] == 3 * [OF_CLASSES]
+    assert [f.view is None for f in recalibrator.keyframes.features] == [True, True, False]
 
 
 def test_frames_weigh_by_their_share_of_main_classes(drive, source):
@@ -556,4 +556,4 @@ def test_a_first_guess_gets_classes_after_a_reset_and_where_it_is_asked_for_late
     recalibrator.ingest(drive[0])
     recalibrator.configure(update(QUICK, asks))
     assert recalibrator.first_guess.needs_classes
-    assert len(recalibrator.buffer) == 0  # their points have classes near the nominal view only
+    assert len(recalibrator.keyframes) == 0  # their points have classes near the nominal view only
