@@ -29,7 +29,6 @@ CLASSES_EVERY_S = 30.0  # of one keyframe
 # At rest estimates are at most so far apart, s: the tracker expects the mount to drift in a minute. Keyframes come so many times
 # as often, from the first distance to the longest, s: within the 5 s in which a displacement is to be told that no look sees.
 LONGEST_REST_S, KEYFRAMES_PER_REST, REST_SPACING_S = 60.0, 6, (2.0, 5.0)
-WAITS_IN_STEP = 5  # times online.rest_period_s, between estimates that others let wait: most of the buffer is new by then
 CLASSES_RESERVE = 0.5  # share of what can be saved up that must be there for classes: keyframes and estimates have the rest
 
 
@@ -250,8 +249,6 @@ class Schedule:
         if self.newest is None or self._estimated is None or (periodic and urgent):
             return True
         wait_s = self.config.rest_period_s if at_rest or waits else 0.0
-        if waits and self._in_step:
-            wait_s *= WAITS_IN_STEP
         if at_rest:
             wait_s = max(wait_s, min(self._steady_by_estimate_s, LONGEST_REST_S))
         elapsed = (self.newest - self._estimated) / NANOSECONDS
@@ -262,6 +259,5 @@ class Schedule:
         """Smallest time between keyframes, s."""
         shortest, longest = REST_SPACING_S
         spacing_s = min(max(shortest, self._steady_s / KEYFRAMES_PER_REST), longest)
-        if not self._in_step or spacing_s == longest:
-            return spacing_s
-        return longest / 2 if self._steady_s else longest / 4  # cameras come to rest at different times, and stay in step
+        # Cameras come to rest at different times, and halves of the longest are in step with it.
+        return spacing_s if not self._in_step or spacing_s == longest else longest / 2

@@ -39,6 +39,7 @@ from calib_ros.result import Extrinsic, Result
 
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
+LONGEST_ROUND_S = 3.0  # that a pair waits for those of the same scan to be done
 
 
 class Pipeline:
@@ -116,7 +117,8 @@ class Pipeline:
             if not self.recalibrator.wants(stamp):
                 self.rested_pairs += len(found)
                 return
-            if self._scans is not None and not self._common.joins(stamp):
+            late = time.monotonic() - self._handed > LONGEST_ROUND_S  # others must not come first for ever
+            if self._scans is not None and not (late or self._common.joins(stamp)):
                 self.dropped_pairs += sum(intake.paired for intake in found)
                 return
         if found:

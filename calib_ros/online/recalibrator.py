@@ -136,9 +136,9 @@ class Recalibrator:
         return self.config.online.rest_period_s > 0 and self.tracker.steady and self._keyframes_fit
 
     @property
-    def only_tests(self) -> bool:
-        """True while keyframes are needed for tests alone: at rest; and for a camera of a rig, beside which others want the time,
-        while all that come move as those in the last estimate."""
+    def looks_seldom(self) -> bool:
+        """True while looks may be seldom: at rest; and for a camera of a rig, beside which others want the time, while all
+        keyframes that come move as those in the last estimate."""
         return self.at_rest or (self._scans is not None and self._waits_for_motion())
 
     def _waits_for_motion(self) -> bool:
@@ -203,7 +203,7 @@ class Recalibrator:
         if not (self.at_rest or self._scans is not None) or self.config.lidar.accumulate_s > 0:
             return True
         doubt = self.glance.struck or self.monitor.in_doubt or self.sensors.faulty_frames > 0
-        return doubt or self.glance.is_due(stamp, self.only_tests)
+        return doubt or self.glance.is_due(stamp, self.looks_seldom)
 
     def ingest(
         self, frame: Frame, scan_before: ScanBefore = lambda since: None, permit: Callable[[], bool] = lambda: True
@@ -221,7 +221,7 @@ class Recalibrator:
         if self.first_guess.pending:
             self.first_guess.add(frame)
         self.schedule.add_frame(frame.stamp, self.tracker.steady)
-        spacing_s, moment = self.schedule.keyframes_at_rest_s if self.only_tests else 0.0, self._moment(frame)
+        spacing_s, moment = self.schedule.keyframes_at_rest_s if self.at_rest else 0.0, self._moment(frame)
         if problem is not None or not self.speed_gate.allows(frame):
             return False
         is_keyframe = self.selector.select(frame.image, moment, permit, spacing_s)
@@ -264,7 +264,7 @@ class Recalibrator:
     def _worth_a_test(self, frame: Frame) -> bool:
         """Whether a frame that is no keyframe is to be tested by the monitor: it matches worse than others, or there is doubt."""
         moment = self._moment(frame)
-        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(moment, self.only_tests)):
+        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(moment, self.looks_seldom)):
             return False
         self.glance.put_off(moment)
         if self.glance.struck or self.monitor.in_doubt or self.tracker.suspect:

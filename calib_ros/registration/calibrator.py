@@ -72,10 +72,8 @@ class Calibrator:
         The models of ``config.semantics``, where they are loaded already.
     given : Camera, optional
         The intrinsics that were stated, where `camera` corrects them: what they leave open is then told by the joint estimate.
-    scans : ScanEdges, optional
-        Edges of scans by their stamps, shared with the calibrators of other cameras beside the same LiDAR.
-    pictures : Recent, optional
-        Those of pictures, shared with the calibrators of the same camera beside other LiDARs.
+    scans, pictures : optional
+        Edges of scans and of pictures, shared with the calibrators of other pairs, see `FeatureExtractor`.
     """
 
     def __init__(
