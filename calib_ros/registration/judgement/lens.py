@@ -58,7 +58,8 @@ AT_ONCE = 30000  # points that OpenCV samples at once
 # radius: pixels are square to 0.2 %, and calibrations of one lens differ by 1 to 3 px. And of values that are plainly wrong.
 ASPECT_USUAL, RADIAL_USUAL, GROSS = 0.002, 0.004, 0.03
 SQUARE = 3 * ASPECT_USUAL  # of pixels that are stated to be so two things must be wrong: the pixels, and what is said of them
-ACCUSING = float(ndtri(0.995))  # standard deviations of what is accused: a right one shows as much in 1 % of cases
+ACCUSED = 0.01  # share of right ones that show as much as what is accused
+ACCUSING = float(ndtri(1 - ACCUSED / 2))  # standard deviations of that
 DRAWS = 512  # from an explanation: tell a probability to 1 %
 OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes then tell as much
 
@@ -279,12 +280,15 @@ class LensEstimate:
         fault = LensFault(self, _main(part, best), best.mean, 1.0)
         # What is not shown, and only expected to be as it may be usually, accuses nothing.
         shown = abs(self.change[fault.k]) > ACCUSING * self.sigma[fault.k]
-        if shown and ratio > np.log(1 / doubt - 1):
+        # Nor what the score hardly gains by: its top may be narrower than the way to it is high.
+        n = len(self.unknowns)
+        gains = 2 * self.gain > n * fdtri(n, self.freedom, 1 - ACCUSED)
+        if gains and shown and ratio > np.log(1 / doubt - 1):
             return fault
         if sum(off) <= OPEN_PROBABILITY:
             return None
         most = self.explanations[int(np.argmax(off))]
-        return LensFault(self, _main(moves, most), most.mean, 1.0 if sum(off) >= 1 - doubt else sum(off))
+        return LensFault(self, _main(moves, most), most.mean, 1.0 if gains and sum(off) >= 1 - doubt else min(sum(off), 1 - 1e-9))
 
     def seen(self, score: PointScore) -> tuple[PointScore, Transform]:
         """A score as it is by the lens that is expected by now, and the extrinsic (4, 4) there."""

@@ -141,6 +141,12 @@ def test_square_pixels_are_doubted_less_readily_than_others():
     assert shown(ASPECT, 0.03, 0.003, 0.3, square).fault(0.5, 0.1) is not None
 
 
+def test_no_lens_is_blamed_where_the_score_hardly_gains():
+    estimate = shown(RADIAL, -0.05, 0.005, 0.3)
+    fault = replace(estimate, gain=1.0).fault(0.5, 0.1)
+    assert fault is None or fault.refusal(LENSES[0], 0.5, 0.1).code is RefusalCode.TOO_UNCERTAIN
+
+
 def test_they_are_checked_where_it_is_wanted(scene):
     camera = wrong(scene.camera, -0.04)
     unchecked = calibrated(scene, camera, refine={"tolerance_deg": 180.0, "tolerance_m": 100.0})
