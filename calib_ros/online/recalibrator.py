@@ -52,11 +52,16 @@ class Recalibrator:
     `ingest` takes frames, `segment_keyframe` adds semantics to a keyframe, `estimate` estimates from all keyframes. Each of them
     may run on a thread of its own: an estimate works on a copy of the buffer's references.
 
-    camera: intrinsics of all frames. initial: T_camera_lidar (4, 4), or a Result, to start from, which `reset` goes back to.
-    config: replaced by `configure`. camera_frame, lidar_frame: names, for the results. current: the extrinsic to go on with,
-    where it is another than the initial one. speed_gate: one that is fed with odometry from outside. scans, pictures: what is
-    found out of those of the LiDAR and of the camera, shared with the recalibrators of other pairs. models: those of a
-    configuration, which are loaded already where others use them.
+    Parameters
+    ----------
+    camera : intrinsics of all frames.
+    initial : T_camera_lidar (4, 4), or a Result, to start from, which `reset` goes back to.
+    config : replaced by `configure`.
+    camera_frame, lidar_frame : names, for the results.
+    current : the extrinsic to go on with, where it is another than the initial one.
+    speed_gate : one that is fed with odometry from outside.
+    scans, pictures : what is found out of those of the LiDAR and of the camera, shared with the recalibrators of other pairs.
+    models : those of a configuration, which are loaded already where others use them.
     """
 
     def __init__(

@@ -17,7 +17,7 @@ from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES
 from calib_ros.datasets.folder import CLOUDS, IMAGES, named_files
 from calib_ros.datasets.open import is_bag, open_dataset
 from calib_ros.datasets.rig import named_rig, open_rig
-from calib_ros.datasets.rig_source import CAMERA, LIDAR, RecordedRig, RigDescription, RigSource, Sensor
+from calib_ros.datasets.rig_source import CAMERA, LIDAR, RigDescription, RigSource, Sensor
 from calib_ros.errors import BadInputError
 from calib_ros.rig.edges import SEEN, seen_share
 
@@ -44,7 +44,7 @@ def recorded_rig(text: str) -> tuple[RigDescription, RigSource, Remarks]:
     reference = max(kinds[LIDAR], key=lambda lidar: _cameras_with(rig, lidar, poses[lidar]) if several else 0)
     rig.reference_sensor = reference
     named = [replace(own, prior=None if own.name == reference else poses[reference][own.name]) for own in sensors]
-    cameras, lidars = (", ".join(kinds[kind]) for kind in (CAMERA, LIDAR))
+    cameras, lidars = map(", ".join, kinds.values())
     why = ", with which most cameras share a view" if several else ""
     remarks.append(f"as recorded: cameras {cameras}; LiDARs {lidars}; poses are relative to {reference}{why}")
     return RigDescription(tuple(named), reference), rig, remarks
@@ -72,8 +72,7 @@ def _poses(rig: RigSource, sensors: Sequence[Sensor], reference: str) -> dict[st
 
 def _cameras_with(rig: RigSource, lidar: str, poses: dict[str, Transform | None]) -> int:
     """How many cameras share a view with a LiDAR, by its middle scan. poses: (4, 4) relative to it."""
-    scans = rig.scans(lidar)
-    if not len(scans):
+    if not len(scans := rig.scans(lidar)):
         return 0
     xyz = scans[len(scans) // 2][1].xyz
     points = xyz[np.isfinite(xyz).all(axis=1)].astype(float)
@@ -85,7 +84,8 @@ def _sensors_of(text: str) -> tuple[list[Sensor], Remarks]:
     """All sensors of a recording, and what is left out of it."""
     path = Path(text).expanduser()
     if not path.exists() and (rig := named_rig(text)) is not None:
-        return list(_of_named(rig)), []
+        of_kinds = (LIDAR, rig.lidars), (CAMERA, rig.cameras)
+        return [Sensor(name, kind, prior=rig.prior(name)) for kind, names in of_kinds for name in names], []
     if path.exists() and is_bag(path):
         return _of_bag(path)
     folders = sorted(child for child in path.iterdir() if child.is_dir()) if path.is_dir() else []
@@ -95,11 +95,6 @@ def _sensors_of(text: str) -> tuple[list[Sensor], Remarks]:
     cameras = list(getattr(source, "cameras", ()))
     found = [Sensor(name if re.match("[A-Za-z]", name) else f"{CAMERA}_{name}", CAMERA, name) for name in cameras]
     return [Sensor(source.lidar_frame, LIDAR), *(found or [Sensor(source.camera_frame, CAMERA)])], []
-
-
-def _of_named(rig: RecordedRig) -> Iterator[Sensor]:
-    for name in (*rig.lidars, *rig.cameras):
-        yield Sensor(name, LIDAR if name in rig.lidars else CAMERA, prior=rig.prior(name))
 
 
 def _of_bag(path: Path) -> tuple[list[Sensor], Remarks]:

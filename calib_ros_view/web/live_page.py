@@ -39,11 +39,11 @@ FORGOTTEN_S = 30.0  # after which keyframes that were drawn are drawn anew for w
 
 def live_page(feed: Watch | RigSession, pictures: Pictures, gallery: Gallery | None = None, back: str = "") -> None:
     """Build the page for one browser. gallery: of a node. back: address of the page that it belongs to, "" = none."""
-    part: RigPart | PairPart
+    part: RigView | PairView
     if isinstance(feed, RigSession) or gallery is None or feed.rig is not None:
-        part, keys = RigPart(feed, pictures), KEYS_OF_RIG
+        part, keys = RigView(feed, pictures), KEYS_OF_RIG
     else:
-        part, keys = PairPart(feed, gallery, pictures), KEYS_OF_PAIR
+        part, keys = PairView(feed, gallery, pictures), KEYS_OF_PAIR
     ui.add_css(html.CSS + CSS)
     with theme.bar(feed.name, keys, back) as (switch, listed):
         part.build_bar()
@@ -72,7 +72,7 @@ def _html() -> ui.html:
     return ui.html("", sanitize=False).classes("w-full")
 
 
-class RigPart:
+class RigView:
     """All sensors of a rig."""
 
     def __init__(self, feed: Watch | RigSession, pictures: Pictures) -> None:
@@ -192,7 +192,7 @@ class Gallery:
         return keyframes > 0
 
 
-class PairPart:
+class PairView:
     """A pair of a running node: its status, services, last hour, pictures."""
 
     def __init__(self, watch: Watch, gallery: Gallery, pictures: Pictures) -> None:
