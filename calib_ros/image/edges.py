@@ -169,7 +169,7 @@ def blurred_levels(
         # At most the size of the image, whatever the focal length, and at least one pixel remains.
         blur = min(max(sigma * focal_length / REFERENCE_FOCAL_LENGTH, MIN_SIGMA), max(height, width))
         scale = 1 << int(np.log2(min(max(blur / STORED_BLUR, 1), height, width)))
-        blur = max(blur, least * focal_length)  # the size stays: frames lie side by side
+        blur = max(blur, min(least * focal_length, height, width))  # the size stays: frames lie side by side
         levels.append(EdgeLevel(np.stack([_blurred(e, blur, scale, local_contrast) for e in edges]), scale, blur))
     return levels
 

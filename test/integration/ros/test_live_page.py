@@ -28,7 +28,7 @@ def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(live, open_p
     def ask(key: str, question: str) -> None:
         press(browser, key)
         shows(browser, question)
-        until(lambda: browser.execute_script("return document.activeElement.innerText.includes('Yes')"), "the focus")
+        until(lambda: browser.execute_script("return document.activeElement.innerText.trim() == 'Yes'"), "the focus")
 
     shows(browser, "No node /calib_ros is heard", "ROS_DOMAIN_ID")
     with Peer(**start_parameters(drive.reference), **QUICK, online__mode="manual", initial_from_tf=False) as peer:
@@ -49,7 +49,7 @@ def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(live, open_p
         ask("c", "Search and estimate now?")
         press(browser, ENTER)
         shows(browser, "~/calibrate (")
-        assert recalibrator.current.accepted == 1
+        until(lambda: recalibrator.current.accepted == 1, "the estimate that was asked for")
         peer.change(search__starts=1 << 20)  # minutes
         ask("c", "Search and estimate now?")
         press(browser, ENTER)

@@ -135,7 +135,7 @@ def test_no_level_is_sharper_than_what_meets_it_is_placed():
     levels = edge_levels(texture(), 720, least=2.5 / 720)
     assert [level.sigma for level in levels] == pytest.approx([16, 8, 4, 2.5, 2.5])
     assert [level.scale for level in levels] == [8, 4, 2, 1, 1]
-    assert np.array_equal(levels[3].packed, levels[4].packed)
+    assert edge_levels(texture(), 1e9, least=0.01)[-1].sigma <= 320  # no wider than the picture, whatever the focal length
 
 
 def test_maps_are_standardised():
