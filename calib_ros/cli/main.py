@@ -126,6 +126,8 @@ def _rig(args: argparse.Namespace) -> int:
     check_json(args.json)
     if args.report is not None and "rig" not in extensions.names(extensions.PAGES):
         raise BadInputError("--report needs calib_ros_check, which this installation leaves out")
+    if args.write_rig is not None:
+        check_output(args.write_rig, "--write-rig")
     write_page = None if args.report is None else extensions.load(extensions.PAGES, "rig")(args.report)
     for path in args.out:
         check_out(path)
@@ -138,11 +140,9 @@ def _rig(args: argparse.Namespace) -> int:
     else:
         description, rig, remarks = recorded_rig(args.source)
         if args.write_rig is not None:
-            check_output(args.write_rig, "--write-rig")
             write_atomically(args.write_rig, rig_yaml(description).encode())
-        description, left = joined(description, args.source)
-        for remark in (*remarks, *left):
-            note(f"calib-ros: {remark}")
+        description = joined(description, args.source, remarks)
+        note("\n".join(f"calib-ros: {remark}" for remark in remarks))
     if before is not None and set(before.poses) != {sensor.name for sensor in description.sensors}:
         names = ", ".join(before.poses)
         raise BadInputError(

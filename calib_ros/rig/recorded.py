@@ -44,21 +44,22 @@ def recorded_rig(text: str) -> tuple[RigDescription, RigSource, Remarks]:
     reference = max(kinds[LIDAR], key=lambda lidar: _cameras_with(rig, lidar, poses[lidar]) if several else 0)
     rig.reference_sensor = reference
     named = [replace(own, prior=None if own.name == reference else poses[reference][own.name]) for own in sensors]
-    cameras, lidars = map(", ".join, kinds.values())
     why = ", with which most cameras share a view" if several else ""
+    cameras, lidars = map(", ".join, kinds.values())
     remarks.append(f"as recorded: cameras {cameras}; LiDARs {lidars}; poses are relative to {reference}{why}")
     return RigDescription(tuple(named), reference), rig, remarks
 
 
-def joined(description: RigDescription, text: str) -> tuple[RigDescription, Remarks]:
-    """The sensors whose poses are known. Raises BadInputError where these are no camera with a LiDAR."""
+def joined(description: RigDescription, text: str, remarks: Remarks) -> RigDescription:
+    """The sensors whose poses are known; of the others a remark is added. BadInputError where there is no camera among them."""
     known = tuple(own for own in description.sensors if own.prior is not None or own.name == description.reference)
     lost = [own.name for own in description.sensors if own not in known]
     cure = "record /tf_static, or set their prior in the file that --write-rig writes and give it with --rig"
     if not any(own.kind == CAMERA for own in known):
-        raise BadInputError(f"{text} does not state where {', '.join(lost)} are relative to {description.reference}; {cure}")
-    left = [f"left out, since the recording does not state where they are: {', '.join(lost)}; {cure}"] if lost else []
-    return replace(description, sensors=known), left
+        unknown = f"{text} does not state where {', '.join(lost)} are relative to {description.reference}; {cure}"
+        raise BadInputError("; ".join([unknown, *remarks]))
+    remarks += [f"left out, since the recording does not state where they are: {', '.join(lost)}; {cure}"] if lost else []
+    return replace(description, sensors=known)
 
 
 def _poses(rig: RigSource, sensors: Sequence[Sensor], reference: str) -> dict[str, Transform | None]:
@@ -72,12 +73,11 @@ def _poses(rig: RigSource, sensors: Sequence[Sensor], reference: str) -> dict[st
 
 def _cameras_with(rig: RigSource, lidar: str, poses: dict[str, Transform | None]) -> int:
     """How many cameras share a view with a LiDAR, by its middle scan. poses: (4, 4) relative to it."""
-    if not len(scans := rig.scans(lidar)):
-        return 0
-    xyz = scans[len(scans) // 2][1].xyz
+    scans = rig.scans(lidar)
+    xyz = scans[len(scans) // 2][1].xyz if len(scans) else np.zeros((0, 3))
     points = xyz[np.isfinite(xyz).all(axis=1)].astype(float)
-    at = ((name, poses[name]) for name in rig.cameras)
-    return sum(T is not None and seen_share(rig.camera(name), se3.inverse(T), points) >= SEEN for name, T in at)
+    at = {name: T for name in rig.cameras if (T := poses[name]) is not None}
+    return sum(seen_share(rig.camera(name), se3.inverse(T), points) >= SEEN for name, T in at.items())
 
 
 def _sensors_of(text: str) -> tuple[list[Sensor], Remarks]:
@@ -92,9 +92,9 @@ def _sensors_of(text: str) -> tuple[list[Sensor], Remarks]:
     if any((child / IMAGES).is_dir() for child in folders):
         return list(_of_folders(folders)), []
     source = open_dataset(text)
-    cameras = list(getattr(source, "cameras", ()))
-    found = [Sensor(name if re.match("[A-Za-z]", name) else f"{CAMERA}_{name}", CAMERA, name) for name in cameras]
-    return [Sensor(source.lidar_frame, LIDAR), *(found or [Sensor(source.camera_frame, CAMERA)])], []
+    names = getattr(source, "cameras", ())
+    found = [Sensor(name if re.match("[A-Za-z]", name) else f"{CAMERA}_{name}", CAMERA, name) for name in names]
+    return [Sensor(_token(source.lidar_frame), LIDAR), *(found or [Sensor(_token(source.camera_frame), CAMERA)])], []
 
 
 def _of_bag(path: Path) -> tuple[list[Sensor], Remarks]:
@@ -144,8 +144,8 @@ def _names(topics: Sequence[str]) -> dict[str, str]:
     named: dict[str, str] = {}
     for topic in topics:
         parts = [part for part in topic.split("/") if part and not NO_NAME.fullmatch(part)]
-        name = _token("_".join(parts) or topic.strip("/"))
-        named[topic] = name if name not in named.values() else _token(topic.strip("/"))
+        names = "_".join(parts) or topic, topic, *(f"{topic}_{k}" for k in range(2, len(topics) + 2))
+        named[topic] = next(own for own in map(_token, names) if own not in named.values())
     return named
 
 
