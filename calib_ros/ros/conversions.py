@@ -6,7 +6,6 @@ import array
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -97,14 +96,8 @@ def transform_message(T: NDArray[np.float64], parent: str, child: str, stamp: in
     msg.header.frame_id, msg.child_frame_id, msg.header.stamp = parent, child, time_message(stamp)
     t, q = msg.transform.translation, msg.transform.rotation
     t.x, t.y, t.z = (float(x) for x in T[:3, 3])
-    q.x, q.y, q.z, q.w = _quaternion(T[:3, :3].astype(float).tobytes())
+    q.x, q.y, q.z, q.w = (float(x) for x in se3.quaternion_from_rotation(T[:3, :3]))
     return msg
-
-
-@lru_cache(128)
-def _quaternion(rotation: bytes) -> tuple[float, ...]:
-    """Of a (3, 3): SciPy takes half a millisecond, and what is published again and again hardly ever changes."""
-    return tuple(map(float, se3.quaternion_from_rotation(np.frombuffer(rotation).reshape(3, 3))))
 
 
 def matrix_from_transform(transform: Any) -> NDArray[np.float64]:
