@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from scipy.special import fdtri, gammaln, logsumexp
+import scipy
 
 from calib_ros.arrays import Covariance, Matrix
 from calib_ros.registration.covariance import free_axes
@@ -29,7 +29,7 @@ LOWEST = -20.0  # of one keyframe; what matches as usual does not make up for al
 def log_student(squared: float, log_det: float, dimensions: int, freedom: float) -> float:
     """Logarithm of the density of Student's distribution at a squared Mahalanobis distance, log_det that of its scale matrix."""
     half = 0.5 * (freedom + dimensions)
-    constant = gammaln(half) - gammaln(0.5 * freedom) - 0.5 * dimensions * np.log(np.pi * freedom)
+    constant = scipy.special.gammaln(half) - scipy.special.gammaln(0.5 * freedom) - 0.5 * dimensions * np.log(np.pi * freedom)
     return float(constant - 0.5 * log_det - half * np.log1p(squared / freedom))
 
 
@@ -51,7 +51,7 @@ def shift_evidence(shift: Matrix, covariance: Covariance, freedom: float) -> flo
     stack = np.broadcast_to(x[:, None], (len(S), len(x), 1))  # numpy 1 would take (6, 1) for a stack of vectors
     squared = [float(x @ y) for y in np.linalg.solve(S, stack)[..., 0]]
     densities = [log_student(*own, len(axes), freedom) for own in zip(squared, np.linalg.slogdet(S)[1].tolist(), strict=True)]
-    return float(logsumexp(densities[1:]) - np.log(len(_MOVEMENTS) - 1) - densities[0])
+    return float(scipy.special.logsumexp(densities[1:]) - np.log(len(_MOVEMENTS) - 1) - densities[0])
 
 
 class ShiftNoise:
@@ -67,7 +67,7 @@ class ShiftNoise:
     def learn(self, squared: float, axes: int, freedom: float) -> None:
         """A keyframe that fits has this squared Mahalanobis distance (see `covariance.distance`) by a covariance of `freedom`."""
         if axes:
-            self._usual.append(squared / axes / float(fdtri(axes, freedom, TAIL)))
+            self._usual.append(squared / axes / float(scipy.special.fdtri(axes, freedom, TAIL)))
 
     @property
     def scale(self) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from scipy.special import fdtrc
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -317,7 +317,7 @@ def points_in_view(frame: FrameFeatures, T: Transform) -> int:
 def _p_value(shift: Matrix, covariance: Covariance, freedom: float) -> float:
     """Probability of a shift (6,) of at least this size, its covariance known with so many degrees of freedom."""
     squared, axes = distance(shift, covariance)
-    return float(fdtrc(axes, freedom, max(squared, 0.0) / axes)) if axes else 1.0
+    return float(scipy.special.fdtrc(axes, freedom, max(squared, 0.0) / axes)) if axes else 1.0
 
 
 def normalised_innovation(T_current: Transform, T_estimate: Transform) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import chdtrc
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
@@ -43,7 +43,7 @@ class PoseFilter:
     def probability(self, T: Transform, covariance: Covariance) -> float:
         """Probability of an estimate T (4, 4) at least this far away, if the filter's pose is right."""
         squared, axes = distance(se3.log(T @ se3.inverse(self.T)), self.spread + covariance)
-        return float(chdtrc(axes, max(squared, 0.0))) if axes else 1.0
+        return float(scipy.special.chdtrc(axes, max(squared, 0.0))) if axes else 1.0
 
     def update(self, T: Transform, covariance: Covariance, share_new: float) -> None:
         """Fuse an estimate of whose keyframes only a share is new: the others are in the filter already."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -31,7 +31,7 @@ from calib_ros.rig.lidars import MOTION_KIND, SCANS_KIND, SHARED, UNKNOWN_M, Lid
 # Half width of a search: two standard deviations of what the priors say, but no less than the odd centimetre of a mount.
 SIGMAS, LEAST_DEG, LEAST_M = 2.0, 0.5, 0.05
 LEAST_S, UNKNOWN_S = 1e-6, 1.0  # standard deviations, s, of one clock for all, and of one of which nothing is known
-FAR = float(chi2.isf(SIGNIFICANCE, 1))  # squared deviations
+FAR = float(scipy.special.chdtri(1, SIGNIFICANCE))  # squared deviations
 GRID, SEEN = (16, 9), 0.1  # cells of a picture, and the share of them with points which is a shared view
 Progress = Callable[[str, float], None]
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
-from scipy.stats import chi2
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -158,12 +157,12 @@ def solve(edges: Sequence[Edge], priors: Priors, reference: str) -> RigSolution:
     while True:
         poses, covariance, cost = _solved(factors, names, reference)
         tried = [k for k in range(len(factors)) if k not in left_out and k not in doubted]
-        if not tried or freedom <= 0 or not chi2.sf(cost, freedom) <= SIGNIFICANCE:
+        if not tried or freedom <= 0 or not scipy.special.chdtrc(freedom, cost) <= SIGNIFICANCE:
             break
         drops = np.array([cost - _solved(_scaled(factors, [k], NOTHING_SAID), names, reference)[2] for k in tried])
         # Those of which one is wrong, as far as one is sure.
         order = np.argsort(-drops, kind="stable")
-        known = np.cumsum(np.exp(drops[order] / 2 - logsumexp(drops / 2)))
+        known = np.cumsum(np.exp(drops[order] / 2 - scipy.special.logsumexp(drops / 2)))
         wrong = [tried[k] for k in order[: int(np.searchsorted(known, SURE)) + 1]]
         if len(wrong) == 1:
             factors, freedom = _scaled(factors, wrong, NOTHING_SAID), freedom - 6
@@ -277,7 +276,7 @@ def _loop(edge: Edge, up: Mapping[str, tuple[str, Edge]], tests: int) -> Loop:
         A = se3.adjoint(T)
         T, C = T @ step, C + A @ own @ A.T
     residual = se3.log(T)
-    p = float(chi2.sf(np.sum((root_information(C) @ residual) ** 2), 6))
+    p = float(scipy.special.chdtrc(6, np.sum((root_information(C) @ residual) ** 2)))
     return Loop(tuple(at for at, _ in steps), residual, p, p > SIGNIFICANCE / tests)
 
 

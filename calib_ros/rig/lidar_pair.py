@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import f
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -148,7 +148,7 @@ class LidarPair:
     def _is_same(a: Transform, b: Transform, C: Covariance, n: int) -> bool:
         """Whether transforms differ by what chance explains, by a covariance whose scale is known from n registrations."""
         xi = se3.log(a @ se3.inverse(b))
-        return bool(f.sf(float(xi @ np.linalg.solve(C, xi)) / 6, 6, 6 * max(n - 1, 1)) > SIGNIFICANCE)
+        return bool(scipy.special.fdtrc(6, 6 * max(n - 1, 1), float(xi @ np.linalg.solve(C, xi)) / 6) > SIGNIFICANCE)
 
     def say(self, status: str, reason: str) -> None:
         """Another status of what is known, and why, for a person."""

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.stats import chi2, norm
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -47,6 +46,7 @@ UNKNOWN_M, UNKNOWN_RAD = 10.0, 3.0  # standard deviations of what motion does no
 STEPS = 12  # of Gauss and Newton
 PARTS = 8  # of a drive, one more than its spread needs
 MIN_MOTIONS = 2 * PARTS
+MEDIAN_OF_SIX = 5.348  # of a chi-squared variable with six degrees of freedom
 RUN_SCANS = 600  # of which the motion is found: a minute shows it
 Stamped = tuple[int, PointCloud]
 
@@ -151,7 +151,8 @@ def shared_share(A: Matrix, B: Matrix) -> float:
     """The same for points (n, 3) of both in one frame."""
     if min(len(A), len(B)) < MIN_POINTS:
         return 0.0
-    near = [np.isfinite(cKDTree(one).query(other, distance_upper_bound=SHARED_M)[0]).mean() for one, other in ((A, B), (B, A))]
+    tree = scipy.spatial.cKDTree
+    near = [np.isfinite(tree(one).query(other, distance_upper_bound=SHARED_M)[0]).mean() for one, other in ((A, B), (B, A))]
     return float(max(near))
 
 
@@ -231,7 +232,7 @@ def fused(target: str, source: str, found: Sequence[Registration], clock_sigma_s
     # At first no registration is known to be right: the one nearest to all.
     spread = [np.median([_squared(se3.log(a @ se3.inverse(b)), H) for a, H in zip(Ts, Hs, strict=True)]) for b in Ts]
     T = Ts[int(np.argmin(spread))]
-    scale = max(float(min(spread)) / chi2.median(6), 1e-9)
+    scale = max(float(min(spread)) / MEDIAN_OF_SIX, 1e-9)
     for _ in range(ROUNDS):
         prior = np.diag(np.r_[np.zeros(6), max(clock_sigma_s, 1e-6) ** -2.0])
         r = [se3.log(t @ se3.inverse(T)) - twist * offset for t, twist in zip(Ts, twists, strict=True)]
@@ -241,7 +242,7 @@ def fused(target: str, source: str, found: Sequence[Registration], clock_sigma_s
         T, offset = se3.exp(step[:6]) @ T, offset + float(step[6])
         r = [se3.log(t @ se3.inverse(T)) - twist * offset for t, twist in zip(Ts, twists, strict=True)]
         squares = np.array([_squared(x, H) for x, H in zip(r, Hs, strict=True)])
-        scale = max(float(np.median(squares)) / chi2.median(6) * n / max(n - 1, 1), 1e-9)
+        scale = max(float(np.median(squares)) / MEDIAN_OF_SIX * n / max(n - 1, 1), 1e-9)
         weights = 1 / (1 + np.maximum(squares / scale - 6, 0) / 6)  # beyond what is expected, as Cauchy's
     covariance = np.linalg.inv(A)
     # How registrations really scatter, frame by frame: more than the Hessian says along what all of them see badly.
@@ -300,7 +301,7 @@ def _hand_eye(A: Matrix, B: Matrix, X: Transform) -> tuple[Transform, Matrix]:
         r = np.array([se3.log(one @ X @ se3.inverse(two) @ se3.inverse(X)) for one, two in zip(A, B, strict=True)])
         # exp(x) X B X^-1 exp(-x) = exp((I - Ad(X B X^-1)) x) X B X^-1
         J = np.array([np.eye(6) - se3.adjoint(X @ two @ se3.inverse(X)) for two in B])
-        sigma = np.array([np.median(np.abs(r[:, :3])), np.median(np.abs(r[:, 3:]))]) / norm.ppf(0.75)
+        sigma = np.array([np.median(np.abs(r[:, :3])), np.median(np.abs(r[:, 3:]))]) / scipy.special.ndtri(0.75)
         W = np.repeat(sigma.clip(1e-5) ** -2.0, 3)
         weights = 1 / (1 + np.maximum((r * r * W).sum(axis=1) - 6, 0) / 6)
         H = np.einsum("n,nij,i,nik->jk", weights, J, W, J) / OVERLAP + floor

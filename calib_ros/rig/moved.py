@@ -13,8 +13,7 @@ from itertools import combinations
 from math import comb
 
 import numpy as np
-from scipy.special import logsumexp
-from scipy.stats import chi2
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix
@@ -77,7 +76,7 @@ def hypotheses(before: RigSolution, edges: Sequence[Edge]) -> list[RigHypothesis
         found += [(CLOCK, (name,), model.jumped(name), np.array([[JUMP_S**2]]), prior) for name in names]
     evidences = [model.evidence(B, D) for _, _, B, D, _ in found]
     logs = np.array([e[0] + prior for e, (*_, prior) in zip(evidences, found, strict=True)])
-    posterior = np.exp(logs - logsumexp(logs))
+    posterior = np.exp(logs - scipy.special.logsumexp(logs))
     out = []
     for (kind, group, _, _, _), (_, x, C, p), probability in zip(found, evidences, posterior, strict=True):
         others = tuple(n for n in names if n not in group) if kind == MOVED else ()
@@ -179,7 +178,7 @@ class _Model:
         log_det = np.linalg.slogdet(information)[1] + np.linalg.slogdet(prior)[1]
         log_det -= 2 * np.linalg.slogdet(self._root)[1]
         freedom = len(y) - int(np.linalg.matrix_rank(G)) if B.size else len(y)
-        p = float(chi2.sf(float(residual @ residual), freedom)) if freedom else 1.0
+        p = float(scipy.special.chdtrc(freedom, float(residual @ residual))) if freedom else 1.0
         return -0.5 * (cost + log_det + len(y) * np.log(2 * np.pi)), x, C, p
 
     def size(self, group: Sequence[str], x: Matrix) -> tuple[float, float]:

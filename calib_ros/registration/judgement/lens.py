@@ -11,11 +11,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import product
+from statistics import NormalDist
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import fdtri, ndtri
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -59,7 +60,7 @@ AT_ONCE = 30000  # points that OpenCV samples at once
 ASPECT_USUAL, RADIAL_USUAL, GROSS = 0.002, 0.004, 0.03
 SQUARE = 3 * ASPECT_USUAL  # of pixels that are stated to be so two things must be wrong: the pixels, and what is said of them
 ACCUSED = 0.01  # share of right ones that show as much as what is accused
-ACCUSING = float(ndtri(1 - ACCUSED / 2))  # standard deviations of that
+ACCUSING = NormalDist().inv_cdf(1 - ACCUSED / 2)  # standard deviations of that
 DRAWS = 512  # from an explanation: tell a probability to 1 %
 OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes then tell as much
 
@@ -244,7 +245,7 @@ class LensEstimate:
         """The camera with the change that is expected, if the scenes show one (F test): a right one would else get their noise.
         T, extrinsic: the optimum (4, 4) by `camera`, its covariance (6, 6)."""
         (mean, spread), n = self.posterior, len(self.unknowns)
-        if self.change @ self.information @ self.change < n * fdtri(n, self.freedom, 1 - SIGNIFICANCE):
+        if not self._exceeds(float(self.change @ self.information @ self.change), SIGNIFICANCE):
             mean, spread = np.zeros(n), spread + np.outer(mean, mean)
         units = np.array([own.unit for own in self.unknowns])
         T, changes = se3.exp(self.moves @ mean) @ T, {}
@@ -280,15 +281,13 @@ class LensEstimate:
         fault = LensFault(self, _main(part, best), best.mean, 1.0)
         # What is not shown, and only expected to be as it may be usually, accuses nothing.
         shown = abs(self.change[fault.k]) > ACCUSING * self.sigma[fault.k]
-        # Nor what the score hardly gains by: its top may be narrower than the way to it is high.
-        n = len(self.unknowns)
-        gains = 2 * self.gain > n * fdtri(n, self.freedom, 1 - ACCUSED)
-        if gains and shown and ratio > np.log(1 / doubt - 1):
+        if shown and ratio > np.log(1 / doubt - 1) and self._gains:
             return fault
         if sum(off) <= OPEN_PROBABILITY:
             return None
         most = self.explanations[int(np.argmax(off))]
-        return LensFault(self, _main(moves, most), most.mean, 1.0 if gains and sum(off) >= 1 - doubt else min(sum(off), 1 - 1e-9))
+        certain = sum(off) >= 1 - doubt and self._gains
+        return LensFault(self, _main(moves, most), most.mean, 1.0 if certain else min(sum(off), 1 - 1e-9))
 
     def seen(self, score: PointScore) -> tuple[PointScore, Transform]:
         """A score as it is by the lens that is expected by now, and the extrinsic (4, 4) there."""
@@ -297,6 +296,16 @@ class LensEstimate:
         P = _seeing(score, self.unknowns)(T, mean)[0].points
         back = se3.inverse(T).astype(np.float32)
         return score.with_points(back[:3, :3] @ P + back[:3, 3:]), T
+
+    @property
+    def _gains(self) -> bool:
+        """What the score hardly gains by accuses nothing: its top may be narrower than the way to it is high."""
+        return self._exceeds(2 * self.gain, ACCUSED)
+
+    def _exceeds(self, square: float, share: float) -> bool:
+        """F test of all unknowns: whether only so small a share of right lenses shows more."""
+        n = len(self.unknowns)
+        return square > n and bool(square > n * scipy.special.fdtri(n, self.freedom, 1 - share))
 
     def _off(self, explanation: LensHypothesis, moves: Matrix) -> float:
         """Probability that it holds, and the extrinsic is off. moves: (4, n), see `fault`, per unit of each change."""
@@ -313,7 +322,7 @@ def _main(part: Matrix, explanation: LensHypothesis) -> int:
 @cache
 def _draws(n: int) -> Matrix:
     """(n, k) of a standard normal distribution, evenly spread."""
-    return np.asarray(ndtri(0.5 + 0.5 * EvenPoints(n, 0).next(DRAWS)).T)
+    return np.asarray(np.vectorize(NormalDist().inv_cdf)(0.5 + 0.5 * EvenPoints(n, 0).next(DRAWS)).T)
 
 
 def _beyond(mean: Matrix, covariance: Matrix) -> float:

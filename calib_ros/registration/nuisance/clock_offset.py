@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr, stdtr
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
@@ -92,7 +92,8 @@ class ClockEstimate:
         turn, shift = (float(np.linalg.norm(part)) for part in np.split(self.effect.direction, 2))
         largest = min(deg / max(float(np.rad2deg(turn)), 1e-12), m / max(shift, 1e-12))
         deviations = abs(self.value) / max(float(np.hypot(self.sigma, self.prior_s)), 1e-12)
-        chance = 2 * (stdtr(self.freedom, -deviations) if np.isfinite(self.freedom) else ndtr(-deviations))
+        t, z = scipy.special.stdtr, scipy.special.ndtr
+        chance = 2 * (t(self.freedom, -deviations) if np.isfinite(self.freedom) else z(-deviations))
         if chance < SIGNIFICANCE and abs(self.value) > largest:
             return wrong_times(self.value, deviations)
         probability = self._probability_wrong(largest)
@@ -109,7 +110,8 @@ class ClockEstimate:
             odds *= usual / gross * np.exp(min(log_ratio, 50.0))
         sigma = self.effect.sigma(GROSS_S)
         mean = self.value * self.effect.information * sigma**2
-        return float(odds / (1 + odds) * (ndtr((-value - mean) / sigma) + ndtr((mean - value) / sigma)))
+        below, above = scipy.special.ndtr(np.array([-value - mean, mean - value]) / sigma)
+        return float(odds / (1 + odds) * (below + above))
 
     def _log_density(self, deviations: float) -> float:
         """Of Student's distribution, but for what all have in common."""
