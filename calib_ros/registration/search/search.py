@@ -58,6 +58,8 @@ AGREEMENT = 3  # independent starts that must reach the best optimum: two may do
 # So many rounds, and starts agree on an optimum that is no better than chance: more rounds hardly find another. Or they do not
 # agree in a wide box: then half of it is searched around the best optimum so far, which may share some edges with the truth.
 FRUITLESS_ROUNDS = 3
+# After so many, starts so close have met the truth; where none agree, and a decoy matches as well, nothing matches.
+HOPELESS_ROUNDS = 2
 WIDE_DEG, WIDE_M = 5.0, 0.3
 
 
@@ -104,6 +106,9 @@ def search(
                 decoy_z = search_decoy(score, T_prior, box, config, limits, user_prior)
             significant = p_value(z_score, decoy_z, number + 1) <= max_p_value
             if agreed >= AGREEMENT and (significant or number + 1 >= FRUITLESS_ROUNDS):
+                break
+            no_better = decoy_z is not None and z_score <= decoy_z
+            if number + 1 >= HOPELESS_ROUNDS and agreed < AGREEMENT and no_better and not is_wide(box):
                 break
             if number + 1 == FRUITLESS_ROUNDS and agreed < AGREEMENT and is_wide(box):
                 half = box.scaled(0.5, FRUITLESS_ROUNDS)
