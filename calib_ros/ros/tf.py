@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,9 @@ class StaticTf(NodeService):
         self._publisher: Any = None
         self._own: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
         self._wanted: tuple[Result, int] | None = None  # the newest that was to be published, with its stamp
-        self._edge = "", ""  # parent and child by the parameters when it was published last
+        # Parent and child by the parameters when it was published last: CAMERA or LIDAR and "", the other sensor being the child;
+        # with a child, the name of its parent.
+        self._edge = "", ""
         self._published: TransformStamped | None = None  # what late joiners get
         self._tree_wanted: Sequence[TransformStamped] = ()  # several edges that were not published yet
         self._lock = threading.RLock()  # a worker publishes, the executor switches and receives
@@ -119,7 +122,7 @@ class StaticTf(NodeService):
     def _publish(self) -> None:
         if self._publisher is None or self._wanted is None or time.monotonic() - self._since < WAIT_S:
             return  # what others publish is not known yet; see check()
-        self._edge = self._wanted_edge()
+        self._edge = self._parameters()["tf_parent"], self._parameters()["tf_child"]
         try:
             message = self._message(*self._wanted)
         except BadInputError as error:
@@ -138,22 +141,6 @@ class StaticTf(NodeService):
         with self._lock:
             self._tree_wanted = messages
 
-    def _publish_tree(self) -> None:
-        if self._publisher is None or not self._tree_wanted or time.monotonic() - self._since < WAIT_S:
-            return
-        messages, self._tree_wanted, allowed = self._tree_wanted, (), []
-        for message in messages:
-            conflict = self._conflict(message.header.frame_id, message.child_frame_id)
-            if conflict:
-                self._error(conflict, f"tf {message.child_frame_id}")
-            else:
-                allowed.append(message)
-        self._send(allowed)
-
-    def _wanted_edge(self) -> tuple[str, str]:
-        """Parent and child: CAMERA or LIDAR and "", the other sensor being the child; with a child, the name of its parent."""
-        return self._parameters()["tf_parent"], self._parameters()["tf_child"]
-
     def check(self) -> None:
         """Follow the parameters and the tree, which may have changed for the better or the worse.
 
@@ -162,8 +149,13 @@ class StaticTf(NodeService):
         """
         with self._lock:
             self._switch(self._parameters()["publish_tf"])
-            self._publish_tree()
-            message, edge = self._published, self._wanted_edge()
+            if self._publisher is not None and self._tree_wanted and time.monotonic() - self._since >= WAIT_S:
+                messages, self._tree_wanted = self._tree_wanted, ()
+                conflicts = {m.child_frame_id: self._conflict(m.header.frame_id, m.child_frame_id) for m in messages}
+                for child, conflict in filter(itemgetter(1), conflicts.items()):
+                    self._error(conflict, f"tf {child}")
+                self._send([message for message in messages if not conflicts[message.child_frame_id]])
+            message, edge = self._published, (self._parameters()["tf_parent"], self._parameters()["tf_child"])
             if message is None or edge[1] or edge != self._edge:
                 self._publish()
             elif conflict := self._conflict(message.header.frame_id, message.child_frame_id):
