@@ -80,10 +80,9 @@ class Calibration(NodeService):
         self._given = set(node._parameter_overrides)
         for line in parameters.misspelt({name: p.value for name, p in node._parameter_overrides.items()}, node._parameters):
             node.get_logger().warning(line)
-        cures = CURES if description is None else (TF_CURE, TF_CURE)
-        self.tf = StaticTf(self.inputs.shared.node, lambda: self.parameters, self.health.error, cures)
+        self.tf = StaticTf(self, CURES if description is None else (TF_CURE, TF_CURE))
         self.files = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_files")  # disks may be slow
-        self.write_back = WriteBack(lambda: self.parameters, self.files, self.health, self.tf.edges)
+        self.write_back = WriteBack(self)
         self.parts: list[NodeService] = [self.health, self.tf, self.write_back]  # as they begin; they end the other way round
         self._end_threads: Callable[[], bool] = lambda: True  # all but those of the parts; True if they ended
         self._timers: list[Timer] = []

@@ -33,7 +33,7 @@ from calib_ros.online.events import FrameIngested
 from calib_ros.result import Result
 from calib_ros.ros.conversions import Serialized
 from calib_ros.ros.parameters import Parameters
-from calib_ros.ros.parts import PairPart, done
+from calib_ros.ros.parts import NodePart, done
 from calib_ros.ros.subscriptions import type_name
 
 BLACK_BOX = re.compile(r"event_\d{8}T\d{6}Z_[a-z]+(_\d+)?")  # the newest has the last name
@@ -51,7 +51,7 @@ class RawKeyframe(NamedTuple):
     camera_info: Serialized
 
 
-class Capture(PairPart):
+class Capture(NodePart):
     """Keeps the raw messages of at most capture_frames keyframes; writes them on ~/capture and for its black box. Thread-safe."""
 
     def __init__(self, own: Any) -> None:

@@ -30,7 +30,7 @@ from calib_ros.rig.description import CAMERA
 from calib_ros.rig.edges import SEEN, seen_share
 from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message
 from calib_ros.ros.distributions import remark
-from calib_ros.ros.parts import PairPart
+from calib_ros.ros.parts import NodePart
 from calib_ros.ros.subscriptions import BEST_EFFORT, AdaptiveSubscription, Form, livox_forms, loss_advice, serialized
 
 Guard = Callable[[], AbstractContextManager[None]]
@@ -155,7 +155,7 @@ class PairInputs:
 MotionSource = tuple[type[Any], Callable[[Any], tuple[float | None, float | None]]]
 
 
-class SensorSubscriptions(PairPart):
+class SensorSubscriptions(NodePart):
     """Image, cloud, CameraInfo and motion; while the node is active every message goes to the pipeline.
 
     camera_info: the newest usable CameraInfo. motion: what measures the vehicle's motion, from motion_source().

@@ -43,6 +43,12 @@ class NodePart(NodeService):
         given: Parameters = self._own.parameters
         return given
 
+    @property
+    def _pipeline(self) -> Pipeline:
+        """Of a pair."""
+        pipeline: Pipeline = self._own.pipeline
+        return pipeline
+
     def _create_publisher(self, kind: Any, topic: str, qos: QoSProfile | int) -> Publisher:
         self._publishers.append(self._node.create_publisher(kind, topic, qos))
         return self._publishers[-1]
@@ -70,14 +76,6 @@ class NodePart(NodeService):
             self._node.destroy_publisher(publisher)
         if self._ends:
             after_answers(self._node, lambda: [end() for end in self._ends])
-
-
-class PairPart(NodePart):
-    """Of the interface of a pair."""
-
-    def __init__(self, own: Any) -> None:
-        super().__init__(own)
-        self._pipeline: Pipeline = own.pipeline
 
 
 def done(node: Node, promise: Promise[Any]) -> Future:

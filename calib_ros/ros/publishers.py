@@ -32,7 +32,7 @@ from calib_ros.ros.conversions import (
     transform_message,
 )
 from calib_ros.ros.dds import LATCHED
-from calib_ros.ros.parts import PairPart
+from calib_ros.ros.parts import NodePart
 
 PROCESSED_KEPT = 100  # headers; more are of messages that are gone before a pair is worked off
 VALID_PERIODS = 2.5  # of publishing: one message may be late, and another one lost
@@ -41,7 +41,7 @@ VALID_PERIODS = 2.5  # of publishing: one message may be late, and another one l
 STARVED_PERIODS = 3
 
 
-class ExtrinsicPublisher(PairPart):
+class ExtrinsicPublisher(NodePart):
     """~/transform on every change, and ~/extrinsic at least once in publish_period_s, with what a consumer needs to rely on it.
 
     DDS tells subscribers that ask for it when the messages stay away (deadline) or the process ends (liveliness). stamp: of the
@@ -120,7 +120,7 @@ class ExtrinsicPublisher(PairPart):
         return msg
 
 
-class OverlayPublisher(PairPart):
+class OverlayPublisher(NodePart):
     """~/overlay and ~/overlay/compressed: the diagnostic picture, drawn once for both while someone listens to either, at most
     once per overlay_period_s.
 
@@ -175,7 +175,7 @@ class OverlayPublisher(PairPart):
             self.compressed.publish(compressed_image_message(picture, extrinsic.result.camera_frame, frame.stamp))
 
 
-class ProcessedPublisher(PairPart):
+class ProcessedPublisher(NodePart):
     """~/processed: the header of every image and cloud, once nothing that was received by then waits to be taken in.
 
     Whoever sends no more before it comes, as `calib-ros play --follow` does, loses no pair, however slow the machine is.

@@ -17,12 +17,12 @@ from std_srvs.srv import Trigger
 
 from calib_ros.registration.progress import Callback
 from calib_ros.result import CONVERGED, TENTATIVE, Extrinsic
-from calib_ros.ros.parts import PairPart, done
+from calib_ros.ros.parts import NodePart, done
 
 FEEDBACK_PERIOD_S = 0.1  # as often as a person can follow; a search reports some hundred times a second
 
 
-class Services(PairPart):
+class Services(NodePart):
     """~/get_extrinsic, ~/reset, ~/save and ~/calibrate, whose requests over the same keyframes share one estimate, which ends
     when all are cancelled."""
 
