@@ -31,10 +31,9 @@ from calib_ros.messages import stamp_ns
 from calib_ros.online.black_box import BlackBox, Occasion
 from calib_ros.online.events import FrameIngested
 from calib_ros.result import Result
-from calib_ros.ros.answers import after_answers, done, serve
 from calib_ros.ros.conversions import Serialized
-from calib_ros.ros.interface import PairPart
 from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.parts import NodePart, done
 from calib_ros.ros.subscriptions import type_name
 
 BLACK_BOX = re.compile(r"event_\d{8}T\d{6}Z_[a-z]+(_\d+)?")  # the newest has the last name
@@ -52,14 +51,14 @@ class RawKeyframe(NamedTuple):
     camera_info: Serialized
 
 
-class Capture(PairPart):
+class Capture(NodePart):
     """Keeps the raw messages of at most capture_frames keyframes; writes them on ~/capture and for its black box. Thread-safe."""
 
     def __init__(self, own: Any) -> None:
         super().__init__(own)
         self._files = own.files
         self.black_box = BlackBox(own.pipeline, lambda: self._parameters["capture.on"], self._record)
-        self._service = serve(Trigger, "~/capture", own.node, own.health, self._answer, MutuallyExclusiveCallbackGroup())
+        self._serve(Trigger, "~/capture", self._answer, MutuallyExclusiveCallbackGroup())
         self._frames: deque[RawKeyframe] = deque(maxlen=self._parameters["capture_frames"])
         self._lock = threading.Lock()
         if self._frames.maxlen:
@@ -87,10 +86,6 @@ class Capture(PairPart):
         self.black_box.check(flush=True)
 
     stop = pause
-
-    def destroy(self) -> None:
-        """Answers that are made already are sent before."""
-        after_answers(self._node, lambda: self._node.destroy_service(self._service))
 
     def _record(self, occasion: Occasion, events: str) -> None:
         def write() -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from calib_ros.config.options import has_room
 from calib_ros.config.sensors import REFINE
@@ -43,7 +43,8 @@ class Health(NodeService):
     """Collects what happens to the node, for log and diagnostics. Thread-safe, since every field is replaced whole.
 
     log: of problems. last_error: the newest of them, and when it came by time.monotonic(). extrinsic: its newest state.
-    losses: see set_losses. silence: why nothing comes on `image` and `points`, where nothing does.
+    estimated_at: when the last estimate was accepted, by the same clock. losses: topics whose messages get lost at present, each
+    with one line for a person. silence: why nothing comes on `image` and `points`, where nothing does.
     """
 
     def __init__(self, logger: Any) -> None:
@@ -51,7 +52,7 @@ class Health(NodeService):
         self.log = QuietLog()
         self.last_error = ("", -1e9)
         self.extrinsic: Extrinsic | None = None
-        self._estimated_at: float | None = None
+        self.estimated_at: float | None = None
         self.losses: dict[str, str] = {}
         self.silence: dict[str, str] = {}
         self.callback_ms: deque[float] = deque(maxlen=2000)
@@ -66,12 +67,6 @@ class Health(NodeService):
     def note(self, text: str, kind: str) -> None:
         """Something that is well again, in one line."""
         self.log.add(kind, text, lambda line: self._logger.info(line))
-
-    def set_losses(self, losses: dict[str, str], told: Container[str]) -> None:
-        """The topics whose messages get lost at present, each with one line for a person. told: those that are to be logged."""
-        for topic in filter(told.__contains__, losses):
-            self.error(losses[topic], f"losses on {topic}")
-        self.losses = losses
 
     def unexpected(self, error: BaseException) -> str:
         """A defect of ours: says where it is and what to do, and returns that line."""
@@ -93,7 +88,7 @@ class Health(NodeService):
         self.extrinsic, result = extrinsic, extrinsic.result
         accepted = extrinsic.accepted > 0 and (before is None or extrinsic.accepted != before.accepted)
         if accepted:
-            self._estimated_at = time.monotonic()
+            self.estimated_at = time.monotonic()
         if result.status in (CONVERGED, TENTATIVE, INSUFFICIENT) and accepted:  # insufficient: some axes not observable yet
             self._logger.info(
                 f"extrinsic from {result.frames_used} keyframes: score {result.score:.3f}, "
@@ -118,17 +113,6 @@ class Health(NodeService):
         except Exception as error:
             self.unexpected(error)
         self.callback_ms.append(1e3 * (time.perf_counter() - start))
-
-    @property
-    def callback_p99_ms(self) -> float:
-        """99th percentile of the newest 2000 callbacks, ms; 0 before the first."""
-        times = list(self.callback_ms)
-        return float(np.percentile(times, 99)) if times else 0.0
-
-    @property
-    def age_s(self) -> float | None:
-        """Seconds since the last accepted estimate, None before the first."""
-        return None if self._estimated_at is None else time.monotonic() - self._estimated_at
 
 
 class _Sample(NamedTuple):
@@ -157,17 +141,22 @@ class _Sample(NamedTuple):
         return self.load.seconds.get(work, 0.0) - before.load.seconds.get(work, 0.0)
 
 
-class Diagnostics:
-    """Makes the /diagnostics message; rates and loads are those of the last count()."""
+class Diagnostics(NodeService):
+    """The status of a pair on /diagnostics, the first of them; rates and loads are those of the last check(). more: gives further
+    values, by name."""
 
-    def __init__(self, name: str, health: Health, pipeline: Pipeline) -> None:
-        self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
-        self._pairing = PairingHealth(pipeline.pairing.synchronizer)
-        self._samples = deque([_Sample.of(pipeline)], maxlen=int(LOAD_WINDOW_S) + 1)
+    def __init__(self, name: str, health: Health, pipeline: Pipeline, more: Callable[[], dict[str, str]] = lambda: {}) -> None:
+        self._name, self._health, self._pipeline, self._more = name.lstrip("/"), health, pipeline, more
+        self.start()
+
+    def start(self) -> None:
+        """Rates count from now."""
+        self._pairing = PairingHealth(self._pipeline.pairing.synchronizer)
+        self._samples = deque([_Sample.of(self._pipeline)], maxlen=int(LOAD_WINDOW_S) + 1)
         self._unpaired = ""  # what is said of messages without partner
 
-    def count(self) -> None:
-        """To be called about once a second: rates and loads count from the calls before."""
+    def check(self) -> None:
+        """Rates and loads count from the calls before."""
         self._unpaired = self._pairing.check()
         if self._unpaired:
             self._health.error(self._unpaired, "unpaired")
@@ -177,20 +166,16 @@ class Diagnostics:
         """First and last sample of the last SILENCE_S."""
         return self._samples[-min(len(self._samples), int(SILENCE_S) + 1)], self._samples[-1]
 
-    def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
-        """One status, as of now; stamp: builtin_interfaces/Time. extra: more values, by name."""
+    def status(self) -> DiagnosticStatus:
+        """As of now."""
         level, text = self._summary()
-        values = {**self._flow(), **self._extrinsic(), **(extra or {})}
+        values = {**self._flow(), **self._extrinsic(), **self._more()}
         values |= {
-            "callback 99th percentile, ms": f"{self._health.callback_p99_ms:.2f}",
+            "callback 99th percentile, ms": f"{np.percentile(list(self._health.callback_ms) or [0.0], 99):.2f}",
             "errors": str(self._health.errors),
             "last error": self._health.last_error[0],
         }
-        status = DiagnosticStatus(level=level, name=f"{self._name}: extrinsic", message=text)
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = stamp
-        return message
+        return status_message(f"{self._name}: extrinsic", level, text, values)
 
     def _flow(self) -> dict[str, str]:
         pipeline, counts = self._pipeline, self._pipeline.pairing.synchronizer.counts
@@ -239,7 +224,7 @@ class Diagnostics:
         }
 
     def _extrinsic(self) -> dict[str, str]:
-        recalibrator, age = self._pipeline.recalibrator, self._health.age_s
+        recalibrator, estimated_at = self._pipeline.recalibrator, self._health.estimated_at
         # With the monitor's last assessment, which is not published while the extrinsic is right.
         state = self._health.extrinsic if recalibrator is None else recalibrator.current
         if state is None:
@@ -248,7 +233,7 @@ class Diagnostics:
         result = state.result
         values = {
             "estimates accepted": str(state.accepted),
-            "age of the last estimate, s": "none" if age is None else f"{age:.1f}",
+            "age of the last estimate, s": "none" if estimated_at is None else f"{time.monotonic() - estimated_at:.1f}",
             "status": result.status,
             "cause": "none" if result.cause is None else result.cause.value,
             "score": f"{result.score:.3f}",
@@ -346,6 +331,12 @@ class Diagnostics:
         text = f"images and clouds arrive, but none belong together: {self._pairing.cause()}"
         self._health.error(text, "unpaired")
         return WARN, text
+
+
+def status_message(name: str, level: bytes, text: str, values: Mapping[str, str]) -> DiagnosticStatus:
+    """A status of /diagnostics."""
+    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=name, message=text, values=pairs)
 
 
 def refined_values(refined: RefinedCamera | None) -> dict[str, str]:

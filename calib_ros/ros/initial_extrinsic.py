@@ -15,10 +15,10 @@ from calib_ros.online.events import ExtrinsicUpdated
 from calib_ros.online.state import load_state, provenance_of, read_state, save_state
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.result import CONVERGED, INITIAL, InitialSource, Result
-from calib_ros.ros.interface import PairPart
+from calib_ros.ros.parts import NodePart
 
 
-class InitialExtrinsic(PairPart):
+class InitialExtrinsic(NodePart):
     """Chooses the initial extrinsic of a pipeline, and saves accepted ones."""
 
     def __init__(self, own: Any) -> None:

@@ -29,7 +29,8 @@ from calib_ros.online.pairing.health import MISSING_SHARE
 from calib_ros.rig.description import CAMERA
 from calib_ros.rig.edges import SEEN, seen_share
 from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message
-from calib_ros.ros.interface import PairPart
+from calib_ros.ros.distributions import remark
+from calib_ros.ros.parts import NodePart
 from calib_ros.ros.subscriptions import BEST_EFFORT, AdaptiveSubscription, Form, livox_forms, loss_advice, serialized
 
 Guard = Callable[[], AbstractContextManager[None]]
@@ -37,6 +38,7 @@ CLOUDS_KEPT, IMAGES_KEPT = 6, 2  # decoded messages: of clouds, those before a k
 UNSEEN_SCANS = 10  # one after the other without a point in view: a second
 SILENT_S = 1.0  # without a message: slower sensors than this are of no use
 AFTER_STAMP = 12  # bytes of a message: what comes behind is the same in nearly every CameraInfo
+INACTIVE = "the node is not active; activate it first"
 MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
 
 
@@ -45,70 +47,61 @@ class SharedTopics:
 
     def __init__(self, node: Node) -> None:
         self.node = node
-        self._topics: dict[str, _Topic] = {}
+        self._topics: dict[str, tuple[AdaptiveSubscription, list[Listener]]] = {}
 
     def subscribe(
         self, forms: Sequence[Form], topic: str, callback: Callable[[int, Any], None], guard: Guard = nullcontext, **options: Any
     ) -> Listener:
         """As an `AdaptiveSubscription`, which the first one makes with its options."""
         if topic not in self._topics:
-            make = partial(AdaptiveSubscription, self.node, forms, topic, guard=guard, **options)
-            self._topics[topic] = _Topic(make)
-        return Listener(self._topics[topic], callback, guard, self._leave)
+            listeners: list[Listener] = []
 
-    def _leave(self, topic: _Topic) -> None:
-        topic.subscription.destroy()
-        self._topics = {name: own for name, own in self._topics.items() if own is not topic}
+            def receive(stamp: int, message: Any) -> None:
+                for listener in list(listeners):
+                    with listener.guard():
+                        listener.callback(stamp, message)
 
-
-class _Topic:
-    def __init__(self, make: Callable[..., AdaptiveSubscription]) -> None:
-        self.listeners: list[Listener] = []
-        self.problem = ""
-        self.subscription = make(callback=self._receive)
-
-    def _receive(self, stamp: int, message: Any) -> None:
-        for listener in list(self.listeners):
-            with listener.guard():
-                listener.callback(stamp, message)
+            self._topics[topic] = AdaptiveSubscription(self.node, forms, topic, receive, guard=guard, **options), listeners
+        return Listener(*self._topics[topic], callback, guard, lambda: self._topics.pop(topic))
 
 
 class Listener:
-    """One of those who share a subscription, with the members of an `AdaptiveSubscription`."""
+    """One of those who share a subscription, with the members of an `AdaptiveSubscription`. leave: called with the last one."""
 
     def __init__(
         self,
-        topic: _Topic,
+        subscription: AdaptiveSubscription,
+        everyone: list[Listener],
         callback: Callable[[int, Any], None],
         guard: Guard,
-        leave: Callable[[_Topic], None],
+        leave: Callable[[], object],
     ) -> None:
-        self._topic, self.callback, self.guard, self._leave = topic, callback, guard, leave
-        self.preference = topic.subscription.preference
-        topic.listeners.append(self)
+        self._subscription, self._everyone, self._leave = subscription, everyone, leave
+        self.callback, self.guard, self.preference = callback, guard, subscription.preference
+        everyone.append(self)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._topic.subscription, name)
+        return getattr(self._subscription, name)
 
     @property
     def tells(self) -> bool:
         """Whether it is to report problems: of those who share the subscription, the first one."""
-        return self._topic.listeners[:1] == [self]
+        return self._everyone[:1] == [self]
 
     def check(self) -> str:
-        """See `AdaptiveSubscription`."""
-        own = self._topic
-        if self.tells:
-            own.subscription.preference = self.preference
-            own.problem = own.subscription.check()
-        return own.problem
+        """See `AdaptiveSubscription`; of the others, which the first one checks for, ''."""
+        if not self.tells:
+            return ""
+        self._subscription.preference = self.preference
+        return self._subscription.check()
 
     def destroy(self) -> None:
         """Receive nothing any more; the last one ends the subscription."""
-        if self in self._topic.listeners:
-            self._topic.listeners.remove(self)
-            if not self._topic.listeners:
-                self._leave(self._topic)
+        if self in self._everyone:
+            self._everyone.remove(self)
+            if not self._everyone:
+                self._subscription.destroy()
+                self._leave()
 
 
 Decoded = Callable[[Serialized], Any]  # message -> what it holds
@@ -162,7 +155,7 @@ class PairInputs:
 MotionSource = tuple[type[Any], Callable[[Any], tuple[float | None, float | None]]]
 
 
-class SensorSubscriptions(PairPart):
+class SensorSubscriptions(NodePart):
     """Image, cloud, CameraInfo and motion; while the node is active every message goes to the pipeline.
 
     camera_info: the newest usable CameraInfo. motion: what measures the vehicle's motion, from motion_source().
@@ -175,9 +168,11 @@ class SensorSubscriptions(PairPart):
         self._inputs, self._rectified = own.inputs, self._parameters["image_is_rectified"]
         self._motion = motion
         self._motion_subscription: Any = None
+        self._pipeline.pause(INACTIVE)
 
     def start(self) -> None:
-        """Subscribe."""
+        """Subscribe, and let the pipeline work."""
+        self._pipeline.resume()
         pipeline, parameters, shared = self._pipeline, self._parameters, self._inputs.shared
         subscribe = partial(shared.subscribe, preference=parameters["reliability"], guard=self._health.guard)
         image, points, camera_info = self._inputs.topics
@@ -197,9 +192,13 @@ class SensorSubscriptions(PairPart):
 
             topic = parameters["motion_source"]
             self._motion_subscription = shared.node.create_subscription(motion, topic, on_motion, MOTION_QOS)
+        said = f"semantics: {'; '.join(pipeline.segmentation.in_use()) or 'no models'}", remark()
+        for line in filter(None, [*said, "waiting for images, clouds and CameraInfo"]):
+            self._node.get_logger().info(line)
 
     def pause(self) -> None:
         """Receive nothing any more, until start() is called again."""
+        self._pipeline.pause(INACTIVE)
         for subscription in self.adaptive:
             subscription.destroy()
         self.adaptive = ()
@@ -210,13 +209,22 @@ class SensorSubscriptions(PairPart):
     def check(self) -> None:
         """Follow the publishers and the parameters."""
         parameters = self._parameters
+        if self._inputs.common is None:  # else the rig receives them
+            self._pipeline.load.count_messages()
         for subscription in self.adaptive:
             subscription.preference = parameters["reliability"]
-            problem = subscription.check()
-            if problem and subscription.tells:
+            if problem := subscription.check():
                 self._health.error(problem, f"publishers of {subscription.topic}")
         self._health.silence = {name: own.silence for name, own in zip(("image", "points"), self.adaptive, strict=False)}
-        self._health.set_losses(self._losses(), {own.topic for own in self.adaptive if own.tells})
+        # Seen by the middleware, which knows of messages that did not arrive whole, or by the stamps of a stream that keeps its
+        # period; of images and clouds, where many get lost.
+        losses: dict[str, str] = {}
+        for own, missing in zip(self.adaptive, self._pipeline.pairing.synchronizer.missing_shares(), strict=False):
+            if (share := max(own.lost_share(), missing)) >= MISSING_SHARE:
+                losses[own.topic] = f"{share:.0%} of the messages on {own.topic} get lost; {loss_advice(own)}"
+                if own.tells:
+                    self._health.error(losses[own.topic], f"losses on {own.topic}")
+        self._health.losses = losses
         if parameters["image_is_rectified"] != self._rectified:
             self._rectified = parameters["image_is_rectified"]
             if self.camera_info is not None:
@@ -232,21 +240,6 @@ class SensorSubscriptions(PairPart):
             self._pipeline.add(is_image, stamp, message)
         finally:
             self._own.processed.receive(message.header)
-
-    def _losses(self) -> dict[str, str]:
-        """Topic -> how many of its messages get lost, and what to do, for a person; of images and clouds, where many do.
-
-        Seen by the middleware, which knows of messages that did not arrive whole, or by the stamps of a stream that keeps its
-        period.
-        """
-        losses: dict[str, str] = {}
-        for subscription, missing in zip(self.adaptive, self._pipeline.pairing.synchronizer.missing_shares(), strict=False):
-            share = max(subscription.lost_share(), missing)
-            if share >= MISSING_SHARE:
-                losses[subscription.topic] = (
-                    f"{share:.0%} of the messages on {subscription.topic} get lost; {loss_advice(subscription)}"
-                )
-        return losses
 
     def _on_camera_info(self, stamp: int, msg: Serialized) -> None:
         if self.camera_info is None or msg.data[AFTER_STAMP:] != self.camera_info.data[AFTER_STAMP:]:

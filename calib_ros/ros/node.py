@@ -9,21 +9,13 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from calib_ros.errors import CalibrationError, defect
-from calib_ros.ros import parameters
-from calib_ros.ros.pair import PairInterface
-from calib_ros.ros.rig_node import RigInterface
-
-
-def interface(node: Node) -> PairInterface | RigInterface:
-    """Of one pair, or of all those of a rig where the parameter rig_file names one."""
-    declared = parameters.declare(node)
-    return RigInterface(node, declared) if declared["rig_file"] else PairInterface(node)
+from calib_ros.ros.calibration import Calibration
 
 
 class _Calibrating(Node):
     """calibration: None until it is made: stop() and destroy_node() may follow an __init__ that raised."""
 
-    calibration: PairInterface | RigInterface | None = None
+    calibration: Calibration | None = None
     _ended = True  # all threads of calibrations that are gone
 
     def stop(self) -> bool:
@@ -45,7 +37,7 @@ class CalibNode(_Calibrating):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("calib_ros", allow_undeclared_parameters=True, **kwargs)  # which are refused, with the nearest name
-        self.calibration = interface(self)
+        self.calibration = Calibration(self)
         self.calibration.start()
 
 
@@ -83,12 +75,12 @@ class CalibLifecycleNode(_Calibrating, LifecycleNode):
         """After a transition that raised: unconfigured again."""
         return self._transition(self._clean_up)
 
-    def _configured(self) -> PairInterface | RigInterface:
+    def _configured(self) -> Calibration:
         assert self.calibration is not None  # the state machine sees to it
         return self.calibration
 
     def _configure(self) -> None:
-        self.calibration = interface(self)
+        self.calibration = Calibration(self)
 
     def _clean_up(self) -> None:
         calibration, self.calibration = self.calibration, None

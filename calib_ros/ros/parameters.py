@@ -210,18 +210,22 @@ def declare(node: Node) -> Parameters:
     again. ConfigError names a value that is out of range or of another type."""
     for name, f in SETTINGS.items():
         _declare(node, name, f.default, f, read_only=name not in LIVE)
-    chosen = preset(node.get_parameter("preset").value).to_dict()
+    chosen, names = preset(node.get_parameter("preset").value).to_dict(), list(SETTINGS)
     for stage, cls in stages().items():
         for f in dataclasses.fields(cls):
-            _declare(node, f"{stage}.{f.name}", chosen[stage][f.name], f)
-    settings = {name: checked(name, _plain(node.get_parameter(name).value), f) for name, f in SETTINGS.items()}
-    values = {
-        stage: {f.name: _plain(node.get_parameter(f"{stage}.{f.name}").value) for f in dataclasses.fields(cls)}
-        for stage, cls in stages().items()
-    }
-    parameters = Parameters(settings, update(Config(), values))
-    parameters.check()  # a bad one is refused now, not with the first image
+            names.append(f"{stage}.{f.name}")
+            _declare(node, names[-1], chosen[stage][f.name], f)
+    parameters = _parameters({name: _plain(node.get_parameter(name).value) for name in names})
     check_mask(parameters.config.image, None)
+    return parameters
+
+
+def _parameters(values: Mapping[str, Any]) -> Parameters:
+    """From the values of all, by name. Raises a CalibrationError: a bad one is refused now, not with the first image."""
+    settings = {name: checked(name, values[name], f) for name, f in SETTINGS.items()}
+    of_stages = {stage: {f.name: values[f"{stage}.{f.name}"] for f in dataclasses.fields(cls)} for stage, cls in stages().items()}
+    parameters = Parameters(settings, update(Config(), of_stages))
+    parameters.check()
     return parameters
 
 
@@ -250,20 +254,10 @@ def replaced(name: str, config: Config, given: Iterable[str]) -> list[str]:
 
 def changed(parameters: Parameters, given: list[Parameter]) -> Parameters:
     """All parameters after a change at run time, which is checked as a whole, but for the mask. Raises a CalibrationError."""
-    new: dict[str, dict[str, Any]] = {}
-    known, settings = stages(), dict(parameters.settings)
-    unknown = misspelt({p.name: p.value for p in given}, parameters.to_dict())
-    if unknown:
+    now = parameters.to_dict()
+    if unknown := misspelt({p.name: p.value for p in given}, now):
         raise ConfigError("; ".join(unknown))
-    for p in given:
-        stage, dot, name = p.name.partition(".")
-        if dot and stage in known:
-            new.setdefault(stage, {})[name] = _plain(p.value)
-        elif p.name in SETTINGS:
-            settings[p.name] = checked(p.name, _plain(p.value), SETTINGS[p.name])
-    config = update(parameters.config, new) if new else parameters.config
-    Parameters(settings, config).check()
-    return Parameters(settings, config)
+    return _parameters(now | {p.name: _plain(p.value) for p in given if p.name in now})
 
 
 def _plain(value: Any) -> Any:

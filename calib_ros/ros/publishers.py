@@ -32,7 +32,7 @@ from calib_ros.ros.conversions import (
     transform_message,
 )
 from calib_ros.ros.dds import LATCHED
-from calib_ros.ros.interface import PairPart
+from calib_ros.ros.parts import NodePart
 
 PROCESSED_KEPT = 100  # headers; more are of messages that are gone before a pair is worked off
 VALID_PERIODS = 2.5  # of publishing: one message may be late, and another one lost
@@ -41,7 +41,7 @@ VALID_PERIODS = 2.5  # of publishing: one message may be late, and another one l
 STARVED_PERIODS = 3
 
 
-class ExtrinsicPublisher(PairPart):
+class ExtrinsicPublisher(NodePart):
     """~/transform on every change, and ~/extrinsic at least once in publish_period_s, with what a consumer needs to rely on it.
 
     DDS tells subscribers that ask for it when the messages stay away (deadline) or the process ends (liveliness). stamp: of the
@@ -62,17 +62,12 @@ class ExtrinsicPublisher(PairPart):
             liveliness=LivelinessPolicy.AUTOMATIC,
             liveliness_lease_duration=Duration(seconds=self._valid_s),
         )
-        self._publisher = own.node.create_publisher(ExtrinsicMsg, "~/extrinsic", profile)
-        self._transforms = own.node.create_publisher(TransformStamped, "~/transform", LATCHED)
+        self._publisher = self._create_publisher(ExtrinsicMsg, "~/extrinsic", profile)
+        self._transforms = self._create_publisher(TransformStamped, "~/transform", LATCHED)
 
     def pause(self) -> None:
         """Say as the last message that the extrinsic is not usable any more."""
         self._pipeline.read_current(self._publish)
-
-    def destroy(self) -> None:
-        """See `NodeService`."""
-        for publisher in (self._publisher, self._transforms):
-            self._node.destroy_publisher(publisher)
 
     def validity(self, extrinsic: Extrinsic) -> Validity:
         """Whether an extrinsic is to be used as of now."""
@@ -125,7 +120,7 @@ class ExtrinsicPublisher(PairPart):
         return msg
 
 
-class OverlayPublisher(PairPart):
+class OverlayPublisher(NodePart):
     """~/overlay and ~/overlay/compressed: the diagnostic picture, drawn once for both while someone listens to either, at most
     once per overlay_period_s.
 
@@ -134,15 +129,10 @@ class OverlayPublisher(PairPart):
 
     def __init__(self, own: Any) -> None:
         super().__init__(own)
-        self.publisher = own.node.create_publisher(Image, "~/overlay", 1)
-        self.compressed = own.node.create_publisher(CompressedImage, "~/overlay/compressed", 1)
+        self.publisher = self._create_publisher(Image, "~/overlay", 1)
+        self.compressed = self._create_publisher(CompressedImage, "~/overlay/compressed", 1)
         self._last = 0.0
         self._listeners = 0  # of both, a second ago
-
-    def destroy(self) -> None:
-        """See `NodeService`."""
-        for publisher in (self.publisher, self.compressed):
-            self._node.destroy_publisher(publisher)
 
     def check(self) -> None:
         """Who begins to listen sees the newest keyframe at once: a node at rest draws none for a long time."""
@@ -185,7 +175,7 @@ class OverlayPublisher(PairPart):
             self.compressed.publish(compressed_image_message(picture, extrinsic.result.camera_frame, frame.stamp))
 
 
-class ProcessedPublisher(PairPart):
+class ProcessedPublisher(NodePart):
     """~/processed: the header of every image and cloud, once nothing that was received by then waits to be taken in.
 
     Whoever sends no more before it comes, as `calib-ros play --follow` does, loses no pair, however slow the machine is.
@@ -195,13 +185,9 @@ class ProcessedPublisher(PairPart):
         super().__init__(own)
         # Kept for whoever this node discovers late.
         kept = QoSProfile(depth=PROCESSED_KEPT, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._publisher = own.node.create_publisher(Header, "~/processed", kept)
+        self._publisher = self._create_publisher(Header, "~/processed", kept)
         self._received: deque[Header] = deque(maxlen=PROCESSED_KEPT)
         self._lock = threading.Lock()
-
-    def destroy(self) -> None:
-        """See `NodeService`."""
-        self._node.destroy_publisher(self._publisher)
 
     def check(self) -> None:
         """Somebody may listen by now."""

@@ -11,7 +11,6 @@ from sensor_msgs.msg import PointCloud2
 
 from calib_ros.arrays import Transform
 from calib_ros.errors import CalibrationError, MissingDependencyError
-from calib_ros.extensions import NodeService
 from calib_ros.frame import NANOSECONDS
 from calib_ros.lidar.ego_motion import MAX_GAP_S
 from calib_ros.online.common import Common
@@ -22,9 +21,8 @@ from calib_ros.rig.lidar_pair import QUICK_S, LidarPair
 from calib_ros.rig.lidars import LidarScans
 from calib_ros.rig.live import PairState
 from calib_ros.ros.conversions import Serialized
-from calib_ros.ros.diagnostics import Health
-from calib_ros.ros.inputs import Decoded, Listener, SharedTopics
-from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.inputs import Decoded, Listener
+from calib_ros.ros.parts import NodePart
 from calib_ros.ros.subscriptions import livox_forms, serialized
 
 SCANS_KEPT = 8  # messages of a LiDAR, among them the first one of a beat and that before it, while the other one is late
@@ -32,7 +30,7 @@ Stamped = tuple[int, Serialized]
 Moment = Mapping[str, list[Stamped]]  # of each LiDAR a scan and the one before it
 
 
-class LidarsOfRig(NodeService):
+class LidarsOfRig(NodePart):
     """Registers the scans of two LiDARs, those that cameras look at as well, on a thread of its own and within the load budget.
 
     names: target and source, their topics and decoders by name. start: T_target_source (4, 4) to begin with, None = unknown yet.
@@ -41,19 +39,17 @@ class LidarsOfRig(NodeService):
 
     def __init__(
         self,
+        own: Any,
         names: tuple[str, str],
-        shared: SharedTopics,
         topics: Mapping[str, str],
         decoded: Mapping[str, Decoded],
         common: Common,
-        parameters: Callable[[], Parameters],
-        health: Health,
         start: Callable[[], Transform | None],
     ) -> None:
-        self.names, self._shared, self._topics, self._decoded, self._common = names, shared, topics, decoded, common
-        self._parameters, self._health, self._start = parameters, health, start
+        super().__init__(own)
+        self.names, self._topics, self._decoded, self._common, self._start = names, topics, decoded, common, start
         self.reset()
-        self.load = LoadBudget(parameters().config.online, purse=common.purse)
+        self.load = LoadBudget(self._parameters.config.online, purse=common.purse)
         self.missing = ""  # why nothing is registered, for a person
         self._recent: dict[str, deque[Stamped]] = {name: deque(maxlen=SCANS_KEPT) for name in names}
         self.stamp = 0  # of the newest scans that were registered, ns
@@ -64,9 +60,9 @@ class LidarsOfRig(NodeService):
 
     def start(self) -> None:
         """Receive scans."""
-        subscribe = partial(self._shared.subscribe, preference=self._parameters()["reliability"], guard=self._health.guard)
-        forms = [serialized(PointCloud2), *livox_forms()]
-        self._listeners = {name: subscribe(forms, self._topics[name], partial(self._add, name)) for name in self.names}
+        forms, reliability = [serialized(PointCloud2), *livox_forms()], self._parameters["reliability"]
+        subscribe = partial(self._own.inputs.shared.subscribe, forms, guard=self._health.guard, preference=reliability)
+        self._listeners = {name: subscribe(self._topics[name], partial(self._add, name)) for name in self.names}
 
     def pause(self) -> None:
         """Receive nothing any more."""
@@ -78,19 +74,19 @@ class LidarsOfRig(NodeService):
 
     def reset(self) -> None:
         """Forget what was registered; scans that are worked on go into what is forgotten."""
-        config = self._parameters().config
+        config = self._parameters.config
         self.pair = LidarPair(*self.names, config.motion.time_offset_sigma_s, config.refine)
 
     def state(self) -> PairState:
         """What it says of itself now."""
-        extrinsic, most = self.pair.extrinsic, self._parameters()["max_data_age_s"]
+        extrinsic, most = self.pair.extrinsic, self._parameters["max_data_age_s"]
         told = [(name, own) for name, own in self._listeners.items() if own.silent_s > most]
         silent = ", ".join(f"nothing comes from {name} on {own.topic}" for name, own in told)
         return PairState(*self.names, extrinsic, extrinsic.usable and not silent, silent, self.pair.kind)
 
     def check(self) -> None:
         """Follow the publishers and the parameters."""
-        self.load.config = self._parameters().config.online
+        self.load.config = self._parameters.config.online
         for listener in self._listeners.values():
             listener.check()
 
@@ -118,7 +114,7 @@ class LidarsOfRig(NodeService):
             self.worker.put(moment)
 
     def _register(self, moment: Moment) -> None:
-        pair, T, motion = self.pair, self._start(), self._parameters().config.motion
+        pair, T, motion = self.pair, self._start(), self._parameters.config.motion
         with self._common.estimates.mine(self.worker.check_cancelled), self.load.counting(Work.ESTIMATES):
             self.load.start_estimate()
             scans = [

@@ -17,29 +17,25 @@ from std_srvs.srv import Trigger
 
 from calib_ros.registration.progress import Callback
 from calib_ros.result import CONVERGED, TENTATIVE, Extrinsic
-from calib_ros.ros.answers import after_answers, done, serve
-from calib_ros.ros.interface import PairPart
+from calib_ros.ros.parts import NodePart, done
 
 FEEDBACK_PERIOD_S = 0.1  # as often as a person can follow; a search reports some hundred times a second
 
 
-class Services(PairPart):
+class Services(NodePart):
     """~/get_extrinsic, ~/reset, ~/save and ~/calibrate, whose requests over the same keyframes share one estimate, which ends
     when all are cancelled."""
 
     def __init__(self, own: Any) -> None:
         super().__init__(own)
-        node, health = own.node, own.health
         self._promises: dict[bytes, Promise[Extrinsic]] = {}  # of the goals under way, by their ids
         group = ReentrantCallbackGroup()  # requests for an estimate share one, and must not wait for each other
-        self._services = [
-            serve(GetExtrinsic, "~/get_extrinsic", node, health, self._get_extrinsic),
-            serve(Trigger, "~/reset", node, health, self._reset),
-            serve(Trigger, "~/save", node, health, self._save),
-            serve(Trigger, "~/calibrate", node, health, self._calibrate, group),
-        ]
-        self._action = ActionServer(
-            node,
+        self._serve(GetExtrinsic, "~/get_extrinsic", self._get_extrinsic)
+        self._serve(Trigger, "~/reset", self._reset)
+        self._serve(Trigger, "~/save", self._save)
+        self._serve(Trigger, "~/calibrate", self._calibrate, group)
+        action = ActionServer(
+            self._node,
             Calibrate,
             "~/calibrate",
             self._execute,
@@ -48,15 +44,7 @@ class Services(PairPart):
             handle_accepted_callback=self._begin,
             cancel_callback=self._cancel,
         )
-
-    def destroy(self) -> None:
-        """To be called when no estimate is under way; answers that are made already are sent before."""
-        after_answers(self._node, self._destroy)
-
-    def _destroy(self) -> None:
-        for service in self._services:
-            self._node.destroy_service(service)
-        self._action.destroy()
+        self._ends.append(action.destroy)
 
     def _message(self, extrinsic: Extrinsic | None = None) -> ExtrinsicMsg:
         """The message of an extrinsic as of now; None = of the current one, the initial one before any."""

@@ -5,26 +5,25 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.datasets.static_transforms import StaticTransforms
 from calib_ros.errors import BadInputError, MissingDependencyError
-from calib_ros.extensions import NodeService
 from calib_ros.online.events import ExtrinsicUpdated
 from calib_ros.result import Result
 from calib_ros.ros.conversions import transform_message
 from calib_ros.ros.dds import LATCHED
-from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.parts import NodePart
 
 CAMERA, LIDAR = "camera", "lidar"  # values of tf_parent
 OWN_TRANSFORMS = 64  # published transforms that are recognised when they are received: one of the newest
@@ -37,18 +36,16 @@ CURES = (
 )
 
 
-class StaticTf(NodeService):
+class StaticTf(NodePart):
     """Reads the static tree for an initial extrinsic, and publishes the extrinsic to it while publish_tf says so.
 
-    parameters: gives the current ones. error: takes one line for a person, and its kind for the log. cures: what to do about a
-    loop, and about a second parent. tree: of everybody but this node. MissingDependencyError if publish_tf is
-    asked for without tf2_msgs.
+    cures: what to do about a loop, and about a second parent. tree: of everybody but this node. MissingDependencyError if
+    publish_tf is asked for without tf2_msgs.
     """
 
-    def __init__(
-        self, node: Node, parameters: Callable[[], Parameters], error: Callable[[str, str], None], cures: tuple[str, str] = CURES
-    ) -> None:
-        self._node, self._parameters, self._error, self._cures = node, parameters, error, cures
+    def __init__(self, own: Any, cures: tuple[str, str] = CURES) -> None:
+        super().__init__(own)
+        self._node, self._cures = own.inputs.shared.node, cures  # of a rig, for its pairs as well
         self.tree = StaticTransforms()
         self._since = time.monotonic()
         self._type: Any = None
@@ -57,17 +54,19 @@ class StaticTf(NodeService):
 
             self._type = TFMessage
         self._publisher: Any = None
-        self._own: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
+        self._sent: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
         self._wanted: tuple[Result, int] | None = None  # the newest that was to be published, with its stamp
-        self._edge = "", ""  # parent and child by the parameters when it was published last
+        # Parent and child by the parameters when it was published last: CAMERA or LIDAR and "", the other sensor being the child;
+        # with a child, the name of its parent.
+        self._edge = "", ""
         self._published: TransformStamped | None = None  # what late joiners get
         self._tree_wanted: Sequence[TransformStamped] = ()  # several edges that were not published yet
         self._lock = threading.RLock()  # a worker publishes, the executor switches and receives
-        self._use_tree = parameters()["initial_from_tf"] and self._type is not None
+        self._use_tree = self._parameters["initial_from_tf"] and self._type is not None
         self._subscription: Any = None
         if self._use_tree:
             self._listen()
-        if parameters()["publish_tf"]:
+        if self._parameters["publish_tf"]:
             self._switch(True)
 
     @property
@@ -119,7 +118,7 @@ class StaticTf(NodeService):
     def _publish(self) -> None:
         if self._publisher is None or self._wanted is None or time.monotonic() - self._since < WAIT_S:
             return  # what others publish is not known yet; see check()
-        self._edge = self._wanted_edge()
+        self._edge = self._parameters["tf_parent"], self._parameters["tf_child"]
         try:
             message = self._message(*self._wanted)
         except BadInputError as error:
@@ -129,7 +128,7 @@ class StaticTf(NodeService):
         self._send([message])
 
     def _send(self, messages: list[TransformStamped]) -> None:
-        self._own.extend(messages)
+        self._sent.extend(messages)
         self._publisher.publish(self._type(transforms=messages))
 
     def put_tree(self, messages: Sequence[TransformStamped]) -> None:
@@ -138,22 +137,6 @@ class StaticTf(NodeService):
         with self._lock:
             self._tree_wanted = messages
 
-    def _publish_tree(self) -> None:
-        if self._publisher is None or not self._tree_wanted or time.monotonic() - self._since < WAIT_S:
-            return
-        messages, self._tree_wanted, allowed = self._tree_wanted, (), []
-        for message in messages:
-            conflict = self._conflict(message.header.frame_id, message.child_frame_id)
-            if conflict:
-                self._error(conflict, f"tf {message.child_frame_id}")
-            else:
-                allowed.append(message)
-        self._send(allowed)
-
-    def _wanted_edge(self) -> tuple[str, str]:
-        """Parent and child: CAMERA or LIDAR and "", the other sensor being the child; with a child, the name of its parent."""
-        return self._parameters()["tf_parent"], self._parameters()["tf_child"]
-
     def check(self) -> None:
         """Follow the parameters and the tree, which may have changed for the better or the worse.
 
@@ -161,9 +144,14 @@ class StaticTf(NodeService):
         first publisher too, in any order.
         """
         with self._lock:
-            self._switch(self._parameters()["publish_tf"])
-            self._publish_tree()
-            message, edge = self._published, self._wanted_edge()
+            self._switch(self._parameters["publish_tf"])
+            if self._publisher is not None and self._tree_wanted and time.monotonic() - self._since >= WAIT_S:
+                messages, self._tree_wanted = self._tree_wanted, ()
+                conflicts = {m.child_frame_id: self._conflict(m.header.frame_id, m.child_frame_id) for m in messages}
+                for child, conflict in filter(itemgetter(1), conflicts.items()):
+                    self._health.error(conflict, f"tf {child}")
+                self._send([message for message in messages if not conflicts[message.child_frame_id]])
+            message, edge = self._published, (self._parameters["tf_parent"], self._parameters["tf_child"])
             if message is None or edge[1] or edge != self._edge:
                 self._publish()
             elif conflict := self._conflict(message.header.frame_id, message.child_frame_id):
@@ -176,12 +164,12 @@ class StaticTf(NodeService):
 
     def _receive(self, msg: Any) -> None:
         with self._lock:
-            others = [item for item in msg.transforms if not any(_same(item, own) for own in self._own)]
+            others = [item for item in msg.transforms if not any(_same(item, own) for own in self._sent)]
         self.tree.add(self._type(transforms=others))
 
     def _withdraw(self, why: str) -> None:
         """Nothing is published any more: tf2 would take the tree apart, or a wrong edge stay in it."""
-        self._error(why, "tf")
+        self._health.error(why, "tf")
         if self._published is not None:
             self._switch(False)
             self._switch(True)

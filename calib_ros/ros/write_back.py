@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from collections.abc import Sequence
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -11,32 +10,28 @@ from typing import Any
 import numpy as np
 
 from calib_ros.errors import BadInputError
-from calib_ros.export import AUTOWARE, CAMCHAIN, DESCRIPTIONS, Edges, content, has_changed, with_edges, write_back
-from calib_ros.extensions import NodeService
+from calib_ros.export import AUTOWARE, CAMCHAIN, DESCRIPTIONS, content, has_changed, with_edges, write_back
 from calib_ros.io import check_output
 from calib_ros.online.events import ExtrinsicUpdated
 from calib_ros.result import CONVERGED, Result
 from calib_ros.rig.description import RigDescription
 from calib_ros.rig.graph import joined_to
 from calib_ros.rig.report import RigReport
-from calib_ros.ros.diagnostics import Health
-from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.parts import NodePart
 
 
-class WriteBack(NodeService):
-    """Thread-safe; files are written on the executor's only thread. parameters: gives the current ones. edges: of a single pair,
-    those of the tree of frames, see `calib_ros.export.write_back`."""
+class WriteBack(NodePart):
+    """Thread-safe; files are written one after the other. Of a single pair edges are those of the tree of frames, see
+    `calib_ros.export.write_back`."""
 
-    def __init__(
-        self, parameters: Callable[[], Parameters], executor: Executor, health: Health, edges: Callable[[Result], Edges]
-    ) -> None:
-        self._parameters, self._executor, self._health, self._edges = parameters, executor, health, edges
+    def __init__(self, own: Any) -> None:
+        super().__init__(own)
         self._known: Result | RigReport | None = None
         self._settings = self._wanted()
         self._written: dict[tuple[str, str], Result | RigReport] = {}  # by file and joint
 
     def _wanted(self) -> tuple[tuple[str, ...], str]:
-        return self._parameters()["export.on_converged"], self._parameters()["export.joint"]
+        return self._parameters["export.on_converged"], self._parameters["export.joint"]
 
     def add(self, event: Any) -> None:
         """A new extrinsic of a single pair, whatever its status."""
@@ -48,7 +43,7 @@ class WriteBack(NodeService):
         """What has converged: of a pair, or of a rig a solution of which all sensors are usable."""
         self._known = known
         if known is not None and self._wanted()[0]:
-            self._executor.submit(self._write, known)
+            self._own.files.submit(self._write, known)
 
     def check(self) -> None:
         """Other files want what is known."""
@@ -69,7 +64,7 @@ class WriteBack(NodeService):
                 continue
             try:
                 if isinstance(known, Result):
-                    write_back(path, known, self._edges(known), joint)
+                    write_back(path, known, self._own.tf.edges(known), joint)
                 elif remark := known.write(path):
                     self._health.error(f"export.on_converged: {remark}", told)
                 self._written[path, joint] = known

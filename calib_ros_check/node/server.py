@@ -17,9 +17,9 @@ from rclpy.node import Node
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.extensions import NodeService
 from calib_ros.online.pipeline import Pipeline
-from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.conversions import covariance_for_ros, matrix_from_transform, time_message, transform_message
 from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
+from calib_ros.ros.parts import after_answers, done
 from calib_ros_check.node.requests import CheckOutcome, CheckRequest, request_check
 from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Deviation, Tolerance
 from calib_ros_check.tolerance import unknown

@@ -27,9 +27,9 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.overlay import PALETTE, depth_levels
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.conversions import time_message
 from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.parts import after_answers, done
 
 DEFAULT_WIDTH, LEAST_WIDTH, MOST_WIDTH = 320, 64, 1280  # px
 JPEG_QUALITY = 80

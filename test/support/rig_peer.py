@@ -89,7 +89,7 @@ class RigPeer(NodeAndPeer):
 
     def pair(self, camera: str) -> Any:
         """The interface of a pair."""
-        return self.calibration.pairs[camera, self.lidar]
+        return self.calibration.graph.pairs[camera, self.lidar]
 
     def sensor(self, name: str, rig: Rig | None = None) -> Any:
         """What the newest message, or another one, says of a sensor."""
@@ -107,7 +107,7 @@ class RigPeer(NodeAndPeer):
             if name in self.rig.lidars:
                 self.publishers[f"/{name}/points"].publish(cloud_message(value, stamp, frame_id=name))
                 pairs, stream = self.cameras if name == self.lidar else (), "clouds"
-                for own in self.calibration.lidars:
+                for own in self.calibration.graph.lidars:
                     self.until(lambda o=own, n=name, s=stamp: o._recent[n] and o._recent[n][-1][0] == s, f"a scan of {name}")
                     assert own.worker.wait_idle(LIMIT_S)
             else:

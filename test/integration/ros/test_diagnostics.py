@@ -24,8 +24,7 @@ from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadBudget, Work
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
-from calib_ros.ros import pair
-from calib_ros.ros.conversions import time_message
+from calib_ros.ros import calibration
 from calib_ros.ros.diagnostics import Diagnostics, Health, refined_values
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -40,11 +39,11 @@ class Watched:
         self.now, self.health = 0.0, Health(logging.getLogger())
         self.pipeline = Pipeline(config, Inputs(*3 * [lambda *_: None]), lambda event: None)
         self.load = self.pipeline.load = LoadBudget(config.online, lambda: self.now)
-        self.diagnostics = Diagnostics("/calib_ros", self.health, self.pipeline)
+        self.diagnostics = Diagnostics("/calib_ros", self.health, self.pipeline, lambda: {"more": "yes"})
 
-    def status(self, **extra: str) -> DiagnosticStatus:
-        self.diagnostics.count()
-        return self.diagnostics.message(time_message(0), extra).status[0]
+    def status(self) -> DiagnosticStatus:
+        self.diagnostics.check()
+        return self.diagnostics.status()
 
 
 @pytest.fixture
@@ -70,7 +69,7 @@ def test_every_status_has_its_level(watched, status, level, text):
     covariance = np.diag([1e-6, 4e-6, 1e-6, 1e-4, 1e-4, 9e-4])
     result = Result(np.eye(4), status, "" if status == CONVERGED else "because", 0.9, covariance)
     watched.health.add(ExtrinsicUpdated(Extrinsic(result, 1.25, 7, "does not fit", 0.031), 0))
-    found = watched.status(more="yes")
+    found = watched.status()
     assert (found.level, found.message) == (level, text)
     said = {v.key: v.value for v in found.values}
     assert (said["status"], said["drift"], said["estimates accepted"], said["more"]) == (status, "1.25", "7", "yes")
@@ -208,7 +207,7 @@ def test_a_node_at_work(street, drive, monkeypatch):
 
 
 def test_a_change_of_status_is_diagnosed_at_once(street, drive, monkeypatch):
-    monkeypatch.setattr(pair, "DIAGNOSED_AGAIN_S", 0.0)
+    monkeypatch.setattr(calibration, "DIAGNOSED_AGAIN_S", 0.0)
     with Peer(**start_parameters(drive.reference), **QUICK, initial_from_tf=False) as peer:
         for timer in peer.calibration._timers:  # nothing else diagnoses it
             timer.cancel()

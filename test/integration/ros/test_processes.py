@@ -219,7 +219,7 @@ sys.exit({entry_point}() + 3)
     [
         ("calib_node", "rclpy.node", "Node", "create_publisher"),
         ("calib_lifecycle_node", "rclpy.node", "Node", "create_publisher"),
-        ("calib_node", "calib_ros.ros.diagnostics", "Diagnostics", "message"),
+        ("calib_node", "calib_ros.ros.diagnostics", "Diagnostics", "status"),
     ],
 )
 def test_a_signal_in_the_middle_of_making_or_publishing(entry_point, module, owner, name):

@@ -45,7 +45,7 @@ from calib_ros.ros import conversions
 from calib_ros.ros.conversions import matrix_from_transform
 from calib_ros.ros.dds import LATCHED
 from calib_ros.ros.inputs import UNSEEN_SCANS, PairInputs
-from calib_ros.ros.node import CalibLifecycleNode, interface
+from calib_ros.ros.node import CalibLifecycleNode, Calibration
 from calib_ros.ros.rig_lidars import LidarsOfRig
 from calib_ros_synthetic.rig import SyntheticRig
 
@@ -250,14 +250,14 @@ def test_two_lidars_are_registered_to_each_other(two) -> None:
     values = {v.key: v.value for v in peer.until(lambda: peer.statuses.get("calib_ros: rig")).values}
     assert values["lidar_right with lidar_left"] == "converged"
     assert edge.rotation_deg < 0.1
-    load = peer.calibration.lidars[0].load
+    load = peer.calibration.graph.lidars[0].load
     assert load._purse is peer.pair("front").pipeline.load._purse
     assert load.counts().seconds[Work.ESTIMATES] > 0
 
 
 def test_without_the_library_lidars_keep_their_priors_and_one_line_says_so(two, monkeypatch) -> None:
-    own = two.peer.calibration.lidars[0]
-    alone = LidarsOfRig(own.names, None, {}, own._decoded, Common(OnlineConfig()), own._parameters, own._health, own._start)
+    own = two.peer.calibration.graph.lidars[0]
+    alone = LidarsOfRig(own._own, own.names, {}, own._decoded, Common(OnlineConfig()), own._start)
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     errors = own._health.errors
     for name in own.names:
@@ -277,7 +277,7 @@ def test_without_the_library_lidars_keep_their_priors_and_one_line_says_so(two, 
 def test_a_reset_forgets_what_the_lidars_told_of_each_other(two) -> None:
     """Of a pair, the registrations of its LiDAR; of the rig, everything. Last, since the node then knows nothing."""
     peer = two.peer
-    (own,) = peer.calibration.lidars
+    (own,) = peer.calibration.graph.lidars
     before = own.pair
 
     def forgets(name: str) -> None:
@@ -383,7 +383,7 @@ def test_a_wrong_rig_file_is_refused_by_what_is_wrong(tmp_path, wrong, named) ->
     given = {"rig_file": str(file), "export.on_converged": [str(kit)]}
     node = CalibLifecycleNode(context=context, parameter_overrides=[Parameter(n, value=v) for n, v in given.items()])
     with pytest.raises(BadInputError) as caught:
-        interface(node)
+        Calibration(node)
     node.destroy_node()
     rclpy.try_shutdown(context=context)
     said = str(caught.value)
