@@ -113,8 +113,8 @@ def _calibrate(args: argparse.Namespace) -> int:
 def _rig(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import configuration
     from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
-    from calib_ros.datasets.rig import open_rig
-    from calib_ros.datasets.rig_source import rig_yaml
+    from calib_ros.datasets.open import open_rig
+    from calib_ros.datasets.rig import rig_yaml
     from calib_ros.io import check_output, write_atomically
     from calib_ros.rig.description import read_rig
     from calib_ros.rig.edges import RigMeasurer
@@ -165,7 +165,7 @@ def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import open_named_source
     from calib_ros.cli.output import progress_bar
     from calib_ros.datasets.bag_writer import write_bag
-    from calib_ros.datasets.rig import named_rig
+    from calib_ros.datasets.open import named_rig
     from calib_ros.datasets.source import frame_positions
 
     rig = named_rig(args.source) if args.camera is None else None

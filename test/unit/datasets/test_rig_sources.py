@@ -17,9 +17,9 @@ from calib_ros.cli.main import main
 from calib_ros.datasets import bag, kitti, nuscenes, open_dataset
 from calib_ros.datasets.bag_file import BagFile
 from calib_ros.datasets.bag_rig import BagRig
+from calib_ros.datasets.open import open_rig
 from calib_ros.datasets.recent import Recent
-from calib_ros.datasets.rig import open_rig
-from calib_ros.datasets.rig_source import RigDescription, Sensor, rig_yaml
+from calib_ros.datasets.rig import RigDescription, Sensor, rig_yaml
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.initial_guess import nominal
