@@ -73,10 +73,14 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     if not is_nuscenes(path) and (is_bag(path) or is_capture(path)):
         from calib_ros.datasets.bag import BagSource
 
-        known = list(signature(BagSource).parameters)[1:]
-        _refuse({name: options[name] for name in options.keys() - known}, text)
+        _refuse({name: options[name] for name in options.keys() - signature(BagSource).parameters}, text)
         return CaptureSource(path, **options) if is_capture(path) else BagSource(path, **options)
-    for fits, reader in ((is_nuscenes, NuScenesSource), (is_folder_dataset, FolderSource), (is_once, OnceSource)):
+    for fits, reader in (
+        (is_nuscenes, NuScenesSource),
+        (is_folder_dataset, FolderSource),
+        (is_once, OnceSource),
+        (find_drive, KittiSource),
+    ):
         if fits(path):
             _refuse(options, text)
             return reader(path, camera)
@@ -85,12 +89,6 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
             f"{text}: PandaSet's scans are pickles, which run code where they are read; write x, y, z, i of pandas.read_pickle, "
             f"in the LiDAR's frame by the inverse of lidar/poses.json, to .npz files of {EXPECTED_FOLDER}"
         )
-    folder = find_drive(path) if path.is_dir() else None
-    if folder is not None:
-        _refuse(options, text)
-        if isinstance(camera, str):
-            raise BadInputError(f"{text} has no camera {camera}; KITTI's are numbers from 0 to 3")
-        return KittiSource(folder, camera)
     if path.is_file():
         raise BadInputError(f"{text} is not a dataset; give a .mcap, .db3 or .bag file, a bag folder or a KITTI folder")
     names = sorted(child.name for child in path.iterdir())
