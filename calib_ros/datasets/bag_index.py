@@ -48,7 +48,13 @@ class BagIndex:
         """Read the whole bag once. keep: hold messages in memory, as `read_spans` does."""
         if keep:
             self._kept = {}
-        begin, statics = self._first_key(), self._bag.statics
+        begin, statics = self._bag.start, self._bag.statics
+        if self._bag.topics[self.image.topic].type in VIDEO:  # decoding begins with a key frame
+            with located(self._bag.path, self.image.topic):
+                packets = (
+                    (time, packet_of(self._bag.decode(topic, data))) for topic, time, data in self._bag.raw([self.image.topic])
+                )
+                begin = next((time for time, packet in packets if packet.is_key), self._bag.stop)
         topics = [*self._by_topic, *statics]
         whole = [self.info.topic, *statics]
         for topic, recorded, data in self._bag.raw(topics) if keep else self._bag.heads(topics, whole):
@@ -60,16 +66,6 @@ class BagIndex:
                 self._add(topic, recorded, data)
         self._transforms.sort(key=lambda one: one[0])
         self._finish()
-
-    def _first_key(self) -> int:
-        """Recording time of the first picture that can be decoded, ns."""
-        if self._bag.topics[self.image.topic].type not in VIDEO:
-            return self._bag.start
-        for topic, recorded, data in self._bag.raw([self.image.topic]):
-            with located(self._bag.path, topic):
-                if packet_of(self._bag.decode(topic, data)).is_key:
-                    return recorded
-        return self._bag.stop
 
     def read_spans(self, spans: list[Span]) -> None:
         """Read only what was recorded in these spans, which neither overlap nor have been read; CameraInfo also around them,
