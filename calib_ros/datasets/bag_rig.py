@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
+from copy import copy
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -17,7 +19,7 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.bag import BagSource, cloud_of
 from calib_ros.datasets.bag_file import BagFile, peek_header
-from calib_ros.datasets.bag_index import RECORDING, TopicIndex
+from calib_ros.datasets.bag_index import RECORDING, BagListing
 from calib_ros.datasets.bag_topics import (
     choose_camera_info,
     choose_image,
@@ -71,30 +73,37 @@ class BagRig(DescribedRig):
         of_camera, of_lidar = self._believed(camera.name), self._believed(lidar.name)
         view = None if of_camera is None or of_lidar is None else se3.inverse(of_camera) @ of_lidar
         topics = self._topics[camera.name], self._topics[lidar.name], self._info_topic(camera.name)
-        clock = {} if self._indices[1] else {"clock": RECORDING}
-        return BagSource(self.path, *topics, **{"T_camera_lidar": view, **self._options, **clock})
+        of_all: dict[str, Any] = {} if self._options.get("windows") else {"listing": self._listing}
+        clock = {} if self._by_headers else {"clock": RECORDING}
+        return BagSource(self.path, *topics, **{"T_camera_lidar": view, **self._options, **clock, **of_all})
 
     def scans(self, lidar: str) -> Timed:
         """By the clock of the pairs, differences between clocks not taken out."""
-        index = self._indices[0][self._topics[lidar]]
+        index = copy(self._listing.found[self._topics[lidar]])
+        index.finish(self._by_headers)
 
         def read(k: int) -> PointCloud:
-            name = index.topic, int(index.recorded[k]), int(index.headers[k])
-            return self._recent(name, lambda: cloud_of(self._bag.find(*name), self._bag.topics[index.topic].type))
+            kind = self._bag.topics[index.topic].type
+            return self._recent(index.key(k), lambda: cloud_of(self._bag.find(*index.key(k)), kind))
 
         return Timed(index.stamps, read)
 
     @cached_property
-    def _indices(self) -> tuple[dict[str, TopicIndex], bool]:
-        """Of all sensors' messages, by topic; and whether the headers' stamps count, which needs them of all sensors: else the
-        times of recording do."""
-        found = {topic: TopicIndex(topic) for topic in self._topics.values()}
-        for topic, recorded, data in self._bag.heads(list(found), []):
-            found[topic].add(recorded, data)
-        by_headers = self._options.get("clock") != RECORDING and all(own.has_stamps for own in found.values())
-        for index in found.values():
-            index.finish(by_headers)
-        return found, by_headers
+    def _listing(self) -> BagListing:
+        """All messages, read once for all pairs."""
+        infos = []
+        for name in self.cameras:
+            with suppress(BadInputError):  # told when the camera is asked for
+                infos.append(self._info_topic(name))
+        listing = BagListing(self._bag, self._topics.values(), infos)
+        listing.read()
+        return listing
+
+    @property
+    def _by_headers(self) -> bool:
+        """Whether the headers' stamps count, which needs them of all sensors: else the times of recording do."""
+        measured = (self._listing.found[topic] for topic in self._topics.values())
+        return self._options.get("clock") != RECORDING and all(own.has_stamps for own in measured)
 
     @cached_property
     def _tree(self) -> StaticTransforms:
