@@ -44,10 +44,10 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from calib_ros import se3
-from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_file import BagFile, peek_header
 from calib_ros.datasets.bag_writer import DESCRIPTION, write_bag, write_rig_bag
-from calib_ros.datasets.rig import RecordedRig, named_rig
+from calib_ros.datasets.open import named_rig, open_dataset
+from calib_ros.datasets.rig import RecordedRig
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.pacing import Work

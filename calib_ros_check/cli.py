@@ -12,7 +12,7 @@ from typing import Any
 
 from calib_ros.cli.inputs import configuration
 from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
-from calib_ros.datasets.rig import is_folder_rig
+from calib_ros.datasets.folder import is_folder_rig
 from calib_ros.datasets.source import selected
 from calib_ros.errors import BadInputError
 from calib_ros.result import VERSION

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from calib_ros.cli.inputs import bag_options, configuration, initial_extrinsic, open_named_source
 from calib_ros.cli.output import note, progress_bar
-from calib_ros.datasets.rig import open_rig
+from calib_ros.datasets.open import open_rig
 from calib_ros.datasets.source import frame_positions, spread_positions
 from calib_ros.errors import BadInputError
 from calib_ros.io import check_output

@@ -109,7 +109,10 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
 
     command = add("calibrate", "estimate the extrinsic from the frames of a source")
     _frames_and_start(command)
-    _search(command)
+    for option, unit in (("--search-deg", "deg"), ("--search-m", "m")):
+        command.add_argument(
+            option, type=per_axis, metavar="S[,S,S]", help=f"half width of the search box, {unit}; both 0 = refine only"
+        )
     _constraints(command)
     command.add_argument(
         "--objective", choices=["fast", *names(OBJECTIVES)], help="score to maximise (default fast); thesis = eq. 3.12"
@@ -232,13 +235,6 @@ def add_preset(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--preset", choices=names(PRESETS), default="", help="thesis = the thesis's own system; other options hold before it"
     )
-
-
-def _search(command: argparse.ArgumentParser) -> None:
-    for option, unit in (("--search-deg", "deg"), ("--search-m", "m")):
-        command.add_argument(
-            option, type=per_axis, metavar="S[,S,S]", help=f"half width of the search box, {unit}; both 0 = refine only"
-        )
 
 
 def _constraints(command: argparse.ArgumentParser) -> None:

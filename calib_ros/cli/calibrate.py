@@ -44,8 +44,7 @@ def calibrate(
     T0 = initial_extrinsic(initial, source, yaw_deg)
     moving = initial in (MOTION, AUTO)
     box = None if moving and search_deg is None and search_m is None else search_box(initial, config, search_deg, search_m)
-    if initial in BY_CLASSES:
-        require_classes(config, initial)
+    require_classes(config, initial)
     if overlay is not None:
         check_output(overlay, "--overlay")
     if initial == "nominal" and not any(config.constraints.limit_m):

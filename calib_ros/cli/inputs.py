@@ -20,7 +20,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros.datasets.open import is_bag
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.registration.initial_guess import GUESSES, nominal
+from calib_ros.registration.initial_guess import BY_CLASSES, GUESSES, nominal
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, Axes, SearchBox
 
 _FREE = {axis: NO_LIMIT_DEG if axis[0] == "r" else NO_LIMIT_M for axis in AXES}
@@ -58,17 +58,13 @@ class ConstraintOptions:
         half = dict(zip(AXES, (*constraints.limit_deg, *constraints.limit_m), strict=True)) | limits
         if not any(half.values()):
             raise BadInputError("all six axes are fixed: nothing is left to estimate")
+        self.check_free("--prior", self.prior_deg, self.prior_m, "the standard deviation")
         values: dict[str, object] = {
             "limit_deg": tuple(half[axis] for axis in AXES[:3]),
             "limit_m": tuple(half[axis] for axis in AXES[3:]),
         }
-        for option, name, prior, axes in (
-            ("--prior-deg", "sigma_deg", self.prior_deg, AXES[:3]),
-            ("--prior-m", "sigma_m", self.prior_m, AXES[3:]),
-        ):
-            if prior is not None:
-                self.check_fixed(option, prior, axes, "the standard deviation")
-                values[name] = prior
+        sigmas = {"sigma_deg": self.prior_deg, "sigma_m": self.prior_m}
+        values |= {name: prior for name, prior in sigmas.items() if prior is not None}
         motion: dict[str, object] = {}
         if self.time_offset is not None and config.motion.deskew == "off":
             raise BadInputError("--time-offset has no effect with motion.deskew: off, which leaves all points where they are")
@@ -81,19 +77,15 @@ class ConstraintOptions:
             motion |= {"time_offset": "fixed", "time_offset_s": self.time_offset}
         return update(config, {"constraints": values, "motion": motion})
 
-    def check_search(self, search_deg: Three | None, search_m: Three | None) -> None:
-        """BadInputError for a search along an axis that is fixed here."""
-        for option, half, axes in (("--search-deg", search_deg, AXES[:3]), ("--search-m", search_m, AXES[3:])):
-            if half is not None:
-                self.check_fixed(option, half, axes, "the search")
-
-    def check_fixed(self, option: str, values: Three, axes: Sequence[str], what: str) -> None:
-        """BadInputError if a value that is not 0 belongs to an axis fixed here. One number for all axes means the free ones."""
+    def check_free(self, option: str, deg: Three | None, m: Three | None, what: str) -> None:
+        """BadInputError if an option has a value, by degrees and metres, that is not 0 and belongs to an axis fixed here. One
+        number for all axes means the free ones. what: that the values are."""
         limits = self.limits()
-        wrong = [axis for axis, value in zip(axes, values, strict=True) if value and limits.get(axis) == 0]
-        if wrong and (len(wrong) == 3 or len(set(values)) > 1):
-            verb = "is fixed" if len(wrong) == 1 else "are fixed"
-            raise BadInputError(f"{option}: {', '.join(wrong)} {verb}, so {what} there must be 0")
+        for unit, values, axes in (("deg", deg, AXES[:3]), ("m", m, AXES[3:])):
+            wrong = [axis for axis, value in zip(axes, values or (), strict=False) if value and limits.get(axis) == 0]
+            if wrong and (len(wrong) == 3 or len(set(values or ())) > 1):
+                verb = "is fixed" if len(wrong) == 1 else "are fixed"
+                raise BadInputError(f"{option}-{unit}: {', '.join(wrong)} {verb}, so {what} there must be 0")
 
 
 def configuration(
@@ -132,9 +124,9 @@ def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: 
 
 
 def require_classes(config: Config, initial: str) -> None:
-    """BadInputError if the configuration gives no classes for a first guess from them."""
+    """BadInputError for a first guess from classes if the configuration gives none."""
     own = config.semantics
-    if own.segmentation == "none" or not own.image_classes or not own.cloud_classes:
+    if initial in BY_CLASSES and (own.segmentation == "none" or not own.image_classes or not own.cloud_classes):
         raise BadInputError(
             f"--initial {initial} needs classes of pixels and points: leave semantics.segmentation, image_classes and "
             "cloud_classes in --config at their defaults, or set the classes to an ONNX file, a folder, or 'source' for "

@@ -27,9 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             if sys.stdout is not None:  # as of a service without one
                 sys.stdout.flush()
             return code
-    except CalibrationError as error:
-        print(f"calib-ros: {error}", file=sys.stderr)
-        return BAD_INPUT
+    except BrokenPipeError:  # the reader, for instance `head`, has seen enough
+        from calib_ros.cli.output import discard_output
+
+        discard_output()
+        return OK
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         advice = "install it from the repository of calib_ros" if library.startswith("calib_ros_") else OPTIONAL.get(library)
@@ -37,12 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"calib-ros: '{given[0]}' needs {library}: {advice}", file=sys.stderr)
         return BAD_INPUT
-    except OSError as error:
-        if isinstance(error, BrokenPipeError):  # the reader, for instance `head`, has seen enough
-            from calib_ros.cli.output import discard_output
-
-            discard_output()
-            return OK
+    except (CalibrationError, OSError) as error:
         print(f"calib-ros: {error}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
@@ -83,25 +80,27 @@ def _info(args: argparse.Namespace) -> int:
 def _calibrate(args: argparse.Namespace) -> int:
     from calib_ros.cli.calibrate import advice, calibrate
     from calib_ros.cli.inputs import configuration, constraint_options, initial_of, open_named_source
-    from calib_ros.cli.output import check_camera_info, check_json, note, print_or_save, summary
+    from calib_ros.cli.output import check_json, note, print_or_save, summary
+    from calib_ros.config.sensors import REFINE
     from calib_ros.intrinsics import camera_info_yaml
-    from calib_ros.io import write_atomically
+    from calib_ros.io import check_output, write_atomically
 
     constraints = constraint_options(args)
-    constraints.check_search(args.search_deg, args.search_m)
+    constraints.check_free("--search", args.search_deg, args.search_m, "the search")
     check_json(args.json)
     config = configuration(args.config, args.seed, args.objective, constraints, args.threads, args.intrinsics, args.preset)
     args.initial = initial_of(args, config)
-    check_camera_info(args.camera_info, config.camera)
+    if args.camera_info is not None:
+        if config.camera.intrinsics != REFINE:
+            raise BadInputError("--camera-info writes refined intrinsics: give --intrinsics refine as well, or leave it out")
+        check_output(args.camera_info, "--camera-info")
     source = open_named_source(args, config)
     cameras = getattr(source, "cameras", ())
     if len(cameras) > 1 and args.camera is None:
         names = ", ".join(cameras)
         note(f"calib-ros: the recording has cameras {names}; --camera chooses one, calib-ros rig estimates all together")
-    result = calibrate(
-        *(source, args.frames, args.initial, args.yaw_deg, config),
-        *(args.search_deg, args.search_m, args.overlay),
-    )
+    limits = args.search_deg, args.search_m
+    result = calibrate(source, args.frames, args.initial, args.yaw_deg, config, *limits, args.overlay)
     print_or_save(result, summary(result, advice(result, source, config, args.initial)), args.json)
     if args.camera_info is not None and result.converged and result.refined_camera is not None:
         write_atomically(args.camera_info, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())
@@ -113,8 +112,8 @@ def _calibrate(args: argparse.Namespace) -> int:
 def _rig(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import configuration
     from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
-    from calib_ros.datasets.rig import open_rig
-    from calib_ros.datasets.rig_source import rig_yaml
+    from calib_ros.datasets.open import open_rig
+    from calib_ros.datasets.rig import rig_yaml
     from calib_ros.io import check_output, write_atomically
     from calib_ros.rig.description import read_rig
     from calib_ros.rig.edges import RigMeasurer
@@ -165,7 +164,7 @@ def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import open_named_source
     from calib_ros.cli.output import progress_bar
     from calib_ros.datasets.bag_writer import write_bag
-    from calib_ros.datasets.rig import named_rig
+    from calib_ros.datasets.open import named_rig
     from calib_ros.datasets.source import frame_positions
 
     rig = named_rig(args.source) if args.camera is None else None
@@ -246,15 +245,7 @@ def _play(args: argparse.Namespace) -> int:
     return OK
 
 
-_RUN = {
-    "info": _info,
-    "calibrate": _calibrate,
-    "rig": _rig,
-    "convert": _convert,
-    "replay": _replay,
-    "export": _export,
-    "play": _play,
-}
+_RUN = {own.__name__[1:]: own for own in (_info, _calibrate, _rig, _convert, _replay, _export, _play)}
 
 
 if __name__ == "__main__":

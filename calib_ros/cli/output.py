@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from calib_ros import se3
-from calib_ros.config import CameraConfig, MotionConfig
-from calib_ros.config.sensors import REFINE
+from calib_ros.config import MotionConfig
 from calib_ros.datasets.source import Source
-from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
 from calib_ros.io import check_output
@@ -174,15 +172,6 @@ def check_json(path: str | None) -> None:
         check_output(path, "--json")
 
 
-def check_camera_info(path: str | None, camera: CameraConfig) -> None:
-    """BadInputError, before the work, for a --camera-info that cannot be written, or would hold what is given already."""
-    if path is None:
-        return
-    if camera.intrinsics != REFINE:
-        raise BadInputError("--camera-info writes refined intrinsics: give --intrinsics refine as well, or leave it out")
-    check_output(path, "--camera-info")
-
-
 def print_or_save(result: Savable, text: str, path: str | None) -> None:
     """What a command has found: as JSON in a file, if one is named, and in words on standard output; "-": JSON on standard
     output, and the words on the standard error. Neither a full disk nor a closed pipe takes the other one."""
@@ -190,19 +179,12 @@ def print_or_save(result: Savable, text: str, path: str | None) -> None:
         if path is not None and path != "-":
             result.save(path)
     finally:
+        try:
+            print(result.dumps().removesuffix("\n") if path == "-" else text, flush=True)
+        except BrokenPipeError:  # its reader is gone
+            discard_output()
         if path == "-":
-            print_text(result.dumps().removesuffix("\n"))
             note(text)
-        else:
-            print_text(text)
-
-
-def print_text(text: str) -> None:
-    """Print to standard output, unless its reader is gone."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        discard_output()
 
 
 def discard_output() -> None:

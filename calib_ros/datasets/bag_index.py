@@ -1,23 +1,18 @@
-"""Where the messages of a bag are, by topic and time, with its cameras and static transforms."""
+"""Where the messages of a bag are, by topic and time, with what its cameras and static transforms say."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib_ros.arrays import Matrix
-from calib_ros.camera import Camera
 from calib_ros.datasets.bag_file import BagFile, peek_header
-from calib_ros.datasets.static_transforms import StaticTransforms
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
-from calib_ros.messages import decode_camera_info
-from calib_ros.messages.video import VIDEO, packet_of
-from calib_ros.stamps import LONGEST_QUEUE_S, Stamps, cause_of_difference, nearest_index, time_scales
+from calib_ros.stamps import LONGEST_QUEUE_S, Stamps, cause_of_difference, time_scales
 
 Span = tuple[int, int]  # [start, stop) of recording times, ns
 MAX_KEPT = 256 * 2**20  # bytes of messages held in memory: thirty frames of 2 Mpx in colour with their clouds
@@ -26,116 +21,58 @@ MAX_LATENCY = NANOSECONDS  # usually, from a sensor to the recorder
 QUICKEST = 0.9
 
 
-class BagIndex:
-    """What is needed to pair the messages of a bag and to fetch them one by one, with its cameras and static transforms. Nothing
-    is read before `read` or `read_spans`; the messages of the latter are kept, up to MAX_KEPT.
+class BagListing:
+    """When the messages of some topics were stamped and recorded, with what CameraInfo says, and static transforms. Nothing is
+    read before `read` or `read_spans`; the messages of the latter are kept, up to MAX_KEPT.
 
-    image, cloud, info: of the topics. without_key: pictures of a video before its first key frame, which are left out.
-    clouds_ahead: see `clock_difference`, ns, of which `clock_difference` is taken out of the clouds' stamps.
+    found: by topic, before `TopicIndex.finish`. infos: of the topics of CameraInfo, a message for each, the same where they say
+    the same. transforms: messages with their time of recording, ns. kept: by topic, time of recording and stamp.
     """
 
-    def __init__(self, bag: BagFile, topics: tuple[str, str, str], rectified: bool, clock: str) -> None:
-        self._bag, self._rectified, self._clock = bag, rectified, clock
-        self.image, self.cloud, self.info = indices = tuple(map(TopicIndex, topics))
-        self._by_topic = dict(zip(topics, indices, strict=True))
-        self._decoded: dict[bytes, Camera] = {}
-        self._cameras: list[Camera] = []
-        self._transforms: list[tuple[int, Any]] = []
-        self._kept: dict[tuple[str, int, int], bytes] | None = None
-        self.without_key = self._kept_bytes = 0
+    def __init__(self, bag: BagFile, topics: Iterable[str], infos: Iterable[str]) -> None:
+        self.bag = bag
+        self.infos: dict[str, list[bytes]] = {topic: [] for topic in infos}
+        self.found = {topic: TopicIndex(topic) for topic in (*topics, *self.infos)}
+        self.transforms: list[tuple[int, Any]] = []
+        self.kept: dict[tuple[str, int, int], bytes] | None = None
+        self._contents: dict[bytes, bytes] = {}
+        self._kept_bytes = 0
 
     def read(self, keep: bool = False) -> None:
         """Read the whole bag once. keep: hold messages in memory, as `read_spans` does."""
         if keep:
-            self._kept = {}
-        begin, statics = self._first_key(), self._bag.statics
-        topics = [*self._by_topic, *statics]
-        whole = [self.info.topic, *statics]
-        for topic, recorded, data in self._bag.raw(topics) if keep else self._bag.heads(topics, whole):
+            self.kept = {}
+        statics = self.bag.statics
+        topics, whole = [*self.found, *statics], [*self.infos, *statics]
+        for topic, recorded, data in self.bag.raw(topics) if keep else self.bag.heads(topics, whole):
             if topic in statics:
-                self._transforms.append((recorded, self._bag.decode(topic, data)))
-            elif topic == self.image.topic and recorded < begin:
-                self.without_key += 1
+                self.transforms.append((recorded, self.bag.decode(topic, data)))
             else:
                 self._add(topic, recorded, data)
-        self._transforms.sort(key=lambda one: one[0])
-        self._finish()
-
-    def _first_key(self) -> int:
-        """Recording time of the first picture that can be decoded, ns."""
-        if self._bag.topics[self.image.topic].type not in VIDEO:
-            return self._bag.start
-        for topic, recorded, data in self._bag.raw([self.image.topic]):
-            with located(self._bag.path, topic):
-                if packet_of(self._bag.decode(topic, data)).is_key:
-                    return recorded
-        return self._bag.stop
+        self.transforms.sort(key=lambda one: one[0])
 
     def read_spans(self, spans: list[Span]) -> None:
         """Read only what was recorded in these spans, which neither overlap nor have been read; CameraInfo also around them,
         where it is rarer, and all static transforms."""
-        self._kept = self._kept or {}
-        period = self._bag.period(self.info.topic)
+        self.kept = self.kept or {}
+        periods = {topic: self.bag.period(topic) for topic in self.infos}
         for start, stop in spans:
-            rare = period > (stop - start) / 2
-            topics = [self.image.topic, self.cloud.topic] + ([] if rare else [self.info.topic])
-            for message in self._bag.raw(topics, start, stop):
+            rare = [topic for topic, period in periods.items() if period > (stop - start) / 2]
+            for message in self.bag.raw([topic for topic in self.found if topic not in rare], start, stop):
                 self._add(*message)
-            for message in self._bag.raw([self.info.topic], start - period, stop + period) if rare else ():
-                self._add(*message)
-        self._transforms = self._transforms or self._bag.transforms()
-        self._finish()
+            for topic in rare:
+                for message in self.bag.raw([topic], start - periods[topic], stop + periods[topic]):
+                    self._add(*message)
+        self.transforms = self.transforms or self.bag.transforms()
 
     def _add(self, topic: str, recorded: int, data: bytes) -> None:
-        with located(self._bag.path, topic):
-            header = self._by_topic[topic].add(recorded, data)
-            if topic == self.info.topic:
-                content = bytes(data[12:])  # all but the stamp: nearly always the same, so decoded once
-                if content not in self._decoded:
-                    self._decoded[content] = decode_camera_info(self._bag.decode(topic, data), self._rectified)
-                self._cameras.append(self._decoded[content])
-            elif self._kept is not None and self._kept_bytes + len(data) <= MAX_KEPT:
-                self._kept[topic, recorded, header] = data
-                self._kept_bytes += len(data)
-
-    def _finish(self) -> None:
-        """Put in order what was read."""
-        self.camera_frame, self.lidar_frame = self.image.frame or self.info.frame, self.cloud.frame
-        self.use_headers = self._clock != RECORDING and self.image.has_stamps and self.cloud.has_stamps
-        for index in self._by_topic.values():
-            index.finish(self.use_headers)
-        asked = self.use_headers and self._clock == AUTO
-        self.clouds_ahead, of_clocks = clock_difference(self.image, self.cloud) if asked else (0, False)
-        self.clock_difference = self.clouds_ahead if of_clocks else 0
-        self.cloud.stamps = self.cloud.stamps - self.clock_difference
-        # T_camera_lidar with its recording time, ns, whenever a static transform has changed it.
-        self.tree = StaticTransforms()
-        self._references: list[tuple[int, Matrix]] = []
-        for recorded, message in self._transforms:
-            self.tree.add(message)
-            T = self.tree.lookup(self.camera_frame, self.lidar_frame)
-            if T is not None and not (self._references and np.array_equal(T, self._references[-1][1])):
-                self._references.append((recorded, T))
-
-    @property
-    def missing(self) -> list[str]:
-        """Topics without any message."""
-        return [topic for topic, index in self._by_topic.items() if not len(index)]
-
-    def message(self, index: TopicIndex, position: int) -> Any:
-        """The decoded message at a position of image or cloud."""
-        recorded, header = int(index.recorded[position]), int(index.headers[position])
-        kept = (self._kept or {}).get((index.topic, recorded, header))
-        return self._bag.find(index.topic, recorded, header) if kept is None else self._bag.decode(index.topic, kept)
-
-    def camera_at(self, stamp: int) -> Camera:
-        """The camera of the CameraInfo nearest to an image's stamp."""
-        return self._cameras[int(self.info.order[nearest_index(self.info.stamps, np.array([stamp]))[0]])]
-
-    def reference_at(self, recorded: int) -> Matrix | None:
-        """T_camera_lidar (4, 4) as of a recording time, None if unknown; before the first transform the first one."""
-        known = sum(time <= recorded for time, _ in self._references)
-        return self._references[max(known - 1, 0)][1] if self._references else None
+        with located(self.bag.path, topic):
+            header = self.found[topic].add(recorded, data)
+        if topic in self.infos:  # all but the stamp is nearly always the same
+            self.infos[topic].append(self._contents.setdefault(bytes(data[12:]), data))
+        elif self.kept is not None and self._kept_bytes + len(data) <= MAX_KEPT:
+            self.kept[topic, recorded, header] = data
+            self._kept_bytes += len(data)
 
 
 class TopicIndex:
@@ -155,6 +92,16 @@ class TopicIndex:
         self.frame = self.frame or frame
         self._found.append((header, recorded))
         return header
+
+    def key(self, position: int) -> tuple[str, int, int]:
+        """Topic, time of recording and stamp of a message, ns."""
+        return self.topic, int(self.recorded[position]), int(self.headers[position])
+
+    def leave_out(self, until: int) -> int:
+        """Leave out what was recorded before a time, ns; returns how many."""
+        before = len(self._found)
+        self._found = [one for one in self._found if one[1] >= until]
+        return before - len(self._found)
 
     def __len__(self) -> int:
         return len(self._found)

@@ -18,7 +18,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets.bag_file import TF_STATIC
 from calib_ros.datasets.bag_messages import typestore
-from calib_ros.datasets.rig_source import CAMERA, LIDAR, RecordedRig, RigDescription, Sensor, rig_yaml
+from calib_ros.datasets.rig import CAMERA, LIDAR, RecordedRig, RigDescription, Sensor, rig_yaml
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud

@@ -1,8 +1,10 @@
-"""A plain folder of images and clouds of the same names, with a calibration as ROS camera_calibration writes it."""
+"""Plain folders of images and clouds of the same names, with a calibration as ROS camera_calibration writes it: of a pair, or one
+for each sensor of a rig."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,8 @@ from numpy.typing import NDArray
 
 from calib_ros.datasets.camera_files import camera_file, read_camera
 from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, FOREIGN, TEXT_SUFFIXES, read_cloud
-from calib_ros.datasets.recent import Recent
+from calib_ros.datasets.recent import Recent, Timed
+from calib_ros.datasets.rig import CAMERA, LIDAR, DescribedRig, RigDescription, Sensor, ros_name
 from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -137,6 +140,97 @@ def is_folder_dataset(path: Path) -> bool:
     """Whether a path looks like such a folder, complete or not."""
     parts = [(path / IMAGES).is_dir(), (path / CLOUDS).is_dir(), camera_file(path).is_file()]
     return sum(parts) >= 2
+
+
+class FolderRig(DescribedRig):
+    """Sub-folders of a folder, each `topic`, by default the name, of a sensor: of a camera as of `FolderSource`, of a LiDAR with
+    clouds/. A LiDAR without a folder is that of the first camera which has clouds. Images and scans of one name belong together.
+
+    Cameras without a calibration of their own are those, by name, of the file beside the folders. T_camera_lidar of a camera's
+    calibration is to the LiDAR of its own clouds, else to the only one. BadInputError for what is missing.
+    """
+
+    def __init__(self, path: Path, description: RigDescription) -> None:
+        super().__init__(path.resolve().name, description)
+        self.path = path
+        if not self.cameras or not self.lidars:
+            raise BadInputError(f"{path} is opened by its cameras' folders; list one camera or more, and one LiDAR or more")
+        self._folders = {name: folder_of(path, self.sensors[name]) for name in self.cameras}
+        for name, folder in self._folders.items():
+            if not (folder / IMAGES).is_dir():
+                has = sorted(child.name for child in path.iterdir() if (child / IMAGES).is_dir())
+                raise BadInputError(
+                    f"{folder / IMAGES} of camera {name} is missing; name by sensors.{name}.topic a folder that is there: "
+                    f"{', '.join(has) or '.'}"
+                )
+        with_clouds = [folder for folder in self._folders.values() if (folder / CLOUDS).is_dir()]
+        for name in self.lidars:
+            folder, given = folder_of(path, self.sensors[name]), self.sensors[name].topic
+            if not (folder / CLOUDS).is_dir() and (given or not with_clouds or len(self.lidars) > 1):
+                raise BadInputError(
+                    f"{folder / CLOUDS} of LiDAR {name} is missing; name by sensors.{name}.topic a folder with {CLOUDS}/"
+                )
+            self._folders[name] = folder if (folder / CLOUDS).is_dir() else with_clouds[0]
+
+    def frame_id(self, name: str) -> str:
+        """By the description, else the camera's name in its calibration, or the LiDAR's own."""
+        return self.sensors[name].frame or name if name in self.lidars else super().frame_id(name)
+
+    def open_pair(self, camera: Sensor, lidar: Sensor) -> FolderSource:
+        """The reference is known to the LiDAR of the camera's calibration."""
+        folder, beside = self._folders[camera.name], camera_file(self.path)
+        shared = beside if beside.is_file() and not camera_file(folder).is_file() else None
+        choice = None if shared is None else camera.topic or camera.name
+        source = FolderSource(folder, choice, self._folders[lidar.name] / CLOUDS, shared)
+        if self.lidar_of(camera.name) != lidar.name:
+            source.reference = None
+        return source
+
+    def scans(self, lidar: str) -> Timed:
+        """The scans that any camera has an image with."""
+        sources: list[FolderSource] = [self.pair(camera, lidar) for camera in self.cameras]
+        # Cameras may stamp one scan differently, where it has no stamp of its own.
+        by_name = {name: (source, k) for source in reversed(sources) for k, name in enumerate(source.names)}
+        found = {source.stamp_of_scan(k): (source, k) for source, k in by_name.values()}
+        stamps = np.array(sorted(found), np.int64)
+
+        def read(k: int) -> object:
+            source, index = found[int(stamps[k])]
+            return source.scan(index)[1]
+
+        return Timed(stamps, read)
+
+    def lidar_of(self, name: str) -> str | None:
+        """The LiDAR of a camera's own clouds, else the only one."""
+        own = [lidar for lidar in self.lidars if name in self.cameras and self._folders[lidar] == self._folders[name]]
+        return own[0] if own else super().lidar_of(name)
+
+
+def folder_of(path: Path, sensor: Sensor) -> Path:
+    """Where the files of a sensor are."""
+    return path / (sensor.topic or sensor.name).lstrip("/")
+
+
+def is_folder_rig(path: Path, description: RigDescription) -> bool:
+    """Whether a folder has the images of a camera that is described."""
+    return any((folder_of(path, sensor) / IMAGES).is_dir() for sensor in description.sensors if sensor.kind == CAMERA)
+
+
+def folder_sensors(path: Path) -> Iterator[Sensor]:
+    """A LiDAR of each folder in a folder with clouds, but one of those that hold the same files, and a camera of each with
+    images; none where no folder has images."""
+    folders = sorted(child for child in path.iterdir() if child.is_dir()) if path.is_dir() else []
+    cameras = [child for child in folders if (child / IMAGES).is_dir()]
+    of_clouds: dict[tuple[tuple[str, int], ...], Path] = {}
+    for folder in (child for child in folders if cameras and (child / CLOUDS).is_dir()):
+        files = named_files(folder / CLOUDS, CLOUD_SUFFIXES)
+        of_clouds.setdefault(tuple((name, file.stat().st_size) for name, file in files.items()), folder)
+    for folder in of_clouds.values():
+        name = ros_name(folder.name)
+        lidar = (name if LIDAR in name else f"{name}_{LIDAR}") if len(of_clouds) > 1 else LIDAR
+        yield Sensor(lidar if folder in cameras else name, LIDAR, folder.name)
+    for folder in cameras:
+        yield Sensor(ros_name(folder.name), CAMERA, folder.name)
 
 
 def named_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:

@@ -52,10 +52,12 @@ class KittiSource:
     Raises BadInputError, with the path and what to do, for another folder, a missing camera, missing or damaged files.
     """
 
-    def __init__(self, path: str | Path, camera: int | None = None) -> None:
+    def __init__(self, path: str | Path, camera: int | str | None = None) -> None:
         root = find_drive(Path(path))
         if root is None:
             raise BadInputError(f"{path} is not a KITTI folder; looked for {EXPECTED_FOLDERS}")
+        if isinstance(camera, str):
+            raise BadInputError(f"{path} has no camera {camera}; KITTI's are numbers from 0 to 3")
         of_360 = layout_name(root) == KITTI_360
         camera = (0 if of_360 else 2) if camera is None else camera
         self._layout = layout_of(root, camera)

@@ -66,7 +66,12 @@ class NuScenesSource:
             raise BadInputError(f"{text} is not a nuScenes folder; looked for {EXPECTED_NUSCENES}")
         self.path, self.recent = folder, Recent(0)  # scans that are kept
         self._records = self._read_scene(scene)
-        self.camera_frame = self._choose_camera(camera)
+        if camera is None:
+            camera = CAMERA if CAMERA in self.cameras else 0
+        self.camera_frame = (dict(enumerate(self.cameras)) | {name: name for name in self.cameras}).get(camera, "")
+        if not self.camera_frame:
+            listed = ", ".join(f"{k} {name}" for k, name in enumerate(self.cameras))
+            raise BadInputError(f"{self.path} has no camera {camera}; choose one of {listed}")
         scans = {scan.sample: scan for scan in self._of(self.lidar_frame) if scan.key}
         found = [(image, scans[image.sample]) for image in self._of(self.camera_frame) if image.key and image.sample in scans]
         self._pairs = [pair for pair in found if all((folder.parent / record.filename).is_file() for record in pair)]
@@ -118,17 +123,6 @@ class NuScenesSource:
 
         records = [self._typed(row, record) for row in self._rows("sample_data", fields, of_scene)]
         return sorted(records, key=lambda own: own.stamp)
-
-    def _choose_camera(self, camera: int | str | None) -> str:
-        """Channel of a camera by its name or position, by default CAM_FRONT. BadInputError if there is none."""
-        if camera is None:
-            return CAMERA if CAMERA in self.cameras else self.cameras[0]
-        if isinstance(camera, int) and 0 <= camera < len(self.cameras):
-            return self.cameras[camera]
-        if camera in self.cameras:
-            return str(camera)
-        listed = ", ".join(f"{k} {name}" for k, name in enumerate(self.cameras))
-        raise BadInputError(f"{self.path} has no camera {camera}; choose one of {listed}")
 
     def _of(self, channel: str) -> list[Record]:
         """What a sensor measured, in time."""

@@ -1,24 +1,43 @@
-"""Opening a dataset by its path or description."""
+"""Opening a recording by its path or text: as a source of one pair, or as a rig, by the description of its sensors."""
 
 from __future__ import annotations
 
+import re
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
 from calib_ros.datasets.capture import CaptureSource, is_capture
-from calib_ros.datasets.folder import CLOUDS, EXPECTED_FOLDER, IMAGES, FolderSource, is_folder_dataset
+from calib_ros.datasets.folder import (
+    CLOUDS,
+    EXPECTED_FOLDER,
+    IMAGES,
+    FolderRig,
+    FolderSource,
+    folder_sensors,
+    is_folder_dataset,
+    is_folder_rig,
+)  # fmt: skip
 from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
 from calib_ros.datasets.nuscenes import EXPECTED_NUSCENES, NuScenesSource, split_scene, tables_folder
 from calib_ros.datasets.once import EXPECTED_ONCE, OnceSource, is_once
+from calib_ros.datasets.rig import (
+    CAMERA,
+    LIDAR,
+    ChosenSensors,
+    DescribedRig,
+    RecordedRig,
+    RigDescription,
+    RigSource,
+    Sensor,
+    ros_name,
+)
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.extensions import SOURCES, source_of
+from calib_ros.extensions import RIGS, SOURCES, source_of
 from calib_ros.extensions import names as installed
 
 BAG_FILES = (".mcap", ".db3", ".bag")
-
-__all__ = ["Source", "open_dataset", "open_source"]
 
 
 def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **options: Any) -> Source:
@@ -54,10 +73,14 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     if not is_nuscenes(path) and (is_bag(path) or is_capture(path)):
         from calib_ros.datasets.bag import BagSource
 
-        known = list(signature(BagSource).parameters)[1:]
-        _refuse({name: options[name] for name in options.keys() - known}, text)
+        _refuse({name: options[name] for name in options.keys() - signature(BagSource).parameters}, text)
         return CaptureSource(path, **options) if is_capture(path) else BagSource(path, **options)
-    for fits, reader in ((is_nuscenes, NuScenesSource), (is_folder_dataset, FolderSource), (is_once, OnceSource)):
+    for fits, reader in (
+        (is_nuscenes, NuScenesSource),
+        (is_folder_dataset, FolderSource),
+        (is_once, OnceSource),
+        (find_drive, KittiSource),
+    ):
         if fits(path):
             _refuse(options, text)
             return reader(path, camera)
@@ -66,12 +89,6 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
             f"{text}: PandaSet's scans are pickles, which run code where they are read; write x, y, z, i of pandas.read_pickle, "
             f"in the LiDAR's frame by the inverse of lidar/poses.json, to .npz files of {EXPECTED_FOLDER}"
         )
-    folder = find_drive(path) if path.is_dir() else None
-    if folder is not None:
-        _refuse(options, text)
-        if isinstance(camera, str):
-            raise BadInputError(f"{text} has no camera {camera}; KITTI's are numbers from 0 to 3")
-        return KittiSource(folder, camera)
     if path.is_file():
         raise BadInputError(f"{text} is not a dataset; give a .mcap, .db3 or .bag file, a bag folder or a KITTI folder")
     names = sorted(child.name for child in path.iterdir())
@@ -89,6 +106,82 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
 
 
 open_source = open_dataset  # the former name
+
+
+def open_rig(path_or_text: str | Path, description: RigDescription, **options: Any) -> RigSource:
+    """Open the recording of the rig that is described: a bag by the topics of its sensors; or a synthetic rig, nuScenes, KITTI or
+    plain folders, where `topic` is the recording's own name of a sensor (nuScenes: channel; KITTI: number of the camera; plain
+    folders: see `FolderRig`), by default its name.
+
+    options : of a bag, see `BagSource`: tolerance_s, rectified, motion, windows, clock, incomplete.
+
+    Raises BadInputError for other recordings, and for sensors that the recording does not have.
+    """
+    text, path = str(path_or_text), Path(path_or_text).expanduser()
+    if not path.exists() and (rig := named_rig(text)) is not None:
+        return ChosenSensors(rig, description)
+    if path.exists() and is_bag(path):
+        from calib_ros.datasets.bag_rig import BagRig
+
+        return BagRig(path, description, **options)
+    if is_folder_rig(path, description):
+        return FolderRig(path, description)
+    return OneLidarRig(text, description)
+
+
+def named_rig(text: str) -> RecordedRig | None:
+    """The rig that another package brings by its name, as "synthetic:rig=..."; None where the text is something else."""
+    opened_by_name = None if Path(text).expanduser().exists() else source_of(text, RIGS)
+    rig: RecordedRig | None = None if opened_by_name is None else opened_by_name(text)
+    return rig
+
+
+class OneLidarRig(DescribedRig):
+    """KITTI, nuScenes, ONCE: several cameras around one LiDAR; or any source of one camera and one LiDAR."""
+
+    def __init__(self, text: str, description: RigDescription) -> None:
+        super().__init__(text, description)
+        if len(self.lidars) != 1 or not self.cameras:
+            raise BadInputError(
+                f"{text} has one LiDAR, but the description has {len(self.lidars)} and {len(self.cameras)} cameras; "
+                "list the LiDAR and one camera or more"
+            )
+        for name in self.cameras:
+            self.pair(name, self.lidars[0])
+
+    def open_pair(self, camera: Sensor, lidar: Sensor) -> Source:
+        """The recording with a camera; the only one needs no name."""
+        several = len(self.cameras) > 1
+        try:
+            source = open_dataset(self.name, camera.topic or camera.name)
+        except BadInputError:
+            if several or camera.topic:
+                raise
+            source = open_dataset(self.name)
+            if len(getattr(source, "cameras", ())) > 1:
+                raise
+        if several and len(getattr(source, "cameras", ())) < 2:
+            raise BadInputError(f"{self.name} has one camera, but the description has {', '.join(self.cameras)}; list that one")
+        return source
+
+
+def sensors_of(text: str) -> tuple[list[Sensor], list[str]]:
+    """All sensors of a recording, as a description of them would open it, with priors where the recording knows what is believed;
+    and remarks on what is left out of it. Raises as `open_dataset`."""
+    path = Path(text).expanduser()
+    if not path.exists() and (rig := named_rig(text)) is not None:
+        of_kinds = (LIDAR, rig.lidars), (CAMERA, rig.cameras)
+        return [Sensor(name, kind, prior=rig.prior(name)) for kind, names in of_kinds for name in names], []
+    if path.exists() and is_bag(path):
+        from calib_ros.datasets.bag_rig import bag_sensors
+
+        return bag_sensors(path)
+    if found := list(folder_sensors(path)):
+        return found, []
+    source = open_dataset(text)
+    names = getattr(source, "cameras", ())
+    found = [Sensor(name if re.match("[A-Za-z]", name) else f"{CAMERA}_{name}", CAMERA, name) for name in names]
+    return [Sensor(ros_name(source.lidar_frame), LIDAR), *(found or [Sensor(ros_name(source.camera_frame), CAMERA)])], []
 
 
 def is_bag(path: Path) -> bool:

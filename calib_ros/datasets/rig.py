@@ -1,65 +1,205 @@
-"""Opening the recording of several cameras and LiDARs by the description of its sensors: of other packages, KITTI and nuScenes,
-and of plain folders, one for each camera, with the clouds of LiDARs in folders of their own, or beside a camera's images."""
+"""Recordings of several cameras and LiDARs: the descriptions that they are opened by, and pairs of sensors as views of them."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+import re
+from dataclasses import dataclass
+from itertools import combinations, product
+from typing import Any, Protocol
 
 import numpy as np
+import yaml
 
 from calib_ros import se3
-from calib_ros.arrays import Transform
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.camera import Camera
-from calib_ros.datasets.camera_files import camera_file
-from calib_ros.datasets.folder import CLOUDS, IMAGES, FolderSource
-from calib_ros.datasets.open import is_bag, open_dataset
 from calib_ros.datasets.recent import Recent, Timed
-from calib_ros.datasets.rig_source import (
-    CAMERA,
-    KEPT_CLOUDS,
-    ByDescription,
-    RecordedRig,
-    RigDescription,
-    RigSource,
-    Sensor,
-)
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.extensions import RIGS, source_of
 
-__all__ = ["RecordedRig", "RigSource", "named_rig", "open_rig"]
+CAMERA, LIDAR = KINDS = "camera", "lidar"  # of sensors
+# As the default search box of the registration: what mounting by a drawing leaves open.
+SIGMA_DEG, SIGMA_M = 3.0, 0.2
+KEPT_CLOUDS = 32  # about 100 MB
+SHOWN_DIGITS = 6  # of priors: micrometres
 
 
-def open_rig(path_or_text: str | Path, description: RigDescription, **options: Any) -> RigSource:
-    """Open the recording of the rig that is described: a bag by the topics of its sensors; or a synthetic rig, nuScenes, KITTI or
-    plain folders, where `topic` is the recording's own name of a sensor (nuScenes: channel; KITTI: number of the camera; plain
-    folders: see `FolderRig`), by default its name.
+class RigSource(Protocol):
+    """The recording of a rig: every pair of a camera and a LiDAR is a Source of its own. What several of them need is read once,
+    as long as it is among the newest. BadInputError or KeyError for names that are none of its sensors."""
 
-    options : of a bag, see `BagSource`: tolerance_s, rectified, motion, windows, clock, incomplete.
+    name: str  # for display
+    cameras: tuple[str, ...]  # names
+    lidars: tuple[str, ...]
+    reference_sensor: str  # that `reference` is relative to
 
-    Raises BadInputError for other recordings, and for sensors that the recording does not have.
+    def camera(self, name: str) -> Camera:
+        """The intrinsics of a camera."""
+
+    def frame_id(self, name: str) -> str:
+        """TF frame of a sensor."""
+
+    def reference(self, name: str) -> Transform | None:
+        """T_reference_sensor (4, 4) of a sensor as the recording states it at its beginning; None if unknown."""
+
+    def pair(self, camera: str, lidar: str) -> Source:
+        """Images of a camera with the scans of a LiDAR that are next to them; the reference is T_camera_lidar."""
+
+    def scans(self, lidar: str) -> Timed:
+        """All scans of a LiDAR with their stamps, ns, in time."""
+
+
+class RecordedRig(RigSource, Protocol):
+    """A rig whose images can be read for themselves, so that all of it can be written to a bag."""
+
+    def pictures(self, camera: str) -> Timed:
+        """All images of a camera with their stamps, ns, in time."""
+
+    def prior(self, name: str) -> Transform:
+        """T_reference_sensor (4, 4) as somebody who mounts the sensors believes it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A sensor of a rig.
+
+    kind: camera or lidar. topic: of a bag, else the recording's own name of it, "" = `name`. camera_info: its topic. frame: of
+    TF, "" = as recorded. prior: T_reference_sensor (4, 4); None = as the recording states it. sigma_deg, sigma_m: standard
+    deviations of the prior along every axis. mask: image file of what a camera's pictures leave out, "" = none.
     """
-    text, path = str(path_or_text), Path(path_or_text).expanduser()
-    if not path.exists() and (rig := named_rig(text)) is not None:
-        return ChosenSensors(rig, description)
-    if path.exists() and is_bag(path):
-        from calib_ros.datasets.bag_rig import BagRig
 
-        return BagRig(path, description, **options)
-    if is_folder_rig(path, description):
-        return FolderRig(path, description)
-    return OneLidarRig(text, description)
+    name: str
+    kind: str
+    topic: str = ""
+    camera_info: str = ""
+    frame: str = ""
+    prior: Transform | None = None
+    sigma_deg: float = SIGMA_DEG
+    sigma_m: float = SIGMA_M
+    mask: str = ""
 
-
-def named_rig(text: str) -> RecordedRig | None:
-    """The rig that another package brings by its name, as "synthetic:rig=..."; None where the text is something else."""
-    opened_by_name = None if Path(text).expanduser().exists() else source_of(text, RIGS)
-    rig: RecordedRig | None = None if opened_by_name is None else opened_by_name(text)
-    return rig
+    def believed(self, T: Transform) -> tuple[Transform, Covariance]:
+        """T_reference_sensor (4, 4) as its prior, with the covariance (6, 6) of a left twist, rad and m."""
+        return T, prior_covariance(T, self.sigma_deg, self.sigma_m)
 
 
-class ChosenSensors(ByDescription):
+@dataclass(frozen=True, eq=False)
+class RigDescription:
+    """The sensors of a rig. reference: the one whose frame the others are stated in. pairs: those to be registered; None = all
+    that share a view by their priors."""
+
+    sensors: tuple[Sensor, ...]
+    reference: str
+    pairs: tuple[tuple[str, str], ...] | None = None
+
+    def __getitem__(self, name: str) -> Sensor:
+        """The sensor of a name. KeyError if there is none."""
+        return {sensor.name: sensor for sensor in self.sensors}[name]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(sensor.name for sensor in self.sensors if sensor.kind == CAMERA)
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """Names of the LiDARs."""
+        return tuple(sensor.name for sensor in self.sensors if sensor.kind == LIDAR)
+
+    @property
+    def lidar_pairs(self) -> list[tuple[str, str]]:
+        """The pairs of two LiDARs."""
+        return [pair for pair in self.pairs or combinations(self.lidars, 2) if self[pair[0]].kind == LIDAR]
+
+    @property
+    def camera_pairs(self) -> list[tuple[str, str]]:
+        """The pairs of a camera and a LiDAR, whether they share a view or not where no pairs are given."""
+        return [pair for pair in self.pairs or product(self.cameras, self.lidars) if self[pair[0]].kind == CAMERA]
+
+
+def rig_yaml(description: RigDescription) -> str:
+    """rig.yaml of a description. A sensor without a prior is to be looked up in the recording."""
+    sensors: dict[str, Any] = {}
+    for own in description.sensors:
+        texts = {key: getattr(own, key) for key in ("kind", "topic", "camera_info", "frame", "mask")}
+        sensors[own.name] = {key: value for key, value in texts.items() if value}
+        if own.prior is not None and own.name != description.reference:
+            parts = {"translation_m": own.prior[:3, 3], "quaternion_xyzw": se3.quaternion_from_rotation(own.prior[:3, :3])}
+            sensors[own.name]["prior"] = {key: [round(float(v), SHOWN_DIGITS) for v in values] for key, values in parts.items()}
+        sigmas = {"sigma_deg": (own.sigma_deg, SIGMA_DEG), "sigma_m": (own.sigma_m, SIGMA_M)}
+        sensors[own.name] |= {key: value for key, (value, usual) in sigmas.items() if value != usual}
+    pairs = {} if description.pairs is None else {"pairs": [list(pair) for pair in description.pairs]}
+    content = {"reference": description.reference, "sensors": sensors, **pairs}
+    return str(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200))
+
+
+def prior_covariance(T: Transform, sigma_deg: float, sigma_m: float) -> Covariance:
+    """Covariance (6, 6) of a left twist of T (4, 4), rad and m: the sensor turns about itself, whatever its lever arm is."""
+    to_twist = np.linalg.inv(se3.parts_jacobian(T))
+    variances = np.repeat([np.deg2rad(sigma_deg) ** 2, sigma_m**2], 3)
+    return np.asarray(to_twist * variances @ to_twist.T)
+
+
+class DescribedRig:
+    """A recording by a description of its sensors, as of `RigSource`; of one LiDAR, unless it is said otherwise."""
+
+    def __init__(self, name: str, description: RigDescription) -> None:
+        self.name, self.reference_sensor = name, description.reference
+        self.sensors = {sensor.name: sensor for sensor in description.sensors}
+        self.cameras, self.lidars = description.cameras, description.lidars
+        self._recent = Recent(KEPT_CLOUDS)
+        self._pairs: dict[tuple[str, str], Any] = {}
+
+    def open_pair(self, camera: Sensor, lidar: Sensor) -> Any:
+        """The source of a pair, when it is asked for first."""
+        raise NotImplementedError
+
+    def lidar_of(self, name: str) -> str | None:
+        """The LiDAR that the reference of a sensor's source is to; None if that is not said."""
+        return name if name in self.lidars else self.lidars[0] if len(self.lidars) == 1 else None
+
+    def camera(self, name: str) -> Camera:
+        """As of any rig."""
+        camera: Camera = self._usual_pair(name).camera
+        return camera
+
+    def frame_id(self, name: str) -> str:
+        """By the description, else as of any rig."""
+        source = self._usual_pair(self.cameras[0] if name in self.lidars else name)
+        return self.sensors[name].frame or str(source.lidar_frame if name in self.lidars else source.camera_frame)
+
+    def reference(self, name: str) -> Transform | None:
+        """As of any rig; None of sensors which no calibration joins to the reference. Of nuScenes and KITTI objects, of the first
+        frames."""
+        if (lidar := self.lidar_of(name)) is None or lidar != self.lidar_of(self.reference_sensor):
+            return None
+        both = self.reference_sensor, name
+        base, own = (np.eye(4) if of in self.lidars else self.pair(of, lidar).reference for of in both)
+        return None if base is None or own is None else np.asarray(base @ se3.inverse(own))
+
+    def pair(self, camera: str, lidar: str) -> Any:
+        """As of any rig."""
+        if (camera, lidar) not in self._pairs:
+            source = self.open_pair(self.sensors[camera], self.sensors[lidar])
+            if hasattr(source, "recent"):
+                source.recent = self._recent
+            self._pairs[camera, lidar] = source
+        return self._pairs[camera, lidar]
+
+    def scans(self, lidar: str) -> Timed:
+        """As of any rig."""
+        source = self.pair(self.cameras[0], lidar)
+        if hasattr(source, "scans"):
+            own: Timed = source.scans()
+            return own
+        stamps = np.array([source[k].moment_of_cloud for k in range(len(source))], np.int64)
+        return Timed(stamps, lambda k: source[k].cloud)
+
+    def _usual_pair(self, camera: str) -> Any:
+        return self.pair(camera, self.lidar_of(camera) or self.lidars[0])
+
+
+class ChosenSensors(DescribedRig):
     """Some sensors of a rig, under the names of a description."""
 
     def __init__(self, rig: RigSource, description: RigDescription) -> None:
@@ -75,6 +215,10 @@ class ChosenSensors(ByDescription):
                 )
             self._own[sensor.name] = found[0]
 
+    def open_pair(self, camera: Sensor, lidar: Sensor) -> Source:
+        """That of the rig."""
+        return self.rig.pair(self._own[camera.name], self._own[lidar.name])
+
     def camera(self, name: str) -> Camera:
         """As of any rig."""
         return self.rig.camera(self._own[name])
@@ -88,167 +232,12 @@ class ChosenSensors(ByDescription):
         base, own = self.rig.reference(self._own[self.reference_sensor]), self.rig.reference(self._own[name])
         return None if base is None or own is None else np.asarray(se3.inverse(base) @ own)
 
-    def pair(self, camera: str, lidar: str) -> Source:
-        """As of any rig."""
-        return self.rig.pair(self._own[camera], self._own[lidar])
-
     def scans(self, lidar: str) -> Timed:
         """As of any rig."""
         return self.rig.scans(self._own[lidar])
 
 
-class OneLidarRig(ByDescription):
-    """KITTI, nuScenes, ONCE: several cameras around one LiDAR; or any source of one camera and one LiDAR."""
-
-    def __init__(self, text: str, description: RigDescription) -> None:
-        super().__init__(text, description)
-        if len(self.lidars) != 1 or not self.cameras:
-            raise BadInputError(
-                f"{text} has one LiDAR, but the description has {len(self.lidars)} and {len(self.cameras)} cameras; "
-                "list the LiDAR and one camera or more"
-            )
-        recent, several = Recent(KEPT_CLOUDS), len(self.cameras) > 1
-        self._sources: dict[str, Any] = {}
-        for name in self.cameras:
-            try:
-                source: Any = open_dataset(text, self.sensors[name].topic or name)
-            except BadInputError:
-                source = None if several or self.sensors[name].topic else open_dataset(text)
-                if source is None or len(getattr(source, "cameras", ())) > 1:  # the only one needs no name
-                    raise
-            if several and len(getattr(source, "cameras", ())) < 2:
-                raise BadInputError(f"{text} has one camera, but the description has {', '.join(self.cameras)}; list that one")
-            if hasattr(source, "recent"):
-                source.recent = recent
-            self._sources[name] = source
-
-    def camera(self, name: str) -> Camera:
-        """As of any rig."""
-        camera: Camera = self._sources[name].camera
-        return camera
-
-    def frame_id(self, name: str) -> str:
-        """As of any rig."""
-        own = self._first.lidar_frame if name in self.lidars else self._sources[name].camera_frame
-        return self.sensors[name].frame or str(own)
-
-    def reference(self, name: str) -> Transform | None:
-        """As of any rig; of nuScenes and KITTI objects, of the first frames."""
-        base, own = (np.eye(4) if of in self.lidars else self._sources[of].reference for of in (self.reference_sensor, name))
-        return None if base is None or own is None else np.asarray(base @ se3.inverse(own))
-
-    def pair(self, camera: str, lidar: str) -> Source:
-        """As of any rig."""
-        self.lidars.index(lidar)
-        source: Source = self._sources[camera]
-        return source
-
-    def scans(self, lidar: str) -> Timed:
-        """As of any rig."""
-        source = self._first
-        if hasattr(source, "scans"):
-            own: Timed = source.scans()
-            return own
-        stamps = np.array([source[k].moment_of_cloud for k in range(len(source))], np.int64)
-        return Timed(stamps, lambda k: source[k].cloud)
-
-    @property
-    def _first(self) -> Any:
-        return self._sources[self.cameras[0]]
-
-
-class FolderRig(ByDescription):
-    """Sub-folders of a folder, each `topic`, by default the name, of a sensor: of a camera as of `FolderSource`, of a LiDAR with
-    clouds/. A LiDAR without a folder is that of the first camera which has clouds. Images and scans of one name belong together.
-
-    Cameras without a calibration of their own are those, by name, of the file beside the folders. T_camera_lidar of a camera's
-    calibration is to the LiDAR of its own clouds, else to the only one. BadInputError for what is missing.
-    """
-
-    def __init__(self, path: Path, description: RigDescription) -> None:
-        super().__init__(path.resolve().name, description)
-        self.path, self._recent = path, Recent(KEPT_CLOUDS)
-        self._pairs: dict[tuple[str, str], FolderSource] = {}
-        if not self.cameras or not self.lidars:
-            raise BadInputError(f"{path} is opened by its cameras' folders; list one camera or more, and one LiDAR or more")
-        self._folders = {name: folder_of(path, self.sensors[name]) for name in self.cameras}
-        for name, folder in self._folders.items():
-            if not (folder / IMAGES).is_dir():
-                has = sorted(child.name for child in path.iterdir() if (child / IMAGES).is_dir())
-                raise BadInputError(
-                    f"{folder / IMAGES} of camera {name} is missing; name by sensors.{name}.topic a folder that is there: "
-                    f"{', '.join(has) or '.'}"
-                )
-        with_clouds = [folder for folder in self._folders.values() if (folder / CLOUDS).is_dir()]
-        for name in self.lidars:
-            folder, given = folder_of(path, self.sensors[name]), self.sensors[name].topic
-            if not (folder / CLOUDS).is_dir() and (given or not with_clouds or len(self.lidars) > 1):
-                raise BadInputError(
-                    f"{folder / CLOUDS} of LiDAR {name} is missing; name by sensors.{name}.topic a folder with {CLOUDS}/"
-                )
-            self._folders[name] = folder if (folder / CLOUDS).is_dir() else with_clouds[0]
-
-    def camera(self, name: str) -> Camera:
-        """As of any rig."""
-        return self.pair(name, self._lidar_of(name) or self.lidars[0]).camera
-
-    def frame_id(self, name: str) -> str:
-        """By the description, else the camera's name in its calibration, or the LiDAR's own."""
-        own = name if name in self.lidars else self.pair(name, self._lidar_of(name) or self.lidars[0]).camera_frame
-        return self.sensors[name].frame or own
-
-    def reference(self, name: str) -> Transform | None:
-        """As of any rig; None of sensors which no calibration joins to the reference."""
-        if self._lidar_of(name) is None or self._lidar_of(name) != self._lidar_of(self.reference_sensor):
-            return None
-        base, own = self._to_lidar(self.reference_sensor), self._to_lidar(name)
-        return None if base is None or own is None else np.asarray(base @ se3.inverse(own))
-
-    def pair(self, camera: str, lidar: str) -> FolderSource:
-        """As of any rig; the reference is known to the LiDAR of the camera's calibration."""
-        if (camera, lidar) not in self._pairs:
-            folder, beside = self._folders[camera], camera_file(self.path)
-            shared = beside if beside.is_file() and not camera_file(folder).is_file() else None
-            choice = None if shared is None else self.sensors[camera].topic or camera
-            source = FolderSource(folder, choice, self._folders[lidar] / CLOUDS, shared)
-            source.recent = self._recent
-            if self._lidar_of(camera) != lidar:
-                source.reference = None
-            self._pairs[camera, lidar] = source
-        return self._pairs[camera, lidar]
-
-    def scans(self, lidar: str) -> Timed:
-        """The scans that any camera has an image with."""
-        sources = [self.pair(camera, lidar) for camera in self.cameras]
-        # Cameras may stamp one scan differently, where it has no stamp of its own.
-        by_name = {name: (source, k) for source in reversed(sources) for k, name in enumerate(source.names)}
-        found = {source.stamp_of_scan(k): (source, k) for source, k in by_name.values()}
-        stamps = np.array(sorted(found), np.int64)
-
-        def read(k: int) -> object:
-            source, index = found[int(stamps[k])]
-            return source.scan(index)[1]
-
-        return Timed(stamps, read)
-
-    def _lidar_of(self, name: str) -> str | None:
-        """The LiDAR that a sensor's reference is to."""
-        if name in self.lidars:
-            return name
-        own = [lidar for lidar in self.lidars if self._folders[lidar] == self._folders[name]]
-        return (own or list(self.lidars))[0] if own or len(self.lidars) == 1 else None
-
-    def _to_lidar(self, name: str) -> Transform | None:
-        """T_sensor_lidar (4, 4)."""
-        lidar = self._lidar_of(name)
-        return np.eye(4) if name in self.lidars or lidar is None else self.pair(name, lidar).reference
-
-
-def folder_of(path: Path, sensor: Sensor) -> Path:
-    """Where the files of a sensor are."""
-    return path / (sensor.topic or sensor.name).lstrip("/")
-
-
-def is_folder_rig(path: Path, description: RigDescription) -> bool:
-    """Whether a folder has the images of a camera that is described."""
-    return any((folder_of(path, sensor) / IMAGES).is_dir() for sensor in description.sensors if sensor.kind == CAMERA)
+def ros_name(text: str) -> str:
+    """What a name of ROS can be made of."""
+    name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")
+    return name if re.match("[A-Za-z]", name) else f"sensor_{name}"

@@ -171,7 +171,15 @@ def _columns(msg: Any, width: int, height: int) -> dict[str, NDArray[Any]]:
         fields.setdefault(str(field.name).strip().lower(), field)
     point_step = int(msg.point_step)
     for name, field in fields.items():
-        _check_field(name, field, point_step)
+        code, offset = DATATYPES.get(int(field.datatype)), int(field.offset)
+        if code is None and name in REQUIRED:
+            raise BadInputError(f"PointCloud2: field {name} has unknown datatype {field.datatype}; check the LiDAR driver")
+        # PCL, too, takes a count of 0 for 1.
+        end = 0 if code is None else offset + np.dtype(code).itemsize * max(int(field.count), 1)
+        if code is not None and (offset < 0 or end > point_step):
+            raise BadInputError(
+                f"PointCloud2: field {shown(name)} ends at byte {end}, but point_step is {point_step}; check its driver"
+            )
     row_bytes = width * point_step
     # A cloud of one row needs no row_step, and some drivers leave it at 0 or at the size of a full scan.
     row_step = row_bytes if height == 1 else int(msg.row_step) or row_bytes
@@ -192,17 +200,3 @@ def _columns(msg: Any, width: int, height: int) -> dict[str, NDArray[Any]]:
             kind = order + DATATYPES[int(field.datatype)]
             columns[name] = np.ndarray(shape, kind, data, int(field.offset), strides).reshape(-1)
     return columns
-
-
-def _check_field(name: str, field: Any, point_step: int) -> None:
-    code = DATATYPES.get(int(field.datatype))
-    if code is None:
-        if name in REQUIRED:
-            raise BadInputError(f"PointCloud2: field {name} has unknown datatype {field.datatype}; check the LiDAR driver")
-        return
-    offset = int(field.offset)
-    end = offset + np.dtype(code).itemsize * max(int(field.count), 1)  # PCL, too, takes a count of 0 for 1
-    if offset < 0 or end > point_step:
-        raise BadInputError(
-            f"PointCloud2: field {shown(name)} ends at byte {end}, but point_step is {point_step}; check its driver"
-        )

@@ -13,12 +13,12 @@ import yaml
 
 from calib_ros import io, result, se3
 from calib_ros.arrays import Transform
-from calib_ros.datasets.rig_source import CAMERA as CAMERA
-from calib_ros.datasets.rig_source import KINDS, SIGMA_DEG, SIGMA_M
-from calib_ros.datasets.rig_source import LIDAR as LIDAR
-from calib_ros.datasets.rig_source import RigDescription as RigDescription
-from calib_ros.datasets.rig_source import Sensor as Sensor
-from calib_ros.datasets.rig_source import prior_covariance as prior_covariance
+from calib_ros.datasets.rig import CAMERA as CAMERA
+from calib_ros.datasets.rig import KINDS, SIGMA_DEG, SIGMA_M
+from calib_ros.datasets.rig import LIDAR as LIDAR
+from calib_ros.datasets.rig import RigDescription as RigDescription
+from calib_ros.datasets.rig import Sensor as Sensor
+from calib_ros.datasets.rig import prior_covariance as prior_covariance
 from calib_ros.errors import BadInputError
 
 FROM_TF = "tf"

@@ -14,7 +14,7 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config, MotionConfig, update
-from calib_ros.datasets.rig_source import RigSource
+from calib_ros.datasets.rig import RigSource
 from calib_ros.datasets.source import Source, frame_positions, neighbours, spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame

@@ -11,7 +11,7 @@ from scipy.stats import chi
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
-from calib_ros.datasets.rig import open_rig
+from calib_ros.datasets.open import open_rig
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.registration.judgement.evidence import CONFIDENCE

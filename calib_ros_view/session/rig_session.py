@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.arrays import Matrix
 from calib_ros.config import Config, update
-from calib_ros.datasets.rig_source import RigSource
+from calib_ros.datasets.rig import RigSource
 from calib_ros.datasets.source import frame_positions, spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame, PointCloud

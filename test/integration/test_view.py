@@ -17,7 +17,7 @@ from waiting import until
 from calib_ros import result, se3
 from calib_ros.cli import main
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.rig import named_rig
+from calib_ros.datasets.open import named_rig
 
 pytest.importorskip("nicegui", reason="needs nicegui")
 SOURCE = "synthetic:seed=1,frames=4,rings=32,width=640,height=192,speed=3,stride=10"

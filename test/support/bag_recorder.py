@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,7 +133,26 @@ class Recorder:
             transforms.append(make("geometry_msgs/msg/TransformStamped", **names, transform=transform))
         self.write(topic, make("tf2_msgs/msg/TFMessage", transforms=transforms), time)
 
-    def trio(self, stamp: int, **options) -> None:
-        self.image(stamp, **options)
-        self.info(stamp)
-        self.cloud(stamp)
+    def trio(
+        self,
+        stamp: int,
+        value: int = 0,
+        time: int | None = None,
+        cloud: int | None = None,
+        cloud_time: int | None = None,
+        **of_image,
+    ) -> None:
+        """An image with its CameraInfo, recorded at `time`, and a cloud stamped `cloud` and recorded at `cloud_time`."""
+        self.image(stamp, time=time, value=value, **of_image)
+        self.info(stamp, time=time)
+        self.cloud(stamp if cloud is None else cloud, time=cloud_time, value=value)
+
+
+def recorded(
+    path: Path, write: Callable[[Recorder, int, int], object] = Recorder.trio, count: int = 1, storage: str = "mcap", **options
+) -> Path:
+    """A bag for which `write` is called with times 0.1 s apart and their numbers."""
+    with Recorder(path, storage, **options) as recorder:
+        for i in range(count):
+            write(recorder, START + 100 * MS * i, i)
+    return path

@@ -14,6 +14,7 @@ from bag_recorder import as_ros1
 from compressed_bags import compressed_bag
 from fuzzing import STAMP, K
 
+from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -139,36 +140,52 @@ def ros1(folder: Path) -> None:
     shutil.rmtree(path)
 
 
-def nuscenes(folder: Path) -> None:
-    """A scene of two key frames."""
+Measured = tuple[str, str, str, int, np.ndarray, bool, np.ndarray | None]
+
+
+def nuscenes(
+    folder: Path, sensors: dict[str, tuple[np.ndarray, np.ndarray | None]] | None = None, measured: Sequence[Measured] = ()
+) -> None:
+    """A scene of two key frames; or sensors with T_ego_sensor (4, 4) and K, None of a LiDAR, and what they measured: scene,
+    sample, channel, stamp in us, T_global_ego (4, 4), whether it is a key frame, and a picture or points, None without a file."""
     import cv2
 
-    pose = {"translation": [0.1, 0.2, 0.3], "rotation": [1.0, 0.0, 0.0, 0.0]}
-    channels = {"CAM_FRONT": "camera", "LIDAR_TOP": "lidar"}
+    def pose(token: str, T: np.ndarray, **more: Any) -> dict[str, Any]:
+        x, y, z, w = se3.quaternion_from_rotation(T[:3, :3])
+        return {"token": token, "translation": T[:3, 3].tolist(), "rotation": [w, x, y, z], **more}
+
+    T = se3.from_parts(np.eye(3), [0.1, 0.2, 0.3])
+    sensors = sensors or {"CAM_FRONT": (T, K), "LIDAR_TOP": (T, None)}
+    for frame in () if measured else frames():
+        points = np.c_[frame.cloud.xyz, frame.cloud.intensity, np.zeros(30)]
+        own = "scene-0061", f"f{frame.name}"
+        contents = {"CAM_FRONT": frame.image, "LIDAR_TOP": points}.items()
+        measured = [*measured, *((*own, channel, frame.stamp // 1000, T, True, content) for channel, content in contents)]
     tables: dict[str, list[dict[str, Any]]] = {
-        "scene": [{"token": "s", "name": "scene-0061"}],
-        "sample": [{"token": f"f{k}", "scene_token": "s", "timestamp": k} for k in range(2)],
-        "sensor": [{"token": name, "channel": name, "modality": kind} for name, kind in channels.items()],
+        "scene": [{"token": name, "name": name} for name in dict.fromkeys(own[0] for own in measured)],
+        "sample": [{"token": own, "scene_token": scene} for scene, own in dict.fromkeys(own[:2] for own in measured)],
+        "sensor": [
+            {"token": f"s{name}", "channel": name, "modality": "lidar" if own is None else "camera"}
+            for name, (_, own) in sensors.items()
+        ],
         "calibrated_sensor": [
-            {"token": f"c{name}", "sensor_token": name, **pose, "camera_intrinsic": K.tolist() if kind == "camera" else []}
-            for name, kind in channels.items()
+            pose(f"c{name}", T, sensor_token=f"s{name}", camera_intrinsic=[] if own is None else own.tolist())
+            for name, (T, own) in sensors.items()
         ],
         "sample_data": [],
         "ego_pose": [],
     }
-    for k, frame in enumerate(frames()):
-        for name, kind in channels.items():
-            file = folder / "samples" / name / f"{k}{'.png' if kind == 'camera' else '.pcd.bin'}"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            if kind == "camera":
-                cv2.imwrite(str(file), frame.image)
-            else:
-                np.c_[frame.cloud.xyz, frame.cloud.intensity, np.zeros(30)].astype("<f4").tofile(file)
-            token, stamp = f"{name}{k}", frame.stamp // 1000
-            row = {"sample_token": f"f{k}", "ego_pose_token": token, "calibrated_sensor_token": f"c{name}", "timestamp": stamp}
-            row |= {"filename": str(file.relative_to(folder)), "is_key_frame": True, "width": 40, "height": 24}
-            tables["sample_data"].append({"token": token, **row})
-            tables["ego_pose"].append({"token": token, "timestamp": stamp, **pose})
+    for _, sample, channel, stamp, T, key, content in measured:
+        is_camera = sensors[channel][1] is not None
+        file = folder / ("samples" if key else "sweeps") / channel / f"{stamp}{'.png' if is_camera else '.pcd.bin'}"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if content is not None:
+            cv2.imwrite(str(file), content) if is_camera else content.astype("<f4").tofile(file)
+        token, (height, width) = f"{channel}{stamp}", (0, 0) if content is None else content.shape[:2]
+        row = {"token": token, "sample_token": sample, "ego_pose_token": f"p{token}", "calibrated_sensor_token": f"c{channel}"}
+        row |= {"timestamp": stamp, "filename": str(file.relative_to(folder)), "is_key_frame": key}
+        tables["sample_data"].append(row | {"width": width, "height": height})
+        tables["ego_pose"].append(pose(f"p{token}", T, timestamp=stamp))
     (folder / "v1.0-mini").mkdir()
     for name, rows in tables.items():
         (folder / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows, indent=0))

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -400,15 +401,18 @@ def test_refined_intrinsics_are_written_as_camera_info(
     assert open_dataset(folder).camera == refined.camera
 
 
-def test_a_search_along_fixed_axes() -> None:
-    rotation_only = ConstraintOptions(rotation_only=True)
-    rotation_only.check_search((5.0, 5.0, 5.0), None)
-    rotation_only.check_search(None, (0.0, 0.0, 0.0))
-    with pytest.raises(BadInputError, match="--search-m: tx, ty, tz are fixed, so the search there must be 0"):
-        rotation_only.check_search(None, (0.5, 0.5, 0.5))
-    ConstraintOptions(fixed=["rx"]).check_search((5.0, 5.0, 5.0), None)  # one number means the axes that are free
-    with pytest.raises(BadInputError, match="--search-deg: rx is fixed"):
-        ConstraintOptions(fixed=["rx"]).check_search((5.0, 5.0, 1.0), None)
+@pytest.mark.parametrize(
+    ("known", "deg", "m", "says"),
+    [
+        ({"rotation_only": True}, (5.0, 5.0, 5.0), (0.0, 0.0, 0.0), None),
+        ({"rotation_only": True}, None, (0.5, 0.5, 0.5), "--search-m: tx, ty, tz are fixed, so the search there must be 0"),
+        ({"fixed": ["rx"]}, (5.0, 5.0, 5.0), None, None),  # one number means the axes that are free
+        ({"fixed": ["rx"]}, (5.0, 5.0, 1.0), None, "--search-deg: rx is fixed"),
+    ],
+)
+def test_a_search_along_fixed_axes(known: dict[str, Any], deg: Any, m: Any, says: str | None) -> None:
+    with nullcontext() if says is None else pytest.raises(BadInputError, match=says):
+        ConstraintOptions(**known).check_free("--search", deg, m, "the search")
 
 
 def test_the_search_box() -> None:

@@ -9,7 +9,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bag_recorder import DISTORTED, MS, PINHOLE, START, STORAGES, T_CAMERA_LIDAR, A, B, C, K, Recorder, assert_same, frame
+from bag_recorder import (
+    DISTORTED,
+    MS,
+    PINHOLE,
+    START,
+    STORAGES,
+    T_CAMERA_LIDAR,
+    A,
+    B,
+    C,
+    K,
+    Recorder,
+    assert_same,
+    frame,
+    recorded,
+)
 from ros_messages import TYPES
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
@@ -162,9 +177,7 @@ def test_pairs_by_header_stamps_not_by_arrival(tmp_path, storage):
     with Recorder(tmp_path / "bag", storage) as record:
         for i in range(4):  # the clouds arrive 150 ms late, several messages at the same time
             stamp = START + i * 100 * MS
-            record.image(stamp, value=i, time=START)
-            record.info(stamp)
-            record.cloud(stamp + 3 * MS, time=stamp + 150 * MS, value=i)
+            record.trio(stamp, i, START, stamp + 3 * MS, stamp + 150 * MS)
         record.image(START + 1000 * MS)  # no cloud near
     bag = BagSource(tmp_path / "bag")
     assert len(bag) == 4
@@ -215,12 +228,8 @@ def test_the_configuration_says_how_a_bag_is_paired(tmp_path):
 
 
 def test_headers_without_stamps_fall_back_to_the_time_of_recording(tmp_path):
-    with Recorder(tmp_path / "bag") as record:
-        for i in range(3):
-            record.image(0, time=START + i * 100 * MS, value=i)
-            record.info(0, time=START + i * 100 * MS)
-            record.cloud(START + 12345, time=START + i * 100 * MS + 1, value=i)
-    bag = BagSource(tmp_path / "bag")
+    path = recorded(tmp_path / "bag", lambda record, time, i: record.trio(0, i, time, START + 12345, time + 1), 3)
+    bag = BagSource(path)
     assert [int(bag[i].image[0, 0]) for i in range(3)] == [0, 1, 2]
     assert [int(bag[i].cloud.xyz[0, 0]) for i in range(3)] == [0, 1, 2]
     assert bag[2].stamp == START + 200 * MS
@@ -243,9 +252,7 @@ def test_clocks_that_differ_are_told_from_messages_that_come_late(tmp_path, ahea
     with Recorder(tmp_path / "bag") as record:
         for i in range(60):
             at = START + i * 100 * MS
-            record.image(at, value=i, time=at + 20 * MS)
-            record.info(at)
-            record.cloud(at + round(ahead_s * 1e9), value=i, time=at + 20 * MS + round(queue_s * 1e9))
+            record.trio(at, i, at + 20 * MS, at + round(ahead_s * 1e9), at + 20 * MS + round(queue_s * 1e9))
         record.cloud(2 * 10**18, value=60, time=START + 6000 * MS)  # one wrong stamp
     bag = BagSource(tmp_path / "bag")
     assert [remark for remark in bag.remarks if cause not in remark] == []
@@ -267,12 +274,7 @@ def test_clocks_that_differ_are_told_from_messages_that_come_late(tmp_path, ahea
 
 def test_a_camera_that_lags_by_seconds_is_paired_by_a_time_offset_that_is_given(tmp_path):
     """Pictures that are stamped 2.5 s after their exposure, when they are sent: nothing but the scenes shows it."""
-    with Recorder(tmp_path / "bag") as record:
-        for i in range(60):
-            at = START + i * 100 * MS
-            record.image(at, value=i, time=at + 20 * MS)
-            record.info(at)
-            record.cloud(at + 2500 * MS, value=i, time=at + 2520 * MS)
+    recorded(tmp_path / "bag", lambda record, at, i: record.trio(at, i, at + 20 * MS, at + 2500 * MS, at + 2520 * MS), 60)
     assert int(BagSource(tmp_path / "bag")[0].cloud.xyz[0, 0]) == 0
     bag = BagSource(tmp_path / "bag", motion=MotionConfig(time_offset_s=-2.5))
     assert [int(bag[i].cloud.xyz[0, 0]) - int(bag[i].image[0, 0]) for i in (0, 20, 34, -1)] == [0, 0, 0, 0]
@@ -339,10 +341,7 @@ def test_topics_of_a_damaged_bag_are_named_in_one_line(tmp_path):
 
 
 def test_missing_types_and_pairs_are_named(tmp_path):
-    with Recorder(tmp_path / "apart") as record:
-        record.image(START)
-        record.info(START)
-        record.cloud(START + 80 * MS)
+    recorded(tmp_path / "apart", lambda record, at, i: record.trio(at, cloud=at + 80 * MS))
     assert len(BagSource(tmp_path / "apart", tolerance_s=0.1)) == 1
     for tolerance in (0, -1, float("nan")):
         with pytest.raises(BadInputError, match="tolerance_s" if tolerance else "within 0.05 s"):
@@ -364,10 +363,8 @@ def test_missing_types_and_pairs_are_named(tmp_path):
         record.write("/scan", scan, START)
     with pytest.raises(BadInputError, match="LaserScan: a scan of one plane"):
         BagSource(tmp_path / "planar")
-    with Recorder(tmp_path / "empty"):
-        pass
     with pytest.raises(BadInputError, match="nothing at all"):
-        BagSource(tmp_path / "empty")
+        BagSource(recorded(tmp_path / "empty", count=0))
 
 
 @pytest.mark.parametrize(
@@ -411,29 +408,19 @@ def test_compressed_images(tmp_path):
     assert (BagSource(tmp_path / "both", "/cam/image_raw/compressed")[0].image == 9).all()
 
 
-def test_rectified_images_use_the_projection_matrix(tmp_path):
-    with Recorder(tmp_path / "bag") as record:
-        record.image(START, topic="/cam/image_rect_color")
-        record.info(START)
-        record.cloud(START)
-    bag = BagSource(tmp_path / "bag")
+def test_images_of_a_topic_called_so_use_the_projection_matrix_unless_they_are_said_to_be_raw(tmp_path, capsys):
+    """The topic's name says it, and the command line has the last word."""
+    path = recorded(tmp_path / "bag", lambda record, at, i: record.trio(at, topic="/cam/image_rect_color"))
+    bag = BagSource(path)
     assert bag.camera.K[0, 0] == 10
     assert bag.camera.is_pinhole
     assert "rectified" in bag.describe()["camera"]
-    assert not BagSource(tmp_path / "bag", rectified=False).camera.is_pinhole
-
-
-def test_the_command_line_says_that_images_are_raw_whatever_their_topic_is_called(tmp_path, capsys):
-    with Recorder(tmp_path / "bag") as record:
-        record.image(START, topic="/cam/image_rect")
-        record.info(START)
-        record.cloud(START)
-    assert main(["info", str(tmp_path / "bag")]) == 0
+    assert not BagSource(path, rectified=False).camera.is_pinhole
+    assert not opened_by_check(str(path), CheckOptions(rectified=False)).camera.is_pinhole
+    assert main(["info", str(path)]) == 0
     assert "--no-rectified" in capsys.readouterr().out
-    assert main(["info", str(tmp_path / "bag"), "--no-rectified"]) == 0
+    assert main(["info", str(path), "--no-rectified"]) == 0
     assert "rectified" not in capsys.readouterr().out
-    raw = opened_by_check(str(tmp_path / "bag"), CheckOptions(rectified=False))
-    assert not raw.camera.is_pinhole
 
 
 @pytest.mark.parametrize("separate", [False, True])

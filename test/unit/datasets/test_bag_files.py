@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_recorder import MS, START, STORAGES, A, Recorder, as_ros1, assert_same, frame
+from bag_recorder import MS, START, STORAGES, A, Recorder, as_ros1, assert_same, frame, recorded
 from rosbags.rosbag2 import CompressionMode
 from sample_sources import Listed
 
@@ -22,10 +22,7 @@ COMPRESSED = [("mcap", CompressionMode.STORAGE), ("mcap", CompressionMode.MESSAG
 
 @pytest.mark.parametrize(("storage", "compression"), [*COMPRESSED, ("sqlite3", CompressionMode.MESSAGE)])
 def test_compressed_bags(tmp_path, storage, compression):
-    with Recorder(tmp_path / "bag", storage, compression) as record:
-        for i in range(3):
-            record.trio(START + i * 100 * MS, value=i)
-    bag = open_dataset(tmp_path / "bag")
+    bag = open_dataset(recorded(tmp_path / "bag", Recorder.trio, 3, storage, compression=compression))
     assert [int(bag[i].image[0, 0]) for i in range(3)] == [0, 1, 2]
     assert bag.describe()["storage"] == storage
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from bag_recorder import MS, PINHOLE, START, STORAGES, A, B, Recorder, as_ros1, assert_same, frame
+from bag_recorder import MS, PINHOLE, START, STORAGES, A, B, Recorder, as_ros1, assert_same, frame, recorded
 from rosbags.rosbag2 import CompressionMode, Reader
 from sample_sources import Listed
 from test_bag_files import COMPRESSED, storage_of
@@ -41,19 +41,12 @@ for windows in sys.argv[2:]:
 """
 
 
-def record(path: Path, write: Callable[[Recorder, int], None], storage: str = "mcap", **options) -> Path:
-    """A bag for which `write` is called with every time."""
-    with Recorder(path, storage, **options) as recorder:
-        for i in range(MESSAGES):
-            write(recorder, START + 100 * MS * i)
-    return path
+record = partial(recorded, count=MESSAGES)
 
 
-def trio(recorder: Recorder, stamp: int) -> None:
+def trio(recorder: Recorder, stamp: int, i: int) -> None:
     """Messages as recorded a little later than stamped; the cloud later than the image."""
-    recorder.image(stamp, time=stamp + 20 * MS, value=(stamp - START) // (100 * MS))
-    recorder.info(stamp, time=stamp + 20 * MS)
-    recorder.cloud(stamp, time=stamp + 70 * MS, value=(stamp - START) // (100 * MS))
+    recorder.trio(stamp, i, stamp + 20 * MS, stamp, stamp + 70 * MS)
 
 
 def assert_frames_of_the_whole(path: Path, count: int, found: int | None = None) -> BagSource:
@@ -73,7 +66,7 @@ def assert_frames_of_the_whole(path: Path, count: int, found: int | None = None)
     [("mcap", CompressionMode.NONE, 1), ("sqlite3", CompressionMode.NONE, 4), *((*kind, 3) for kind in COMPRESSED)],
 )
 def test_windows_hold_frames_of_the_whole_bag_and_their_neighbours(tmp_path, storage, compression, count):
-    bag = assert_frames_of_the_whole(record(tmp_path / "bag", trio, storage, compression=compression), count)
+    bag = assert_frames_of_the_whole(record(tmp_path / "bag", trio, storage=storage, compression=compression), count)
     assert len(bag) <= 5 * count
     assert f"{count} windows of the recording" in bag.describe()["frames"]
     middles = [int(bag[middle].image[0, 0]) for middle in bag.middles]
@@ -133,7 +126,7 @@ def test_an_index_that_names_other_messages_is_told(tmp_path):
 
 
 def test_messages_compressed_one_by_one_are_read_without_metadata(tmp_path):
-    path = record(tmp_path / "bag", trio, "sqlite3", compression=CompressionMode.MESSAGE)
+    path = record(tmp_path / "bag", trio, storage="sqlite3", compression=CompressionMode.MESSAGE)
     stamps = [BagSource(path)[k].stamp for k in (0, MESSAGES - 1)]
     (path / "metadata.yaml").unlink()
     bag = BagSource(path)
@@ -152,17 +145,13 @@ def test_a_short_bag_is_read_as_a_whole(tmp_path):
 
 @pytest.mark.parametrize("late_ms", [400, 700, 4000])
 def test_a_sensor_that_is_recorded_late_has_wider_windows_or_the_whole_bag(tmp_path, late_ms):
-    def write(recorder: Recorder, stamp: int) -> None:
-        recorder.image(stamp)
-        recorder.info(stamp)
-        recorder.cloud(stamp, time=stamp + late_ms * MS)
-
-    bag = assert_frames_of_the_whole(record(tmp_path / "bag", write), 3)
+    path = record(tmp_path / "bag", lambda recorder, stamp, i: recorder.trio(stamp, cloud_time=stamp + late_ms * MS))
+    bag = assert_frames_of_the_whole(path, 3)
     assert bag.windows == (0 if late_ms == 4000 else 3)
 
 
 def test_windows_avoid_where_a_sensor_is_missing(tmp_path):
-    def write(recorder: Recorder, stamp: int) -> None:
+    def write(recorder: Recorder, stamp: int, i: int) -> None:
         if not 4000 < (stamp - START) / MS < 5000:
             recorder.image(stamp)
         recorder.info(stamp)
@@ -171,16 +160,14 @@ def test_windows_avoid_where_a_sensor_is_missing(tmp_path):
     bag = assert_frames_of_the_whole(record(tmp_path / "bag", write), 4)  # the second slot's middle is at 4.5 s
     assert 3.3 < (bag[bag.middles[1]].stamp - START) / 1e9 < 3.9
     # Half of the recording without images: the slots there stay empty.
-    half = record(
-        tmp_path / "half", lambda recorder, stamp: trio(recorder, stamp) if stamp < START + 6000 * MS else recorder.cloud(stamp)
-    )
+    half = record(tmp_path / "half", lambda own, stamp, i: trio(own, stamp, i) if i < MESSAGES // 2 else own.cloud(stamp))
     bag = BagSource(half, windows=4)
     assert (len(bag.middles), bag.windows) == (2, 2)
 
 
 @pytest.mark.parametrize("once", [True, False])
 def test_seldom_camera_infos_are_found(tmp_path, once):
-    def write(recorder: Recorder, stamp: int) -> None:
+    def write(recorder: Recorder, stamp: int, i: int) -> None:
         recorder.image(stamp)
         recorder.cloud(stamp)
         if stamp == START or (not once and (stamp - START) % (2000 * MS) == 0):
@@ -195,14 +182,14 @@ def test_seldom_camera_infos_are_found(tmp_path, once):
 def test_static_transforms_are_those_of_the_whole_bag(tmp_path, storage):
     """Once at the beginning, and corrected once between two windows."""
 
-    def write(recorder: Recorder, stamp: int) -> None:
+    def write(recorder: Recorder, stamp: int, i: int) -> None:
         if stamp == START:
             recorder.static(stamp, ("cam", "lidar", A))
         if stamp == START + 6000 * MS:
             recorder.static(stamp, ("cam", "lidar", B))
-        trio(recorder, stamp)
+        trio(recorder, stamp, i)
 
-    bag = assert_frames_of_the_whole(record(tmp_path / "bag", write, storage), 4)
+    bag = assert_frames_of_the_whole(record(tmp_path / "bag", write, storage=storage), 4)
     for middle, T in zip(bag.middles, (A, A, B, B), strict=True):
         assert np.abs(bag[middle].reference - T).max() < 1e-9
 
@@ -212,7 +199,7 @@ def test_a_bag_of_several_files(tmp_path):
     first = record(tmp_path / "first", trio)
     with Recorder(tmp_path / "second") as recorder:
         for i in range(MESSAGES, 2 * MESSAGES):
-            trio(recorder, START + 100 * MS * i)
+            trio(recorder, START + 100 * MS * i, i)
     metadata = yaml.safe_load((first / "metadata.yaml").read_text())
     about = metadata["rosbag2_bagfile_information"]
     about["relative_file_paths"].append("second.mcap")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+import sample_sources
 from scenes import RenderedDrive
 from scipy.spatial.transform import Rotation
 
@@ -28,11 +27,6 @@ SCAN_US = 50_000
 FRONT, BACK, LIDAR = "CAM_FRONT", "CAM_BACK", "LIDAR_TOP"
 
 
-def pose(token: str, T: np.ndarray, **more: Any) -> dict[str, Any]:
-    x, y, z, w = se3.quaternion_from_rotation(T[:3, :3])
-    return {"token": token, "translation": T[:3, 3].tolist(), "rotation": [w, x, y, z], **more}
-
-
 @pytest.fixture(scope="module")
 def drive() -> SyntheticDrive:
     return RenderedDrive(seed=1, frames=FRAMES, rings=32, width=640, height=192, speed=SPEED)
@@ -47,52 +41,29 @@ def truth(drive: SyntheticDrive) -> np.ndarray:
 def template(drive: SyntheticDrive, truth: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scenes scene-0061, with all its files, and scene-0103, without any."""
     root = tmp_path_factory.mktemp("nuscenes")
-    T_ego_camera = {FRONT: T_EGO_LIDAR @ se3.inverse(truth)}
-    T_ego_camera[BACK] = se3.from_parts(Rotation.from_euler("z", 180, degrees=True).as_matrix(), [0, 0, 0]) @ T_ego_camera[FRONT]
-    tables: dict[str, list[dict[str, Any]]] = {name: [] for name in ("sample", "sample_data", "ego_pose")}
-    tables["scene"] = [{"token": f"s{k}", "name": name} for k, name in enumerate(("scene-0061", "scene-0103"))]
-    tables["sensor"] = [{"token": "sr", "channel": "RADAR_FRONT", "modality": "radar"}]
-    tables["calibrated_sensor"] = []
-    for channel, T in {**T_ego_camera, LIDAR: T_EGO_LIDAR}.items():
-        camera = channel != LIDAR
-        tables["sensor"].append({"token": f"s{channel}", "channel": channel, "modality": "camera" if camera else "lidar"})
-        K = drive.camera.K.tolist() if camera else []
-        tables["calibrated_sensor"].append(pose(f"c{channel}", T, sensor_token=f"s{channel}", camera_intrinsic=K))
-        (root / "samples" / channel).mkdir(parents=True)
-
-    def add(channel: str, sample: str, stamp_us: int, T_global_ego: np.ndarray, key: bool = True) -> Path:
-        ending, size = (".pcd.bin", (0, 0)) if channel == LIDAR else (".png", (drive.camera.width, drive.camera.height))
-        name = f"{'samples' if key else 'sweeps'}/{channel}/{stamp_us}{ending}"
-        row = {"sample_token": sample, "calibrated_sensor_token": f"c{channel}", "filename": name, "timestamp": stamp_us}
-        row |= {"is_key_frame": key, "width": size[0], "height": size[1]}
-        token = f"{channel}{stamp_us}"
-        tables["sample_data"].append({"token": token, "ego_pose_token": f"p{token}", **row})
-        tables["ego_pose"].append(pose(f"p{token}", T_global_ego, timestamp=stamp_us))
-        return root / name
-
+    T_front = T_EGO_LIDAR @ se3.inverse(truth)
+    T_back = se3.from_parts(Rotation.from_euler("z", 180, degrees=True).as_matrix(), [0, 0, 0]) @ T_front
+    sensors = {FRONT: (T_front, drive.camera.K), BACK: (T_back, drive.camera.K), LIDAR: (T_EGO_LIDAR, None)}
+    measured: list[sample_sources.Measured] = []
     for k in range(FRAMES):
         frame = drive[k]
-        stamp = frame.stamp // 1000
+        own, stamp = ("scene-0061", f"f{k}"), frame.stamp // 1000
         start = se3.from_parts(Rotation.from_euler("z", 20 * k, degrees=True).as_matrix(), [100.0 * k, 50, 0])
 
         def ego(at_us: int, start=start, stamp=stamp, twist=frame.twist) -> np.ndarray:
             T_global_lidar = start @ se3.exp(twist * (at_us - stamp) * 1e-6) @ se3.inverse(TURNED)
             return T_global_lidar @ se3.inverse(T_EGO_LIDAR)
 
-        tables["sample"].append({"token": f"f{k}", "scene_token": "s0", "timestamp": stamp + LATE_US})
-        for channel in (FRONT, BACK):
-            cv2.imwrite(str(add(channel, f"f{k}", stamp, ego(stamp))), frame.image)
         points = moved(deskewed_points(frame, MotionConfig()), frame.twist, np.full(len(frame.cloud), -LATE_US * 1e-6))
-        rows = np.c_[se3.transform(TURNED, points), frame.cloud.intensity, frame.cloud.ring].astype("<f4")
-        rows.tofile(add(LIDAR, f"f{k}", stamp + LATE_US, ego(stamp + LATE_US)))
-        for gap in (-SCAN_US, SCAN_US):  # of the sweeps only the poses are needed
-            add(LIDAR, f"f{k}", stamp + LATE_US + gap, ego(stamp + LATE_US + gap), key=False)
-    tables["sample"].append({"token": "g", "scene_token": "s1", "timestamp": 5})
-    for channel in (FRONT, LIDAR):
-        add(channel, "g", 5, np.eye(4))
-    (root / "v1.0-mini").mkdir()
-    for name, rows in tables.items():
-        (root / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows[::-1] if name == "sample_data" else rows))
+        rows = np.c_[se3.transform(TURNED, points), frame.cloud.intensity, frame.cloud.ring]
+        measured += [(*own, channel, stamp, ego(stamp), True, frame.image) for channel in (FRONT, BACK)]
+        # Of the sweeps only the poses are needed.
+        scans = {stamp + LATE_US + gap: rows if gap == 0 else None for gap in (0, -SCAN_US, SCAN_US)}
+        measured += [(*own, LIDAR, at, ego(at), content is not None, content) for at, content in scans.items()]
+    measured += [("scene-0103", "g", channel, 5, np.eye(4), True, None) for channel in (FRONT, LIDAR)]
+    sample_sources.nuscenes(root, sensors, measured)
+    edit(root, "sensor", lambda rows: [{"token": "sr", "channel": "RADAR_FRONT", "modality": "radar"}, *rows])
+    edit(root, "sample_data", lambda rows: rows[::-1])
     return root
 
 
@@ -181,7 +152,7 @@ def test_unknown_scenes_and_cameras(template, scene, camera, message):
 
 
 @pytest.mark.parametrize("table", ["scene", "sample", "sample_data", "calibrated_sensor", "ego_pose", "sensor"])
-@pytest.mark.parametrize("content", ["[{", '[{"token": "a", "scene_token": "s0", "sensor_token": "sLIDAR_TOP"}]', None])
+@pytest.mark.parametrize("content", ["[{", '[{"token": "a", "scene_token": "scene-0061", "sensor_token": "sLIDAR_TOP"}]', None])
 def test_damaged_tables_are_one_clear_error(tree, table, content):
     path = tree / "v1.0-mini" / f"{table}.json"
     path.unlink()

@@ -17,9 +17,9 @@ from calib_ros.cli.main import main
 from calib_ros.datasets import bag, kitti, nuscenes, open_dataset
 from calib_ros.datasets.bag_file import BagFile
 from calib_ros.datasets.bag_rig import BagRig
+from calib_ros.datasets.open import open_rig
 from calib_ros.datasets.recent import Recent
-from calib_ros.datasets.rig import open_rig
-from calib_ros.datasets.rig_source import RigDescription, Sensor, rig_yaml
+from calib_ros.datasets.rig import RigDescription, Sensor, rig_yaml
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.initial_guess import nominal
@@ -82,6 +82,8 @@ def test_a_bag_gives_back_the_rig(written: Path, description: Any, rig: Syntheti
     decoded: list[int] = []
     whole = bag.decode_cloud
     monkeypatch.setattr(bag, "decode_cloud", lambda message: decoded.append(1) or whole(message))
+    read, heads = [], BagFile.heads
+    monkeypatch.setattr(BagFile, "heads", lambda *given: read.append(1) or heads(*given))
     opened = open_rig(written, description)
     assert isinstance(opened, BagRig)
     assert (opened.cameras, opened.lidars) == (rig.cameras, rig.lidars)
@@ -106,9 +108,10 @@ def test_a_bag_gives_back_the_rig(written: Path, description: Any, rig: Syntheti
     assert (stamp, cloud) == (frame.cloud_stamp, frame.cloud)
     other = opened.pair("right", "lidar_right")
     decoded.clear()
-    stamps = [int(other._index.cloud.stamps[k]) for k in other._pairs[1]]
+    stamps = [int(other._clouds.stamps[k]) for k in other._pairs[1]]
     assert other[stamps.index(stamp)].cloud is cloud
     assert not decoded
+    assert len(read) == 1  # of the bag, for all pairs
 
 
 def test_priors_tell_where_a_camera_looks_when_a_bag_has_no_transforms(written: Path, rig: SyntheticRig) -> None:
