@@ -60,12 +60,13 @@ def scan_once(rig: SyntheticRig, lidar: str, index: int) -> Any:
 def picture_once(rig: SyntheticRig, camera: str, index: int, hung: Any = None, age_s: float = 0.0) -> Any:
     """In place of SyntheticRig._picture."""
     lens, where = rig.camera(camera), hung or rig._hung(camera, False)
-    key = (_key(rig), lens.K.tolist(), lens.width, lens.height, lens.model, np.asarray(lens.D).tolist())
+    key = (_key(rig, *OF_SCANS), lens.K.tolist(), lens.width, lens.height, lens.model, np.asarray(lens.D).tolist())
     key = (*key, camera, index, [T.tolist() for T in where], age_s)
     return made_once(key, lambda: _picture(rig, camera, index, hung, age_s))
 
 
 OF_PICTURES = ("width", "height", "tilt_deg", "image_late_ms", "jitter_ms")  # what the scans of a pair do not depend on
+OF_SCANS = ("rings", "spin", "stamp_at")  # what its pictures do not depend on
 
 
 def _key(rig: SyntheticRig, *not_of: str) -> object:
