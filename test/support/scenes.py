@@ -9,7 +9,7 @@ import pickle
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +115,10 @@ class Scene:
         self.frames = [drive[k] for k in range(frames)]
         self.calibrator = Calibrator(self.camera)
         self.quick = Calibrator(self.camera, QUICK)
-        self.features = [self.calibrator.extract(f) for f in self.frames]
+
+    @cached_property
+    def features(self) -> list[FrameFeatures]:
+        return [self.calibrator.extract(f) for f in self.frames]
 
     def off(self, by) -> np.ndarray:
         return se3.perturb(self.truth, *by)

@@ -165,7 +165,7 @@ def test_they_are_checked_where_it_is_wanted(scene):
 def test_where_nothing_matches_what_was_mixed_up_is_named(scene, flip, wrong_transform, size, cause):
     camera = replace(scene.camera, K=scene.camera.K * np.array([[size, 1, size], [1, size, size], [1, 1, 1]]))
     frames = [replace(f, image=np.ascontiguousarray(np.flip(f.image, flip)), camera=camera) for f in scene.frames[:2]]
-    result = Calibrator(camera, QUICK).calibrate(frames, wrong_transform(scene.truth), BOX)
+    result = Calibrator(camera, QUICK).calibrate(frames, wrong_transform(scene.truth))
     assert_not_used(result, result.initial)
     assert result.cause is cause, result.reason
 

@@ -21,8 +21,6 @@ from calib_ros_check.outcome import Tolerance
 from calib_ros_check.recording import CheckOptions
 from calib_ros_semantics.models.weight_sets import of_package
 
-QUICK = "search: {rounds: 1, starts: 64}\n"  # enough for what is to be found here
-
 
 @pytest.fixture
 def bad(tmp_path: Path) -> Path:
@@ -48,7 +46,8 @@ def lines(folder: Path) -> int:
     return len((folder.parent / "out/results.jsonl").read_text().splitlines())
 
 
-def test_bad_recordings_are_rows(bad: Path, in_this_process: None) -> None:
+@pytest.mark.usefixtures("in_this_process")
+def test_bad_recordings_are_rows(bad: Path) -> None:
     told: list[tuple[int, int]] = []
     fleet = check_fleet(options(bad), progress=lambda *counts: told.append(counts))
     assert fleet.exit_code == 2
@@ -64,7 +63,8 @@ def test_bad_recordings_are_rows(bad: Path, in_this_process: None) -> None:
     assert "3 recordings of 0 vehicles" in page.read_text()
 
 
-def test_a_recording_that_changed_and_other_options_are_checked_again(bad: Path, in_this_process: None) -> None:
+@pytest.mark.usefixtures("in_this_process")
+def test_a_recording_that_changed_and_other_options_are_checked_again(bad: Path) -> None:
     check_fleet(options(bad))
     assert lines(bad) == 4
     (bad / "car/garbage.mcap").write_bytes(b"other")
@@ -122,12 +122,11 @@ def test_a_recording_that_is_gone_is_blamed_on_the_machine(tmp_path: Path) -> No
     assert "does not exist" in answer["error"]
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_folder_of_recordings_from_the_command_line(drive, street_bag: Path, bad: Path, capsys) -> None:
     shutil.copytree(street_bag, bad / "car/street")
     write_bag(drive, bad / "van/street")
-    (bad.parent / "quick.yaml").write_text(QUICK)
-    given = ["--out", str(bad.parent / "out"), "--workers", "1", "--frames", "0,4", "--config", str(bad.parent / "quick.yaml")]
-    assert main(["check", str(bad), *given]) == 3
+    assert main(["check", str(bad), "--out", str(bad.parent / "out"), "--workers", "1", "--frames", "0,4"]) == 3
     said = capsys.readouterr().out
     assert said.startswith("5 recordings of 2 vehicles: 0 fail, 3 error, 0 inconclusive, 2 pass")
     with (bad.parent / "out/fleet.csv").open(newline="") as file:
