@@ -73,11 +73,11 @@ def test_another_principal_point_is_a_turn_of_the_camera_that_is_stated(scene):
 
 def test_of_images_that_are_said_to_be_rectified_the_refusal_says_how_to_take_them_as_raw(scene):
     camera = wrong(scene.camera, -0.04)
-    refused = calibrated(scene, replace(camera, said_rectified=True))
+    refused = calibrated(scene, replace(camera, said_rectified=True), None)
     assert refused.refusal is RefusalCode.WRONG_INTRINSICS
     assert "; the images are taken for rectified, but camera_info has a distortion" in refused.reason
     assert "--no-rectified, or image_is_rectified: false to the node" in refused.reason
-    assert "--no-rectified" not in calibrated(scene, camera).reason
+    assert "--no-rectified" not in calibrated(scene, camera, None).reason
 
 
 def test_right_intrinsics_are_estimated_as_given(scene):
