@@ -9,7 +9,7 @@ import pickle
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -60,12 +60,13 @@ def scan_once(rig: SyntheticRig, lidar: str, index: int) -> Any:
 def picture_once(rig: SyntheticRig, camera: str, index: int, hung: Any = None, age_s: float = 0.0) -> Any:
     """In place of SyntheticRig._picture."""
     lens, where = rig.camera(camera), hung or rig._hung(camera, False)
-    key = (_key(rig), lens.K.tolist(), lens.width, lens.height, lens.model, np.asarray(lens.D).tolist())
+    key = (_key(rig, *OF_SCANS), lens.K.tolist(), lens.width, lens.height, lens.model, np.asarray(lens.D).tolist())
     key = (*key, camera, index, [T.tolist() for T in where], age_s)
     return made_once(key, lambda: _picture(rig, camera, index, hung, age_s))
 
 
 OF_PICTURES = ("width", "height", "tilt_deg", "image_late_ms", "jitter_ms")  # what the scans of a pair do not depend on
+OF_SCANS = ("rings", "spin", "stamp_at")  # what its pictures do not depend on
 
 
 def _key(rig: SyntheticRig, *not_of: str) -> object:
@@ -114,7 +115,10 @@ class Scene:
         self.frames = [drive[k] for k in range(frames)]
         self.calibrator = Calibrator(self.camera)
         self.quick = Calibrator(self.camera, QUICK)
-        self.features = [self.calibrator.extract(f) for f in self.frames]
+
+    @cached_property
+    def features(self) -> list[FrameFeatures]:
+        return [self.calibrator.extract(f) for f in self.frames]
 
     def off(self, by) -> np.ndarray:
         return se3.perturb(self.truth, *by)

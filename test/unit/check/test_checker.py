@@ -100,8 +100,8 @@ def test_further_looks_are_at_half_the_p_value_whatever_the_clocks(drive, monkey
     assert len(optima) == 2, "what is not taken competes all the same"
 
 
-def test_a_check_may_be_ended_among_the_causes(made, checker):
-    stages = []
+def test_a_check_may_be_ended_among_the_causes(drive, checker):
+    (frames, truth), stages = drive, []
 
     def end(stage, share):
         stages.append((stage, share))
@@ -109,7 +109,7 @@ def test_a_check_may_be_ended_among_the_causes(made, checker):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        checker.check([made[k] for k in range(3)], se3.inverse(made.reference), progress=end)
+        checker.check(frames, se3.inverse(truth), progress=end)
     assert {"features", "search", "causes"} <= {stage for stage, _ in stages}
     assert all(0 <= share <= 1 for _, share in stages)
 
@@ -192,8 +192,8 @@ def test_where_nothing_matches_the_effort_is_bounded(made, checker, monkeypatch)
     barrel = replace(made.camera, D=np.array([-0.3, 0.08, 0.0, 0.0, 0.0]))
     checker = Checker(barrel, checker.config)
     rng = np.random.default_rng(0)
-    noise = [rng.integers(0, 255, made[0].image.shape, dtype=np.uint8) for _ in range(4)]
-    frames = [replace(made[k % 4], camera=barrel, image=noise[k % 4]) for k in range(6)]
+    noise = [rng.integers(0, 255, made[0].image.shape, dtype=np.uint8) for _ in range(FEW_FRAMES + 1)]
+    frames = [replace(made[k], camera=barrel, image=image) for k, image in enumerate(noise)]
     features = [checker._calibrator.extract(frame) for frame in frames]
     taken: list[int] = []
     searches: list[object] = []

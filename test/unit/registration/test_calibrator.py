@@ -20,11 +20,6 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INSUFFICIENT, RefusalCode, Result
 
 
-@pytest.fixture(scope="module")
-def other() -> Scene:
-    return Scene(3)
-
-
 def cloudless(frame: Frame, name: str = "") -> Frame:
     return replace(frame, cloud=PointCloud(np.zeros((0, 3), np.float32)), name=name or frame.name)
 
@@ -174,27 +169,29 @@ def test_axes_are_searched_by_their_own_widths_and_refined_without(scene, box, b
 # --- what cannot be calibrated --------------------------------------------------------------------------------------------
 
 
-# A search of all rounds where nothing can be found takes half a minute; one round shows the same refusal.
-REFINE, ONE_ROUND = pytest.param(None, QUICK, id="refine"), pytest.param(SearchBox(5, 0.3), QUICK, id="one round")
-SEARCH = pytest.param(SearchBox(5, 0.3), Config(), id="search", marks=pytest.mark.slow)
+# A search of all rounds where nothing can be found takes half a minute; one round shows the same refusal. Without a search they
+# are refused in test_outlier_frames.
+@pytest.mark.parametrize("config", [QUICK, pytest.param(Config(), marks=pytest.mark.slow)], ids=["one round", "all rounds"])
+def test_pictures_of_another_scene_are_refused(scene, config):
+    frames = [replace(a, image=b.image) for a, b in zip(scene.frames, Scene(3).frames, strict=True)]
+    assert_not_used(Calibrator(scene.camera, config).calibrate(frames, scene.truth, SearchBox(5, 0.3)), scene.truth)
 
 
-@pytest.mark.parametrize(("box", "config"), [REFINE, ONE_ROUND, SEARCH])
-def test_pictures_of_another_scene_are_refused(scene, other, box, config):
-    frames = [replace(a, image=b.image) for a, b in zip(scene.frames, other.frames, strict=True)]
-    assert_not_used(Calibrator(scene.camera, config).calibrate(frames, scene.truth, box), scene.truth)
-
-
-@pytest.mark.parametrize(("box", "config"), [REFINE, ONE_ROUND])
 @pytest.mark.parametrize(
-    ("level", "noise"),
-    [pytest.param(0, 0, id="black"), pytest.param(40, 3, id="dark", marks=pytest.mark.slow), pytest.param(128, 80, id="noise")],
+    ("level", "noise", "box"),
+    [
+        pytest.param(0, 0, None, id="black"),
+        pytest.param(128, 80, None, id="noise"),
+        pytest.param(0, 0, SearchBox(5, 0.3), id="black, searched"),
+        *(pytest.param(40, 3, box, marks=pytest.mark.slow) for box in (None, SearchBox(5, 0.3))),
+        pytest.param(128, 80, SearchBox(5, 0.3), marks=pytest.mark.slow),
+    ],
 )
-def test_pictures_that_show_nothing_are_refused(scene, level, noise, box, config):
+def test_pictures_that_show_nothing_are_refused(scene, level, noise, box):
     rng = np.random.default_rng(0)
     images = [np.clip(rng.normal(level, noise, f.image.shape), 0, 255).astype(np.uint8) for f in scene.frames]
     frames = [replace(f, image=image) for f, image in zip(scene.frames, images, strict=True)]
-    assert_not_used(Calibrator(scene.camera, config).calibrate(frames[:2], scene.off(NEAR), box), scene.off(NEAR))
+    assert_not_used(scene.quick.calibrate(frames[:2], scene.off(NEAR), box), scene.off(NEAR))
 
 
 def test_frame_with_an_empty_cloud_is_left_out_by_name(scene):

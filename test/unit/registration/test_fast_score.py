@@ -160,36 +160,6 @@ def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
         FastScore(features, nominal(), CONFIG)
 
 
-@pytest.mark.parametrize("level", [0, 2, 4])
-def test_the_gradient_is_the_slope(level):
-    smooth = [frame(k, smoothness=4.0, n=400) for k in range(2)]
-    score = FastScore(smooth, nominal(), CONFIG)
-    T = POSES[1]
-    gradient, H = score.at(level).linearise(T)
-
-    def samples(T: np.ndarray) -> np.ndarray:
-        return slow(smooth, T, level)[0]
-
-    weight = slow(smooth, T, level)[1]
-    # Away from the picture's border, where the score is not smooth, every point's slope counts.
-    uv = CAMERA.project(se3.transform(T, score.points.T))[0]
-    margin = max(10, 2.5 * SCALES[level])
-    inner = (np.abs(uv - [160, 60]) < [160 - margin, 60 - margin]).all(axis=1)
-    assert inner.sum() > 150
-    J = score.jacobian(T, level)
-    numeric = np.zeros((6, len(weight)))
-    for k in range(6):
-        d = np.zeros(6)
-        d[k] = 2e-4 if k < 3 else 2e-3
-        numeric[k] = (samples(se3.exp(d) @ T) - samples(se3.exp(-d) @ T)) / (2 * d[k])
-    for k in range(6):
-        size = np.sqrt(np.mean(numeric[k, inner] ** 2))
-        assert np.sqrt(np.mean((J[k, inner] - numeric[k, inner]) ** 2)) < 0.12 * size, k
-        assert J[k, inner] @ weight[inner] == pytest.approx(numeric[k, inner] @ weight[inner], abs=0.03 * size), k
-    assert np.allclose(J @ weight, gradient, rtol=1e-3, atol=1e-4 * np.abs(gradient).max())
-    assert np.linalg.eigvalsh(H).min() > 0
-
-
 def test_a_subset_is_the_score_of_its_points():
     score = FastScore(FRAMES, nominal(), CONFIG)
     T = POSES[1]

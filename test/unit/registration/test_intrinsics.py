@@ -43,7 +43,7 @@ def calibrated(scene: Scene, seen_by: Camera, box: SearchBox | None = BOX, confi
     """The result with another camera."""
     calibrator = Calibrator(seen_by, update(config, options))
     start = scene.off(([0.4, -0.3, 0.2], [0.03, -0.02, 0.04]))
-    return calibrator.calibrate([replace(f, camera=seen_by) for f in scene.frames], start, box)
+    return calibrator.calibrate([replace(f, camera=seen_by) for f in scene.frames[:3]], start, box)
 
 
 # --- given ----------------------------------------------------------------------------------------------------------------
@@ -73,11 +73,11 @@ def test_another_principal_point_is_a_turn_of_the_camera_that_is_stated(scene):
 
 def test_of_images_that_are_said_to_be_rectified_the_refusal_says_how_to_take_them_as_raw(scene):
     camera = wrong(scene.camera, -0.04)
-    refused = calibrated(scene, replace(camera, said_rectified=True))
+    refused = calibrated(scene, replace(camera, said_rectified=True), None)
     assert refused.refusal is RefusalCode.WRONG_INTRINSICS
     assert "; the images are taken for rectified, but camera_info has a distortion" in refused.reason
     assert "--no-rectified, or image_is_rectified: false to the node" in refused.reason
-    assert "--no-rectified" not in calibrated(scene, camera).reason
+    assert "--no-rectified" not in calibrated(scene, camera, None).reason
 
 
 def test_right_intrinsics_are_estimated_as_given(scene):
@@ -158,15 +158,14 @@ def test_they_are_checked_where_it_is_wanted(scene):
     ("flip", "wrong_transform", "size", "cause"),
     [
         ((1,), np.asarray, 1.0, Cause.MIRRORED_IMAGE),
-        ((0, 1), np.asarray, 1.0, Cause.ROTATED_IMAGE),
         ((), se3.inverse, 1.0, Cause.INVERSE_TRANSFORM),
         ((), np.asarray, 1.25, Cause.OTHER_CAMERA),
     ],
 )
 def test_where_nothing_matches_what_was_mixed_up_is_named(scene, flip, wrong_transform, size, cause):
     camera = replace(scene.camera, K=scene.camera.K * np.array([[size, 1, size], [1, size, size], [1, 1, 1]]))
-    frames = [replace(f, image=np.ascontiguousarray(np.flip(f.image, flip)), camera=camera) for f in scene.frames]
-    result = Calibrator(camera, QUICK).calibrate(frames, wrong_transform(scene.truth), BOX)
+    frames = [replace(f, image=np.ascontiguousarray(np.flip(f.image, flip)), camera=camera) for f in scene.frames[:2]]
+    result = Calibrator(camera, QUICK).calibrate(frames, wrong_transform(scene.truth))
     assert_not_used(result, result.initial)
     assert result.cause is cause, result.reason
 

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -149,16 +145,6 @@ def test_a_pose_that_is_no_pose_reads_nothing_outside_the_maps(camera, bad):
     T[:3, :3] = bad
     assert np.isfinite(compiled.samples(T, 1)).all()
     assert np.isfinite(compiled.values(T[None], 1)).all()
-
-
-def test_the_view_of_c_is_that_of_python():
-    """A field more on one side would shift all that follow."""
-    view = sampling._View
-    source = Path(sampling.__file__).with_name("kernel.c").read_text(encoding="utf-8")
-    struct = re.sub(r"/\*.*?\*/", "", source[source.index("typedef struct {") : source.index("} View;")], flags=re.DOTALL)
-    declared = re.findall(r"(\w+)\s*[,;]", struct)
-    assert declared == [field[0] for field in view._fields_]
-    assert ctypes.sizeof(view) == 9 * 8 + 10 * 4  # the last of them fills up to a multiple of 8
 
 
 def test_without_a_kernel_of_these_sources_it_is_said_how_to_build_one(monkeypatch, tmp_path):

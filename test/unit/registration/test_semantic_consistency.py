@@ -51,31 +51,23 @@ def test_semantic_consistency_is_highest_at_the_truth(source, features):
     assert semantic_likelihood_ratio(None, source.reference) == 1.0
 
 
-def verdict(features, T: np.ndarray, share: float, config: Config = SOURCE):
-    """Status of a refinement from T for which this multiple of its p value is accepted without classes, and the reason."""
-    p_value = Calibrator(features[0].camera, config).estimate(features, T).evidence.p_value
-    accepting = update(config, {"refine": {"max_p_value": share * p_value}})
-    result = Calibrator(features[0].camera, accepting).estimate(features, T)
-    return result.status, result.reason
-
-
 def test_the_classes_decide_where_the_edges_leave_a_doubt(source, features):
-    at = source.reference
-    unseen = [replace(f, view=None) for f in features]
-    assert verdict(features, at, 0.5)[0] == "converged"
-    assert verdict(unseen, at, 0.5)[0] == "refused"
-    assert verdict(unseen, at, 2)[0] == "converged"
-    status, reason = verdict(features, at, 0.1)  # too little whatever the classes say
-    assert status == "refused"
-    assert "the optimum may be chance" in reason
-    assert "labelled points" not in reason
-    # Classes of another place: the same edges are not enough any more.
-    mixed = [replace(f, view=replace(f.view, classes=np.roll(f.view.classes, 160, axis=1))) for f in features]
-    assert verdict(mixed, at, 0.5)[0] == "refused"
-    status, reason = verdict(mixed, at, 2)
-    assert status == "refused"
-    assert "few labelled points meet pixels of their class" in reason
-    assert verdict(mixed, at, 10)[0] == "converged"
+    """Of a refinement for which a multiple of its p value is accepted without classes."""
+    at, unseen = source.reference, [replace(f, view=None) for f in features]
+    mixed = [replace(f, view=replace(f.view, classes=np.roll(f.view.classes, 160, axis=1))) for f in features]  # of another place
+    for given, rows in (
+        (features, [(0.5, CONVERGED, ""), (0.1, REFUSED, "the optimum may be chance")]),  # too little whatever the classes say
+        (unseen, [(0.5, REFUSED, ""), (2, CONVERGED, "")]),
+        # The same edges are not enough any more.
+        (mixed, [(0.5, REFUSED, ""), (2, REFUSED, "few labelled points meet pixels of their class"), (10, CONVERGED, "")]),
+    ):
+        p_value = Calibrator(source.camera, SOURCE).estimate(given, at).evidence.p_value
+        for share, status, says in rows:
+            accepting = update(SOURCE, {"refine": {"max_p_value": share * p_value}})
+            result = Calibrator(source.camera, accepting).estimate(given, at)
+            assert result.status == status, (share, result.reason)
+            assert says in result.reason
+            assert given is mixed or "labelled points" not in result.reason
 
 
 def test_the_search_is_seeded_by_classes_too(source, features):

@@ -115,7 +115,7 @@ EXPORTS = {
         names_of_tensors=("pixel_values", "logits"),
     ),
     # 150 classes cannot be told within half a cell of a border.
-    "SegFormer ADE20K": case("logits 1 150 128 128", 150, inputs="1 3 512 512", stride=4, margin=20, size=(500, 520)),
+    "SegFormer ADE20K": case("logits 1 150 64 64", 150, inputs="1 3 256 256", stride=4, margin=20, size=(500, 520)),
     "EdgeNets": case("o 1 20 256 512", 20, [*CITYSCAPES, "background"]),
     "raw ids": case("o 1 34 256 512", 34, CITYSCAPES_RAW),
     "raw ids chosen": case("argmax 1 256 512", 34, CITYSCAPES_RAW),

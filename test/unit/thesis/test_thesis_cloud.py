@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers import GROUND, HEIGHT, Box, Plane, Spinner
-from sklearn.cluster import DBSCAN
 from thesis_constants import thesis_with
 
 from calib_ros.errors import TooFewFeaturesError
@@ -198,6 +197,8 @@ def test_a_voxel_counts_for_all_its_points_and_lies_in_their_middle():
 @pytest.mark.parametrize("voxel", [0.0, 0.15])
 def test_clusters_are_those_of_dbscan(min_points, voxel):
     """Against scikit-learn, on scattered points: core points, points on borders between clusters, noise."""
+    from sklearn.cluster import DBSCAN  # takes a second of every process that collects this file
+
     xyz = np.random.default_rng(min_points).uniform(0, 6, (1500, 3)).astype(np.float32)
     few, weight, member = _downsampled(xyz, voxel)
     expected = DBSCAN(eps=0.5, min_samples=min_points).fit(few, sample_weight=weight).labels_[member]

@@ -39,7 +39,6 @@ def test_a_4x4_picture_is_equalised_as_computed_by_hand():
     # H = 6, 5, 4, 1; CDF = 6, 11, 15, 16; 255 * CDF / 16 = 95.625, 175.3125, 239.0625, 255.
     expected = [[96, 96, 96, 96], [96, 96, 175, 175], [175, 175, 175, 239], [239, 239, 239, 255]]
     assert equalize(gray, "global").tolist() == expected
-    assert equalize(gray, "global").tolist() == expected
     # The darkest level is part of the distribution: 255 * 2 / 4 = 127.5, rounded to even; cv2.equalizeHist leaves it at 0.
     assert equalize(np.array([[0, 0], [255, 255]], np.uint8), "global").tolist() == [[128, 128], [255, 255]]
     for value in (0, 7, 255):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from thesis_constants import thesis_with
 
 from calib_ros.camera import Camera
 from calib_ros.registration.score.point_score import nearest_per_pixel, project
-from calib_ros_thesis import maps as thesis_maps
 from calib_ros_thesis.cloud import PointAttributes
 from calib_ros_thesis.config import ThesisConfig
 from calib_ros_thesis.image import OPERATORS
@@ -333,11 +330,3 @@ def test_of_the_points_on_a_pixel_the_nearest_is_visible():
     assert np.array_equal(rows * 30 + columns, pixels)
     assert np.array_equal(points, expected)
     assert 500 < len(points) < len(inside)
-
-
-def test_the_rule_of_c_is_that_of_python():
-    """A field more on one side would shift all that follow."""
-    source = Path(thesis_maps.__file__).with_name("kernel.c").read_text(encoding="utf-8")
-    start = source.index("typedef struct {\n    int32_t inverse")
-    struct = re.sub(r"/\*.*?\*/", "", source[start : source.index("} Rule;")], flags=re.DOTALL)
-    assert re.findall(r"(\w+)\s*[,;]", struct) == [field[0] for field in thesis_maps._Rule._fields_]

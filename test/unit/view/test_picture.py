@@ -1,6 +1,8 @@
-"""The picture with the cloud over it."""
+"""The picture with the cloud over it, and the cloud in the colours of the picture."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,7 +13,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.initial_guess import nominal
-from calib_ros_view.session.picture import COLORINGS, GAP, KIND_COLORS, FramePicture, Look, encoded
+from calib_ros_view.session.picture import COLORINGS, GAP, KIND_COLORS, UNSEEN, FramePicture, Look, colored_cloud, encoded
 
 CAMERA = Camera(np.array([[100.0, 0, 100], [0, 100.0, 50], [0, 0, 1]]), 200, 100)
 GRAY = np.full((100, 200, 3), 100, np.uint8)
@@ -96,3 +98,40 @@ def test_before_and_now():
 def test_looks_out_of_range_are_refused(wrong):
     with pytest.raises(BadInputError):
         Look(**wrong)
+
+
+# --- the cloud in the colours of the picture ------------------------------------------------------------------------------
+
+
+def red_and_blue(*points):
+    """A frame whose picture is red on the left, blue on the right (BGR)."""
+    image = np.zeros_like(GRAY)
+    image[:, :100, 2] = image[:, 100:, 0] = 255
+    return replace(frame(*points), image=image)
+
+
+def test_points_take_the_colour_under_them():
+    _, rgb, seen = colored_cloud(red_and_blue((10, 2, 0), (10, -2, 0), (-10, 0, 0)), nominal())
+    assert rgb.tolist() == [[255, 0, 0], [0, 0, 255], list(UNSEEN)]
+    assert seen.tolist() == [True, True, False]
+    near, behind, beside = (5.0, 1.0, 0.0), (20.0, 4.0, 0.0), (20.0, -4.0, 0.0)
+    assert colored_cloud(red_and_blue(near, behind, beside), nominal())[2].tolist() == [True, False, True]
+
+
+def test_grey_pictures_and_lost_returns():
+    one = red_and_blue((10, 2, 0), (np.nan, 0, 0), (0, 0, 0))
+    _, rgb, _ = colored_cloud(replace(one, image=one.image[..., 2]), nominal())
+    assert rgb.tolist() == [[255, 255, 255]]
+    assert len(colored_cloud(frame(), nominal())[0]) == 0
+
+
+def test_of_many_points_those_in_view_are_kept_and_the_same_every_time(street):
+    T = street[0].reference
+    xyz, _, seen = colored_cloud(street[0], T, most=10**9)
+    assert len(xyz) == len(street[0].cloud.finite())
+    most = int(seen.sum()) + 500
+    some, _, some_seen = colored_cloud(street[0], T, most)
+    assert len(some) == most
+    assert some_seen.sum() == seen.sum()
+    assert np.array_equal(some, colored_cloud(street[0], T, most)[0])
+    assert colored_cloud(street[0], T, 300)[2].all()
