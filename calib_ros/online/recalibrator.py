@@ -170,7 +170,7 @@ class Recalibrator:
             tracker, keyframes = self.tracker, self.keyframes
             fault = None if tracker.sensor_problem is None else tracker.sensor_problem.fault
             counted = Counted(
-                *(len(keyframes), keyframes.per_s(self.schedule.newest), tracker.fused_keyframes),
+                *(len(keyframes), keyframes.per_s(self.schedule.newest), tracker.filter.keyframes),
                 *(tracker.missing, tracker.confirmations, fault),
             )
             return advise((extrinsic or tracker.current).result, self.config, camera, counted)

@@ -8,8 +8,7 @@ from tracked import STILL, T, assessment, confirming, consistent, estimate, turn
 
 from calib_ros.config import Config, TrackerConfig, update
 from calib_ros.online.monitor import Verdict
-from calib_ros.online.tracker import RECOVERING, Tracker
-from calib_ros.online.tracker_states import NOTHING
+from calib_ros.online.tracker import NOTHING, RECOVERING, Tracker
 from calib_ros.result import CONVERGED, INITIAL, TENTATIVE, Result
 
 

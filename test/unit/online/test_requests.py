@@ -7,8 +7,7 @@ from concurrent.futures import CancelledError, Future
 import pytest
 
 from calib_ros.errors import CalibrationError
-from calib_ros.online.requests import ESTIMATE, MAX_WAITING, Pending, Requests
-from calib_ros.online.worker import Cancelled
+from calib_ros.online.worker import ESTIMATE, MAX_WAITING, Cancelled, Pending, Requests
 
 OUTCOME = "outcome"
 
