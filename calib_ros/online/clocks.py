@@ -10,6 +10,7 @@ import numpy as np
 from calib_ros.arrays import Matrix
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
+from calib_ros.frame import NANOSECONDS
 from calib_ros.online.monitor import MIN_TWIST
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.features import FrameFeatures, at_time_offset
@@ -32,12 +33,6 @@ def usable_clocks(config: Config, known: Result) -> Result:
     return replace(known, time_offset_s=None, time_offset_sigma_s=None, stamping=None)
 
 
-def states_same_clocks(before: MotionConfig, after: MotionConfig) -> bool:
-    """Whether what a user says of the clocks is the same, so that what was found of them still holds."""
-    names = ("time_offset", "time_offset_s", "stamping", "spin", "stamp_azimuth_deg", "stamp_at")
-    return all(getattr(before, name) == getattr(after, name) for name in names)
-
-
 def with_clocks(config: Config, known: Result) -> Config:
     """The configuration with the time offset, how well it is known, and the stamping of a result that knows them."""
     known, motion = usable_clocks(config, known), config.motion
@@ -50,6 +45,16 @@ def with_clocks(config: Config, known: Result) -> Config:
     if known.time_offset_sigma_s is not None:  # stamps scatter however well the offset is known
         sigma = min(max(known.time_offset_sigma_s, min(STAMP_SCATTER_S, sigma)), MAX_OFFSET_S)
     return replace(config, motion=replace(motion, time_offset_s=offset, time_offset_sigma_s=sigma))
+
+
+def with_clocks_kept(config: Config, stated: MotionConfig, used: MotionConfig, known: Result) -> Config:
+    """Another configuration with what was found of the clocks, unless it states other ones. stated: before. used: what estimates
+    have made of it. known: the newest."""
+    if config.motion == stated:
+        return replace(config, motion=used)
+    names = ("time_offset", "time_offset_s", "stamping", "spin", "stamp_azimuth_deg", "stamp_at")
+    same = all(getattr(stated, name) == getattr(config.motion, name) for name in names)
+    return with_clocks(config, known) if same else config
 
 
 def with_clocks_moved(features: FrameFeatures, before: MotionConfig, after: MotionConfig) -> FrameFeatures:
@@ -69,15 +74,18 @@ class SeenMotion:
         self.newest: int | None = None
         self._lowest = self._highest = np.full(6, np.nan)
 
-    def learn(self, keyframes: Sequence[FrameFeatures]) -> None:
-        """Those in an estimate, oldest first."""
-        self.newest = keyframes[-1].stamp
+    def learn(self, keyframes: Sequence[FrameFeatures]) -> float:
+        """Those in an estimate, oldest first; returns how much newer they are than those in the last one, s, 0 = unknown."""
+        if not keyframes:
+            return 0.0
+        before, self.newest = self.newest, keyframes[-1].stamp
         if len(twists := _twists(keyframes)):
             self._lowest, self._highest = twists.min(axis=0), twists.max(axis=0)
+        return 0.0 if before is None else (self.newest - before) / NANOSECONDS
 
-    def covers(self, keyframes: Sequence[FrameFeatures]) -> bool:
-        """Whether none of these moves otherwise, by what counts as a motion."""
-        twists = _twists(keyframes)
+    def covers(self, keyframes: Sequence[FrameFeatures], new: int) -> bool:
+        """Whether none of the newest `new` keyframes moves otherwise, by what counts as a motion."""
+        twists = _twists(keyframes[max(len(keyframes) - new, 0) :])
         return bool((twists >= self._lowest - MIN_TWIST).all() and (twists <= self._highest + MIN_TWIST).all())
 
 

@@ -190,7 +190,11 @@ class Synchronizer:
         pairs: list[tuple[Any, Any]] = []
         settled_images = settled_clouds = 0
         for i, c in zip(*nearest_pairs(at_image, at_cloud, self.tolerance), strict=True):
-            if self._nearer_may_come(int(at_image[i]), int(at_cloud[c])):
+            # A message still to come may be nearer to either than they are to each other.
+            image, cloud = int(at_image[i]), int(at_cloud[c])
+            if image < cloud and self._images.earliest_next() < 2 * cloud - image:
+                break
+            if cloud < image and self._clouds.earliest_next() + self.cloud_offset < 2 * image - cloud:
                 break
             pairs.append((images[i][1], clouds[c][1]))
             settled_images, settled_clouds = int(i) + 1, int(c) + 1
@@ -199,13 +203,6 @@ class Synchronizer:
         self.counts.unpaired_clouds += settled_clouds - len(pairs)
         del images[:settled_images], clouds[:settled_clouds]
         return pairs
-
-    def _nearer_may_come(self, image_moment: int, cloud_moment: int) -> bool:
-        """True if a message still to come may be nearer to either than they are to each other."""
-        if image_moment < cloud_moment:
-            return self._images.earliest_next() < 2 * cloud_moment - image_moment
-        next_cloud = self._clouds.earliest_next() + (self.cloud_offset or 0)
-        return cloud_moment < image_moment and next_cloud < 2 * image_moment - cloud_moment
 
 
 class ClockDifference:

@@ -377,9 +377,8 @@ class Tracker:
         needed, agreeing = self.confirmations, int(self._agreed)
         if self.lost:
             agreeing = self._agreeing_in_a_row + min(self._accepted_since_moved, 1)
-        return Confirmations(
-            max(needed.keyframes - self._consistent_keyframes, 0), max(needed.estimates - agreeing, 0), needed.clocks
-        )
+        keyframes, estimates = needed.keyframes - self._consistent_keyframes, needed.estimates - agreeing
+        return Confirmations(max(keyframes, 0), max(estimates, 0), needed.clocks)
 
     # ---- what is published --------------------------------------------------------------------------------------------
 
@@ -410,8 +409,7 @@ class Tracker:
         elif result.converged and not self._accepted and not self._consistent_keyframes:
             result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")
         told = assessment or Assessment(Verdict.INCONCLUSIVE, "", math.nan)
-        usable = self._is_usable(result.status)
-        monitored = told.message, told.p_value, usable, self._estimated_at, told.since_stamp
+        monitored = told.message, told.p_value, self._is_usable(result.status), self._estimated_at, told.since_stamp
         return Extrinsic(result, self._innovation, self._accepted, *monitored)
 
     def _is_usable(self, status: str) -> bool:
