@@ -1,11 +1,13 @@
-"""What is done while nothing is known of the extrinsic: guesses from the vehicle's motion, and from the classes of keyframes."""
+"""What is done while nothing is known of the extrinsic: guesses from the vehicle's motion, and from the classes of keyframes; and
+where nothing matches: is something mixed up?"""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -15,9 +17,10 @@ from calib_ros.config import Config
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.registration.acceptance.refusal import joined
-from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import CLOUD, IMAGE, PoseHypothesis
+from calib_ros.registration.calibrator import NO_MATCH, Calibrator
+from calib_ros.registration.classes import ALL, CLASSES, CLOUD, IMAGE, FrameSemantics, PoseHypothesis
 from calib_ros.registration.features import FrameFeatures, views_of
+from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, MOTION
 from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.motion_guess.registration import best_registration, better
@@ -29,10 +32,12 @@ NOMINAL = "nominal"  # of initial.method
 RUN_S, SPACING_S = 5.0, 0.15  # s of frames whose motion is used, and between them; at 10 Hz every second one
 ENOUGH_S = 0.8 * RUN_S
 NEW_S = 0.5 * RUN_S  # s of further frames after a guess that failed, before the next
+JUDGED_AFTER = 3  # estimates where nothing matches: then the judge is asked once what may be mixed up
 
 
 class FirstGuess:
-    """Finds the first extrinsic. `add` may be called from another thread than `estimate`.
+    """Finds the first extrinsic, and asks what is mixed up where estimates match nothing. `add` may be called from another thread
+    than `estimate`.
 
     start: what stands in until something is known, if it is nominal. pending: nothing is known.
     """
@@ -45,6 +50,7 @@ class FirstGuess:
         self._run: deque[Frame] = deque()
         self._tried_at: int | None = None  # stamp of the newest frame of the last guess from motion that failed
         self._failure = ""  # why it did
+        self.forget_unmatched()
 
     @property
     def _wanted(self) -> bool:
@@ -161,6 +167,31 @@ class FirstGuess:
             return self._insufficient(initial, missing or f"waiting for the classes of {needed} keyframes{so_far}")
         return calibrator.guess(features, progress=progress, method=self.config.initial.method)
 
+    def forget_unmatched(self) -> None:
+        """Other keyframes come."""
+        self._unmatched = 0  # estimates since the last one that converged
+        self._mixed_up: Result | None = None  # what was found of these
+
+    def explained(
+        self,
+        result: Result,
+        calibrator: Calibrator,
+        given: tuple[Sequence[FrameFeatures], SearchBox | None, Callback | None],
+        start: Result,
+    ) -> Result:
+        """The result of an estimate; where nothing has matched several times, with the cause that was found then, if any. given:
+        what it was estimated from, see `Calibrator.explained`. start: the initial extrinsic."""
+        if result.converged:
+            self.forget_unmatched()
+        if result.refusal not in NO_MATCH:
+            return result
+        if self._unmatched + 1 == JUDGED_AFTER:
+            guessed = start.origin in (InitialSource.NOMINAL, InitialSource.SEMANTIC, InitialSource.MOTION)
+            self._mixed_up = calibrator.explained(result, *given, stated=not guessed)
+        self._unmatched += 1
+        found = self._mixed_up
+        return result if found is None or found.cause is None else replace(result, cause=found.cause, reason=found.reason)
+
     @staticmethod
     def _insufficient(initial: Result, why: str) -> Result:
         reason = f"nothing is known of the extrinsic: {why}" if why else "nothing is known of the extrinsic"
@@ -170,3 +201,21 @@ class FirstGuess:
     def _lasted(run: Sequence[Frame] | deque[Frame]) -> float:
         """s from the first to the last frame."""
         return (run[-1].moment_of_cloud - run[0].moment_of_cloud) / NANOSECONDS if run else 0.0
+
+
+def classes_of(
+    frame: Frame,
+    calibrator: Calibrator,
+    reach: tuple[Sequence[Transform], SearchBox] | None,
+    in_doubt: bool,
+    cancelled: Callable[[], bool],
+) -> FrameSemantics:
+    """Semantics of a keyframe, which takes seconds: for a first guess, or for estimates.
+
+    reach: (4, 4) extrinsics at which the box of a search begins, outside of which points need no classes; None = first guess.
+    in_doubt: the last estimate was. cancelled: see Segmentation.
+    """
+    if reach is None:
+        return calibrator.segmentation(frame, cancelled, CLASSES, None)
+    points = reduce(np.union1d, [points_in_reach(frame, calibrator.extract, T, reach[1]) for T in reach[0]])
+    return calibrator.segmentation(frame, cancelled, ALL if in_doubt else calibrator.kinds_without_doubt or ALL, points)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
-from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
@@ -73,9 +72,9 @@ class Glance:
             return False  # the frame itself is told elsewhere
         if loss is None:
             return False
-        strikes = len(self._losses) >= LEAST_KEPT and loss > max(self._losses)
+        self.struck = len(self._losses) >= LEAST_KEPT and loss > max(self._losses)
         self._losses.append(loss)
-        return strikes
+        return self.struck
 
 
 def match_loss(frame: Frame, T: Transform, config: Config) -> float | None:
@@ -99,7 +98,13 @@ def nearness_picture(frame: Frame, T: Transform, config: Config) -> Map:
     width = min(WIDTH, camera.width)
     scale = width / camera.width
     height = max(round(camera.height * scale), 1)
-    seen = in_view(xyz, T, camera, config.lidar.min_range)
+    # Of what the camera sees, or nearly so, from lidar.min_range on. Lost returns are not among them.
+    centre = (-T[:3, :3].T @ T[:3, 3]).astype(np.float32)
+    z = xyz @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
+    square = (xyz * xyz) @ np.ones(3, np.float32)
+    distance = np.sqrt(np.maximum(square - 2 * (xyz @ centre) + centre @ centre, 0))  # from the camera
+    least = np.float32(np.cos(min(np.deg2rad(camera.field_deg) / 2 + BORDER, np.pi)))
+    seen = np.flatnonzero((z > least * distance) & (square >= config.lidar.min_range**2))
     points = xyz[seen].astype(float)
     if (twist := used_twist(frame, config.motion)) is not None:
         time = None if frame.cloud.time is None else frame.cloud.time[seen]
@@ -112,25 +117,16 @@ def nearness_picture(frame: Frame, T: Transform, config: Config) -> Map:
     return picture.reshape(height, width)
 
 
-def in_view(xyz: NDArray[np.float32], T: Transform, camera: Camera, min_range: float) -> NDArray[np.intp]:
-    """Which points (n, 3) a camera at T (4, 4) sees, or nearly so, from min_range on. Lost returns are not among them."""
-    centre = (-T[:3, :3].T @ T[:3, 3]).astype(np.float32)
-    z = xyz @ T[2, :3].astype(np.float32) + np.float32(T[2, 3])
-    square = (xyz * xyz) @ np.ones(3, np.float32)
-    distance = np.sqrt(np.maximum(square - 2 * (xyz @ centre) + centre @ centre, 0))  # from the camera
-    least = np.float32(np.cos(min(np.deg2rad(camera.field_deg) / 2 + BORDER, np.pi)))
-    return np.flatnonzero((z > least * distance) & (square >= min_range**2))
-
-
 def depth_edges(nearness: Map) -> tuple[Map, Map]:
     """Edges of depth, two (h, w) in 0..1, from inverse distances (h, w): across and down, on the nearer side of each jump."""
-    gap = usual_gap(nearness.T)
-    level = cv2.morphologyEx(nearness, cv2.MORPH_CLOSE, np.ones((closing(gap), closing(usual_gap(nearness))), np.uint8))
+    gaps = usual_gap(nearness.T), usual_gap(nearness)
+    kernel = np.ones([min(max(gap | 1, 3), MOST_CLOSED) for gap in gaps], np.uint8)
+    level = cv2.morphologyEx(nearness, cv2.MORPH_CLOSE, kernel)
     np.log(level, out=level, where=level > 0)
     across, down = np.zeros_like(level), np.zeros_like(level)
     _mark_jumps(level, FLAT, across)
-    if gap <= 2 * BLUR:  # rings farther apart do not tell where between them an edge lies
-        _mark_jumps(level.T, FLAT * gap, down.T)
+    if gaps[0] <= 2 * BLUR:  # rings farther apart do not tell where between them an edge lies
+        _mark_jumps(level.T, FLAT * gaps[0], down.T)
     return across, down
 
 
@@ -147,11 +143,6 @@ def usual_gap(picture: Map) -> int:
     row, column = np.nonzero(picture)
     gaps = np.diff(column)[np.diff(row) == 0]
     return int(np.percentile(gaps, GAPS)) if len(gaps) else 1
-
-
-def closing(gap: int) -> int:
-    """Size of the kernel, px, that closes such gaps."""
-    return min(max(gap | 1, 3), MOST_CLOSED)
 
 
 def image_edges(image: NDArray[np.uint8], config: Config) -> Map:

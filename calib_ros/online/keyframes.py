@@ -20,7 +20,7 @@ from calib_ros.config import Config, MotionConfig, OnlineConfig, TrackerConfig
 from calib_ros.errors import BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.accumulation import Accumulator, Stamped
-from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
+from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion, unknown_motion_s
 from calib_ros.online.pacing import is_due
 from calib_ros.registration.features import FrameFeatures
 
@@ -78,13 +78,13 @@ class KeyframeSelector:
 
 class Batch(NamedTuple):
     """Keyframes of an estimate, oldest first. new: keyframes since the one before. unfused: how many of the buffer are in no
-    accepted estimate yet. unfused_features: how many of the estimate's own."""
+    accepted estimate yet. share_new: how many of the estimate's own."""
 
     features: Sequence[FrameFeatures]
     generation: int
     new: int
     unfused: int
-    unfused_features: int
+    share_new: float
 
 
 class KeyframeBuffer:
@@ -99,6 +99,7 @@ class KeyframeBuffer:
         self.features: deque[FrameFeatures] = deque(maxlen=size)
         self.seen = self.new = self.unfused = self.generation = 0
         self.incomplete = False
+        self._enough: tuple[tuple[object, ...], bool] | None = None  # the last answer, and of what
 
     def __len__(self) -> int:
         return len(self.features)
@@ -119,6 +120,15 @@ class KeyframeBuffer:
         ids = set(map(id, chosen))
         return sum(id(own) in ids for own in list(self.features)[-count:]) if count > 0 else 0
 
+    def enough(self, least: int, extrinsic: object, informative: Callable[[], list[FrameFeatures]]) -> bool:
+        """Whether there are at least so many informative keyframes, new ones among them. extrinsic: that they are informative at.
+        What is the same as before is not counted anew: an estimate that waits for the budget asks at every frame."""
+        state = self.generation, self.seen, self.new, least, extrinsic
+        if self._enough is None or self._enough[0] != state:
+            chosen = informative()
+            self._enough = state, len(chosen) >= least and self.newest_among(chosen, self.new) > 0
+        return self._enough[1]
+
     def per_s(self, now: int | None) -> float:
         """New keyframes per second from the oldest one kept until now, ns; 0 = unknown."""
         elapsed = (now - self.features[0].stamp) / NANOSECONDS if now is not None and len(self.features) > 1 else 0.0
@@ -127,7 +137,8 @@ class KeyframeBuffer:
     def batch(self, chosen: Sequence[FrameFeatures]) -> Batch:
         """The chosen keyframes, for an estimate that begins now."""
         new, self.new = self.new, 0
-        return Batch(chosen, self.generation, new, self.unfused, self.newest_among(chosen, self.unfused))
+        share_new = min(self.newest_among(chosen, self.unfused) / max(len(chosen), 1), 1.0)
+        return Batch(chosen, self.generation, new, self.unfused, share_new)
 
     def give_back(self, batch: Batch) -> None:
         """The estimate ended without a result: what was new still is."""
@@ -170,7 +181,7 @@ class KeyframeBuffer:
 
     def resize(self, size: int) -> None:
         """Change the capacity; the oldest keyframes leave if there are more."""
-        self.features = deque(self.features, size)
+        self.features, self._enough = deque(self.features, size), None
 
     def clear(self) -> None:
         """Drop all keyframes."""
@@ -227,7 +238,7 @@ class EgoMotion:
     """Twist of the LiDAR from scan to scan, for keyframes that come without odometry. Not thread-safe.
 
     config may be replaced at any time. last: the last estimate, None before the first. missing: a line for a person if
-    small_gicp is not installed, else "". left_out: keyframes that were given up, see `check_known`. estimate: that of
+    small_gicp is not installed, else "". left_out: keyframes that were given up, see `unknown_s`. estimate: that of
     `estimate_motion`, or one that remembers.
     """
 
@@ -303,12 +314,13 @@ class EgoMotion:
             return False
         return 0 <= self._known[0] - keyframe.stamp <= REMEMBERED_S * NANOSECONDS
 
-    def check_known(self, frame: Frame, seconds: float, limits: TrackerConfig) -> None:
-        """BadTimesError if a frame's motion is unknown although the vehicle moved shortly before, in `seconds` (see
-        `unknown_motion_s`) by more than a converged extrinsic may be off: nobody knows how the scan is bent."""
-        stamp = frame.cloud_stamp
+    def unknown_s(self, frame: Frame, T: NDArray[np.float64], limits: TrackerConfig) -> float:
+        """For how long the motion of a frame seen at T (4, 4) is unknown, see `unknown_motion_s`. BadTimesError if it is although
+        the vehicle moved shortly before, meanwhile by more than a converged extrinsic may be off: nobody knows how the scan is
+        bent."""
+        stamp, seconds = frame.cloud_stamp, unknown_motion_s(frame, T, self.config)
         if stamp is None or self._known is None or not self.moves_in(seconds, limits):
-            return
+            return seconds
         since, twist = (stamp - self._known[0]) / NANOSECONDS, self._known[1]
         if 0 <= since <= REMEMBERED_S:
             self.left_out += 1
@@ -318,6 +330,7 @@ class EgoMotion:
                 f"keyframe left out: the vehicle moved at {speed:.1f} m/s and {rate:.1f} deg/s {since:.1f} s ago, and its motion "
                 f"now is unknown ({reason}); if this lasts, the LiDAR's messages get lost"
             )
+        return seconds
 
 
 def feature_config(config: Config) -> tuple[object, ...]:

@@ -29,10 +29,9 @@ from calib_ros.online.common import Common
 from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Problem, Remarks
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Work
-from calib_ros.online.pairing.pairing import Intake, Pairing
+from calib_ros.online.pairing import Intake, Pairing
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.requests import ESTIMATE, Pending, Requests
-from calib_ros.online.worker import Worker
+from calib_ros.online.worker import ESTIMATE, Pending, Requests, Worker
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.progress import Callback
 from calib_ros.result import Extrinsic, Result

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +13,14 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config, SemanticsConfig
 from calib_ros.config.online import CONTINUOUS
 from calib_ros.datasets.recent import Recent
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import Frame
 from calib_ros.intrinsics import RefinedCamera
-from calib_ros.lidar.ego_motion import estimate_motion, unknown_motion_s
+from calib_ros.lidar.ego_motion import estimate_motion
 from calib_ros.lidar.range_image import require_returns
-from calib_ros.online.clocks import SeenMotion, states_same_clocks, usable_clocks, with_clocks, with_clocks_moved
+from calib_ros.online.clocks import SeenMotion, usable_clocks, with_clocks, with_clocks_kept, with_clocks_moved
 from calib_ros.online.coach import Advice, Counted, advise
 from calib_ros.online.common import SharedScans
-from calib_ros.online.first_guess import FirstGuess
+from calib_ros.online.first_guess import FirstGuess, classes_of
 from calib_ros.online.glance import Glance
 from calib_ros.online.keyframes import Batch, EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, feature_config
 from calib_ros.online.monitor import Monitor, Verdict
@@ -30,16 +29,14 @@ from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
 from calib_ros.registration.acceptance.checks import leaves_doubt
-from calib_ros.registration.calibrator import NO_MATCH, Calibrator
-from calib_ros.registration.classes import ALL, CLASSES, Segmentation
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
-from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, RefusalCode, Result
+from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, RefusalCode, Result
 
-JUDGED_AFTER = 3  # estimates where nothing matches: then the judge is asked once what may be mixed up
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 # p value of a keyframe that asks for an estimate at rest: by chance, of the two tests at each, one rest in twenty ends early.
@@ -77,12 +74,11 @@ class Recalibrator:
         pictures: Recent | None = None,
         models: Callable[[SemanticsConfig], Segmentation] = models_of,
     ) -> None:
+        self.camera, self._configured = camera, config or Config()
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
-        self._configured = config or Config()
         start = usable_clocks(self._configured, start)
         current = None if current is None else usable_clocks(self._configured, current)
         self.config = with_clocks(self._configured, current or start)
-        self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth()
         self._scans, self._pictures, self._models = scans, pictures, models
@@ -91,20 +87,14 @@ class Recalibrator:
         self.segmentation = models(self.config.semantics)
         self._to_segment: tuple[Frame, FrameFeatures] | None = None  # the newest keyframe: models are slower than a drive
         self.segmented: tuple[int, dict[str, float]] = 0, {}  # keyframes, and s that the models took for the last one
-        self.motion = EgoMotion(
-            self.config.motion, self.config.lidar.accumulate_s, estimate_motion if scans is None else scans.motion
-        )
+        estimate = estimate_motion if scans is None else scans.motion
+        self.motion = EgoMotion(self.config.motion, self.config.lidar.accumulate_s, estimate)
         self.speed_gate = speed_gate or SpeedGate(self.config.online)
-        self.schedule = Schedule(self.config.online, in_step)
-        self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
-        self._calibrator = self._calibrator_for(self.config)
+        self.schedule, self.keyframes = Schedule(self.config.online, in_step), KeyframeBuffer(self.config.online.buffer_size)
         self._lock, self._calibrator_lock = threading.Lock(), threading.Lock()
+        self._calibrator = self._calibrator_for(self.config)
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
-        self._in_doubt = True  # the last estimate was, or there was none
-        self._unmatched = 0  # estimates since the last one that converged
-        self._mixed_up: Result | None = None  # what was found of these
-        self._seen_motion = SeenMotion()
-        self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
+        self._in_doubt, self._seen_motion = True, SeenMotion()  # the last estimate was, or there was none; how it moved
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
         self.refined_camera: RefinedCamera | None = None  # by the newest estimate that tells of it
         self.first_guess = FirstGuess(self.config, self.tracker.initial)
@@ -132,8 +122,8 @@ class Recalibrator:
     @property
     def segments_keyframes(self) -> bool:
         """True if there are models to segment keyframes, and estimates that want it."""
-        wanted = self.first_guess.needs_classes or self._in_doubt or not self.calibrator.classes_in_doubt_only
-        return self.segmentation.active and wanted
+        needed = self.first_guess.needs_classes or self._in_doubt
+        return self.segmentation.active and (needed or not self.calibrator.classes_in_doubt_only)
 
     @property
     def at_rest(self) -> bool:
@@ -148,10 +138,8 @@ class Recalibrator:
 
     def _waits_for_motion(self) -> bool:
         """Whether another estimate would tell nothing new, as long as all new keyframes move as those in the last one."""
-        if not (self.tracker.awaits_motion and self._keyframes_fit):
-            return False
-        keyframes = list(self.keyframes.features)
-        return self._seen_motion.covers(keyframes[max(len(keyframes) - self.keyframes.new, 0) :])
+        known = self.tracker.awaits_motion and self._keyframes_fit
+        return known and self._seen_motion.covers(list(self.keyframes.features), self.keyframes.new)
 
     def newest(self) -> FrameFeatures | None:
         """Features of the newest keyframe, None before the first."""
@@ -169,10 +157,8 @@ class Recalibrator:
         with self._lock:
             tracker, keyframes = self.tracker, self.keyframes
             fault = None if tracker.sensor_problem is None else tracker.sensor_problem.fault
-            counted = Counted(
-                *(len(keyframes), keyframes.per_s(self.schedule.newest), tracker.fused_keyframes),
-                *(tracker.missing, tracker.confirmations, fault),
-            )
+            seen = len(keyframes), keyframes.per_s(self.schedule.newest), tracker.filter.keyframes
+            counted = Counted(*seen, tracker.missing, tracker.confirmations, fault)
             return advise((extrinsic or tracker.current).result, self.config, camera, counted)
 
     def ready(self) -> bool:
@@ -182,7 +168,8 @@ class Recalibrator:
                 return False
             waits = self._waits_for_motion()
             urgent = self.tracker.lost or (self.tracker.tentative and not waits)
-            return self.schedule.due(self.at_rest, waits, urgent) and self._has_enough()
+            least, current = self.config.online.min_keyframes, self.tracker.current
+            return self.schedule.due(self.at_rest, waits, urgent) and self.keyframes.enough(least, current, self._informative)
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
@@ -190,21 +177,11 @@ class Recalibrator:
         keyframes = list(self.keyframes.features)
         return self.monitor.informative(keyframes, self.tracker.T) if self.tracker.monitored else keyframes
 
-    def _has_enough(self) -> bool:
-        """With the lock held: there are enough keyframes to estimate from, and new ones among them."""
-        # Asked at every frame while an estimate waits for the budget.
-        state = (self.keyframes.generation, self.keyframes.seen, self.keyframes.new, self.tracker.current)
-        if self._enough is None or self._enough[0] != state:
-            informative = self._informative()
-            enough = len(informative) >= self.config.online.min_keyframes
-            self._enough = state, enough and self.keyframes.newest_among(informative, self.keyframes.new) > 0
-        return self._enough[1]
-
     # ---- frames -------------------------------------------------------------------------------------------------------
 
     def wants(self, stamp: int) -> bool:
-        """False if a frame of this `_moment`, ns, need not even be decoded: between two looks, at rest and without any doubt. The
-        cameras of a rig look at the same scans, in each of which is searched once for all, at rest or not."""
+        """False if a frame of this stamp, ns, need not even be decoded: between two looks, at rest and without any doubt.
+        The cameras of a rig, for which it is that of the scan, look at the same scans, at rest or not."""
         if not (self.at_rest or self._scans is not None) or self.config.lidar.accumulate_s > 0:
             return True
         doubt = self.glance.struck or self.monitor.in_doubt or self.sensors.faulty_frames > 0
@@ -226,25 +203,23 @@ class Recalibrator:
         if self.first_guess.pending:
             self.first_guess.add(frame)
         self.schedule.add_frame(frame.stamp, self.tracker.steady)
-        spacing_s, moment = self.schedule.keyframes_at_rest_s if self.at_rest else 0.0, self._moment(frame)
+        spacing_s = self.schedule.keyframes_at_rest_s if self.at_rest else 0.0
+        moment = frame.stamp if self._scans is None else frame.moment_of_cloud  # the cameras of a rig choose the same scans
         if problem is not None or not self.speed_gate.allows(frame):
             return False
         is_keyframe = self.selector.select(frame.image, moment, permit, spacing_s)
         if is_keyframe:
             self.glance.put_off(moment)
-        elif not (self._worth_a_test(frame) and permit()):
+        elif not (self._worth_a_test(frame, moment) and permit()):
             return False
         generation = self.keyframes.generation
         try:
             frame_with_twist = self.motion.with_twist(frame, scan_before)
-            unknown_s = unknown_motion_s(frame_with_twist, self.tracker.T, self.config.motion)
-            self.motion.check_known(frame_with_twist, unknown_s, self.config.tracker)
+            unknown_s = self.motion.unknown_s(frame_with_twist, self.tracker.T, self.config.tracker)
             if frame_with_twist is not frame and not self.speed_gate.allows(frame_with_twist):
                 return False  # the selector goes on from this frame: scans in a turn are not aligned one by one
             frame_with_twist = self.motion.accumulated(frame_with_twist)
-            features = self.calibrator.extract(frame_with_twist)
-            if unknown_s:
-                features = replace(features, unknown_motion_s=unknown_s)
+            features = replace(self.calibrator.extract(frame_with_twist), unknown_motion_s=unknown_s)
         except Exception:
             if is_keyframe:
                 self.selector.reset()  # the scene is still wanted: the next frame may show it with a good scan
@@ -262,20 +237,14 @@ class Recalibrator:
             self._monitor_extrinsic(None if is_keyframe else features)
         return is_keyframe
 
-    def _moment(self, frame: Frame) -> int:
-        """What looks and keyframes are timed by, ns: the cameras of a rig by the scan, so that they choose the same."""
-        return frame.stamp if self._scans is None else frame.moment_of_cloud
-
-    def _worth_a_test(self, frame: Frame) -> bool:
+    def _worth_a_test(self, frame: Frame, moment: int) -> bool:
         """Whether a frame that is no keyframe is to be tested by the monitor: it matches worse than others, or there is doubt."""
-        moment = self._moment(frame)
         if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(moment, self.looks_seldom)):
             return False
         self.glance.put_off(moment)
-        if self.glance.struck or self.monitor.in_doubt or self.tracker.suspect:
-            return True  # no need to look, nor to get used to what may be a knock
-        self.glance.struck = self.glance.strikes(frame, self.tracker.T, self.config)
-        return self.glance.struck
+        # In doubt there is no need to look, nor to get used to what may be a knock.
+        doubt = self.glance.struck or self.monitor.in_doubt or self.tracker.suspect
+        return doubt or self.glance.strikes(frame, self.tracker.T, self.config)
 
     def segment_keyframe(self, cancelled: Callable[[], bool] = lambda: False) -> tuple[str, ...]:
         """Add semantics to the newest keyframe, if it has none yet, which takes seconds; returns a line for each model that
@@ -284,17 +253,11 @@ class Recalibrator:
             waiting, self._to_segment = self._to_segment, None
         if waiting is None:
             return ()
-        (frame, plain), calibrator, tracker, points = waiting, self.calibrator, self.tracker, None
-        kinds: tuple[str, ...] = ALL
-        if self.first_guess.needs_classes:
-            kinds = CLASSES
-        else:
-            # Where searches begin that come by themselves, and those on request: other points need no classes.
-            starts = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
-            points = reduce(np.union1d, [points_in_reach(frame, calibrator.extract, T, self._search_box()) for T in starts])
-            if not (self._in_doubt and self._seen_motion.newest is not None):
-                kinds = calibrator.kinds_without_doubt or ALL
-        semantics = calibrator.segmentation(frame, cancelled, kinds, points)
+        (frame, plain), calibrator, tracker = waiting, self.calibrator, self.tracker
+        # Where searches begin that come by themselves, and those on request: other points need no classes.
+        starts = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
+        reach = None if self.first_guess.needs_classes else (starts, self._search_box())
+        semantics = classes_of(frame, calibrator, reach, self._in_doubt and self._seen_motion.newest is not None, cancelled)
         self.segmented = self.segmented[0], dict(semantics.seconds)
         if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):
             return semantics.problems
@@ -307,12 +270,9 @@ class Recalibrator:
 
     def describe_semantics(self) -> str:
         """Progress, failures, and the weights in use, for people."""
-        models = self.segmentation.describe()
-        if not models:
-            return "none: no models are configured"
-        count, times = self.segmented
+        (count, times), models = self.segmented, self.segmentation.describe()
         took = [f"{kind} {seconds:.1f} s" for kind, seconds in times.items()]
-        return "; ".join([f"{count} keyframes", *took, *models])
+        return "; ".join([f"{count} keyframes", *took, *models]) if models else "none: no models are configured"
 
     def _monitor_extrinsic(self, tested: FrameFeatures | None = None) -> None:
         """Test the current extrinsic with the newest keyframe, or with a frame that becomes one if it speaks against it. Where it
@@ -329,10 +289,8 @@ class Recalibrator:
                 return
             if tested is not None:
                 keyframes.append(tested)
-            T, spread, anchor = tracker.T, tracker.spread, tracker.initial.T_camera_lidar
-            clock_sigma_s = tracker.clock_sigma_s
-        same_scene = tested is not None
-        assessment = self.monitor.check(self.calibrator, keyframes, T, spread, anchor, same_scene, clock_sigma_s)
+            given = tracker.T, tracker.spread, tracker.initial.T_camera_lidar, tested is not None, tracker.clock_sigma_s
+        assessment = self.monitor.check(self.calibrator, keyframes, *given)
         with self._lock:
             if generation != self.keyframes.generation or self._restart_monitor:
                 return
@@ -377,9 +335,9 @@ class Recalibrator:
                     # A search on request may use all rounds; automatic ones are limited, since the next keyframe tries again.
                     box, start = self._search_box(SEARCH_ROUNDS), tracker.search_center
                 # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
-                anchor = tracker.initial.T_camera_lidar
-                result = self.calibrator.estimate(batch.features, start, box, progress, anchor=anchor, near=box is None)
-            result = self._explained(result, batch, box, progress)
+                given = batch.features, start, box, progress
+                result = self.calibrator.estimate(*given, anchor=tracker.initial.T_camera_lidar, near=box is None)
+            result = self.first_guess.explained(result, self.calibrator, (batch.features, box, progress), names)
         except Cancelled:
             with self._lock:
                 self.keyframes.give_back(batch)
@@ -393,20 +351,6 @@ class Recalibrator:
             self.calibrator.objectives.free_memory()
         return extrinsic
 
-    def _explained(self, result: Result, batch: Batch, box: SearchBox | None, progress: Callback | None) -> Result:
-        """The result; where nothing has matched several times, with the cause that was found then, if any."""
-        if result.converged:
-            self._unmatched, self._mixed_up = 0, None
-        if result.refusal not in NO_MATCH:
-            return result
-        if self._unmatched + 1 == JUDGED_AFTER:
-            guessed = self.tracker.initial.origin in (InitialSource.NOMINAL, InitialSource.SEMANTIC, InitialSource.MOTION)
-            self._mixed_up = self.calibrator.explained(result, batch.features, box, progress, stated=not guessed)
-        self._unmatched += 1
-        if self._mixed_up is None or self._mixed_up.cause is None:
-            return result
-        return replace(result, cause=self._mixed_up.cause, reason=self._mixed_up.reason)
-
     def _search_box(self, rounds: int | None = None) -> SearchBox:
         return SearchBox(self.config.search.rotation_deg, self.config.search.translation_m, rounds)
 
@@ -418,14 +362,9 @@ class Recalibrator:
                 unknown = replace(result, status=INITIAL, covariance=None, covariance_with_intrinsics=None)
                 self.tracker = Tracker(unknown, None, self.config)
                 self.first_guess.end()
-            seconds, self._in_doubt = 0.0, leaves_doubt(replace(result, cause=None))
-            if batch.features:
-                before = self._seen_motion.newest
-                seconds = 0.0 if before is None else (batch.features[-1].stamp - before) / NANOSECONDS
-                self._seen_motion.learn(batch.features)
-            accepted = self.tracker.current.accepted
-            share_new = min(batch.unfused_features / max(len(batch.features), 1), 1.0)
-            extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all=not self.keyframes.incomplete)
+            self._in_doubt = leaves_doubt(replace(result, cause=None))
+            seconds, accepted = self._seen_motion.learn(batch.features), self.tracker.current.accepted
+            extrinsic = self.tracker.update(result, batch.share_new, seconds, on_request, not self.keyframes.incomplete)
             if result.converged or result.refusal is RefusalCode.WRONG_INTRINSICS:  # where they are wrong, it is wanted most
                 self.refined_camera = result.refined_camera
             if extrinsic.accepted > accepted:
@@ -437,12 +376,10 @@ class Recalibrator:
     def _use_clocks(self, known: Result) -> None:
         """With the lock held: take over what is known of the clocks, so that the points of all keyframes move."""
         before, config = self.config.motion, with_clocks(self.config, known)
-        after = config.motion
-        if after == before:
-            return
-        self.config = self.tracker.config = config
-        self.motion.config, self._enough, self._restart_monitor = after, None, True
-        self.keyframes.change(lambda f: with_clocks_moved(f, before, after))
+        if config.motion != before:
+            self._use(config)
+            self._restart_monitor = True
+            self.keyframes.change(lambda f: with_clocks_moved(f, before, config.motion))
 
     # ---- changes ------------------------------------------------------------------------------------------------------
 
@@ -452,33 +389,24 @@ class Recalibrator:
             self._clear_keyframes()
             self.sensors = SensorHealth()
             self.glance.reset()
-            placeholder = self.first_guess.begin_anew()
-            if placeholder is None:
+            if (placeholder := self.first_guess.begin_anew()) is None:
                 self.tracker.reset()
             else:
                 self.tracker = Tracker(placeholder, None, self._configured)
-            self.config = self.tracker.config = with_clocks(self._configured, self.tracker.initial)
-            self.motion.config = self.config.motion
+            self._use(with_clocks(self._configured, self.tracker.initial))
 
     def configure(self, config: Config) -> None:
         """Use another configuration from now on. Keyframes are kept unless their features would change, and what was found of
         the clocks unless what the stage ``motion`` states of them changes."""
         with self._lock:
             before, self._configured = self._configured.motion, config
-            if before == config.motion:
-                config = replace(config, motion=self.config.motion)
-            elif states_same_clocks(before, config.motion):
-                config = with_clocks(config, self.tracker.current.result)
+            config = with_clocks_kept(config, before, self.config.motion, self.tracker.current.result)
             features_changed = feature_config(config) != feature_config(self.config)
             if config.semantics != self.config.semantics:  # else the models stay loaded
                 self.segmentation = self._models(config.semantics)
-            self.config, self._enough = config, None
+            self._use(config)
             # Where it begins to guess, only points near the nominal view have classes so far.
             features_changed = self.first_guess.configure(config, self.tracker.current.accepted > 0) or features_changed
-            self.selector.config = self.schedule.config = self.speed_gate.config = config.online
-            self.motion.config, self.motion.accumulate_s = config.motion, config.lidar.accumulate_s
-            self.monitor.config = config.monitor
-            self.tracker.config = config
             self.keyframes.resize(config.online.buffer_size)
             if not config.monitor.enabled:
                 self._restart_monitor = True
@@ -486,10 +414,17 @@ class Recalibrator:
             if features_changed:
                 self._clear_keyframes()
 
+    def _use(self, config: Config) -> None:
+        """With the lock held: in all parts but the first guess."""
+        self.config = config
+        self.tracker.config, self.monitor.config = config, config.monitor
+        self.selector.config = self.schedule.config = self.speed_gate.config = config.online
+        self.motion.config, self.motion.accumulate_s = config.motion, config.lidar.accumulate_s
+
     def _clear_keyframes(self) -> None:
         """With the lock held. Features and estimates that are being computed from the old keyframes become void."""
         self.keyframes.clear()
         self._restart_monitor = self._in_doubt = True
         self._to_segment = None
-        self._unmatched, self._mixed_up = 0, None
+        self.first_guess.forget_unmatched()
         self.selector.reset()

@@ -61,7 +61,11 @@ class SensorHealth:
         return problem
 
     def _check_camera(self, frame: Frame) -> SensorProblem | None:
-        small = _shrunk(frame.image)
+        # Grey, at 1 / SHRINK_FACTOR of the size; without what is left over of it, since whole factors are quicker.
+        grey = frame.image if frame.image.ndim == 2 else cv2.extractChannel(frame.image, 1)
+        height, width = (max(size // SHRINK_FACTOR, 2) for size in grey.shape)
+        whole = grey[: height * SHRINK_FACTOR, : width * SHRINK_FACTOR]
+        small = np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
         contrast = float(np.mean([np.abs(np.diff(small.astype(np.int16), axis=axis)).mean() for axis in (0, 1)]))
         frozen = self._is_frozen(frame)
         usual = float(np.median(self._contrasts)) if len(self._contrasts) >= MIN_HISTORY else 0.0
@@ -105,11 +109,3 @@ class SensorHealth:
             return SensorProblem(SensorFault.LIDAR_BLIND, message)
         self._returns.append(returns)
         return None
-
-
-def _shrunk(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grey, at 1 / SHRINK_FACTOR of the size; without what is left over of it, since whole factors are quicker."""
-    grey = image if image.ndim == 2 else cv2.extractChannel(image, 1)
-    height, width = (max(size // SHRINK_FACTOR, 2) for size in grey.shape)
-    whole = grey[: height * SHRINK_FACTOR, : width * SHRINK_FACTOR]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

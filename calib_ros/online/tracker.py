@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
-from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import Config
 from calib_ros.config.online import MANUAL
-from calib_ros.online.clocks import KNOWN_Z, SAME_S, ClockEvidence, OffsetFilter, at_offset
+from calib_ros.online.clocks import ClockEvidence
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
-from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
+from calib_ros.online.pose_filter import KNOWN_Z, SAME_S, OffsetFilter, PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
-from calib_ros.online.tracker_states import NOTHING, TRANSITIONS, Confirmations, TrackerEvent, TrackerState
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, pose_constraints
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
@@ -25,9 +25,58 @@ UNSETTLING_REJECTIONS = 3  # so many in a row, and the whole box is searched aga
 # Estimates in a row that must agree with the one before, after the calibration has moved: a few keyframes of one place may share
 # a wrong optimum, and 2 did so on a KITTI junction.
 RECOVERING = 3
-# An estimate farther from a settled extrinsic, or less probable given it, is rejected: a mount that drifts does not jump.
-MAX_STEP_DEG, MAX_STEP_M = 1.0, 0.15
-GATE = 1e-4
+
+
+class TrackerState(Enum):
+    """What the current extrinsic rests on."""
+
+    INITIAL = "no estimate yet"
+    TENTATIVE = "one estimate, to be confirmed"
+    CONFIRMED = "estimates and keyframes agree"
+    LOST = "it has moved"
+
+
+class Confirmations(NamedTuple):
+    """What confirms an extrinsic. keyframes: consistent ones. estimates: that agree. clocks: 1 = frames that show the offset."""
+
+    keyframes: int = 0
+    estimates: int = 0
+    clocks: int = 0
+
+
+NOTHING = Confirmations()
+
+
+class TrackerEvent(Enum):
+    """What changes the state."""
+
+    AGREES_WITH_SAVED = "the first estimate agrees with the saved extrinsic"
+    ESTIMATE_ELSEWHERE = "an estimate that nothing confirms yet is accepted"
+    ESTIMATE_CONFIRMED = "keyframes, another estimate and the clocks confirm it"
+    OTHER_CLOCKS = "an estimate rests on another time offset"
+    MOVED = "the monitor or a new search says that it has moved"
+    FOUND_AGAIN = "estimates in a row agree, or one was asked for"
+
+
+S, E = TrackerState, TrackerEvent
+
+# A pair that is not listed cannot happen, and raises a KeyError. Going back to the initial extrinsic makes a new tracker.
+TRANSITIONS: dict[tuple[TrackerState, TrackerEvent], TrackerState] = {
+    (S.INITIAL, E.AGREES_WITH_SAVED): S.CONFIRMED,
+    (S.INITIAL, E.ESTIMATE_ELSEWHERE): S.TENTATIVE,
+    (S.INITIAL, E.MOVED): S.LOST,
+    (S.INITIAL, E.OTHER_CLOCKS): S.INITIAL,
+    (S.TENTATIVE, E.ESTIMATE_CONFIRMED): S.CONFIRMED,
+    (S.TENTATIVE, E.ESTIMATE_ELSEWHERE): S.TENTATIVE,
+    (S.TENTATIVE, E.OTHER_CLOCKS): S.INITIAL,
+    (S.TENTATIVE, E.MOVED): S.LOST,
+    (S.CONFIRMED, E.ESTIMATE_ELSEWHERE): S.TENTATIVE,
+    (S.CONFIRMED, E.OTHER_CLOCKS): S.INITIAL,
+    (S.CONFIRMED, E.MOVED): S.LOST,
+    (S.LOST, E.MOVED): S.LOST,  # the monitor, of what an estimate has found meanwhile
+    (S.LOST, E.FOUND_AGAIN): S.TENTATIVE,
+    (S.LOST, E.OTHER_CLOCKS): S.INITIAL,
+}
 
 
 class Tracker:
@@ -35,8 +84,7 @@ class Tracker:
 
     config may be replaced at any time. current: what to publish, a new object after every change. state: what it rests on.
     last_good: the newest extrinsic to rely on, None before the first. settled: successive estimates agree, so that they refine
-    instead of searching. fused_keyframes: how many the covariance rests on. sensor_problem: what is wrong with a
-    sensor; None while both work.
+    instead of searching. sensor_problem: what is wrong with a sensor; None while both work. filter: pose and clocks' offset.
     """
 
     def __init__(self, initial: Result, current: Result | None = None, config: Config | None = None) -> None:
@@ -54,15 +102,14 @@ class Tracker:
         self._accepted = self._rejected_in_a_row = self._agreeing_in_a_row = 0
         self._accepted_since_moved = 0  # or since the beginning
         self._estimated_at = result.data_stamp
-        self.fused_keyframes = 0.0
         self._consistent_keyframes, self._agreed = 0, False  # confirmations: keyframes, and another estimate
-        self._clocks, self._offset = ClockEvidence(), OffsetFilter(self.config.motion.time_offset_s)
-        self._offset.restart(result)
+        self._clocks, offset = ClockEvidence(), OffsetFilter(self.config.motion.time_offset_s)
+        offset.restart(result)
         self._objection = result.reason if self.lost else None  # of the monitor
         self.sensor_problem: SensorProblem | None = None
         self._assessment: Assessment | None = None
         self._search_start = result.T_camera_lidar
-        self.filter = PoseFilter(self._search_start, self._box_covariance())
+        self.filter = PoseFilter(self._search_start, self._box_covariance(), offset)
         self.current = self._extrinsic()
 
     # ---- state --------------------------------------------------------------------------------------------------------
@@ -96,14 +143,16 @@ class Tracker:
     def steady(self) -> bool:
         """True while estimates agree, the newest was accepted, and nothing speaks against the extrinsic or is still to confirm
         it."""
-        doubted = self.tentative or self.suspect or self.lost
-        return self.settled and self._result.status == CONVERGED and not doubted
+        return self._in_line and not self.tentative
 
     @property
     def awaits_motion(self) -> bool:
         """True while it would be steady but for frames of another speed or turn."""
-        in_line = self.settled and self._result.status == CONVERGED and not (self.suspect or self.lost)
-        return in_line and self.tentative and self.missing == Confirmations(clocks=1)
+        return self._in_line and self.tentative and self.missing == Confirmations(clocks=1)
+
+    @property
+    def _in_line(self) -> bool:
+        return self.settled and self._result.status == CONVERGED and not (self.suspect or self.lost)
 
     @property
     def spread(self) -> Covariance:
@@ -151,16 +200,16 @@ class Tracker:
         rest on, and replaces them.
         """
         self.filter.predict(seconds)
-        if abs(self._offset.used_s - self.config.motion.time_offset_s) > SAME_S:  # stated anew
+        if abs(self.filter.offset.used_s - self.config.motion.time_offset_s) > SAME_S:  # stated anew
             self._start_anew()
-            self._offset = OffsetFilter(self.config.motion.time_offset_s)
+            self.filter.offset = OffsetFilter(self.config.motion.time_offset_s)
         if self.suspect and not on_request:  # its keyframes are in question
             return self.current
-        if self._offset.differs(estimate) and (self.tentative or on_request):
+        if self.filter.offset.differs(estimate) and (self.tentative or on_request):
             self._start_anew()
         why = "" if estimate.converged else estimate.reason or estimate.status
         if estimate.converged and self.settled and not on_request and estimate.covariance is not None:
-            why = self._too_far(estimate)
+            why = self.filter.why_too_far(estimate)
         if why:
             self._reject(estimate, why)
         else:
@@ -200,25 +249,7 @@ class Tracker:
             self.current = self._extrinsic()
         return self.current
 
-    # ---- gate ---------------------------------------------------------------------------------------------------------
-
-    def _too_far(self, estimate: Result) -> str:
-        """Why an estimate is farther from the current extrinsic than the process noise allows for; "" if it is not."""
-        (deg, m), covariance = self._innovation_of(estimate), estimate.covariance
-        T = at_offset(estimate, self._offset.used_s)
-        away, kept = f"{deg:.2f} deg / {100 * m:.0f} cm away", "kept until more keyframes confirm it"
-        if deg > MAX_STEP_DEG or m > MAX_STEP_M:
-            limits = f"{MAX_STEP_DEG:g} deg / {100 * MAX_STEP_M:g} cm"
-            return f"the estimate is {away} from the current extrinsic, beyond {limits}: {kept}"
-        if covariance is not None and self.filter.probability(T, covariance) < GATE:
-            return f"the estimate does not fit the current extrinsic ({away}, far beyond the uncertainty of both): {kept}"
-        return ""
-
-    def _innovation_of(self, estimate: Result) -> tuple[float, float]:
-        """Angle, deg, and distance, m, of an estimate from the current extrinsic, both at the same offset of the clocks: that one
-        estimate takes for a late image what another takes for a shift is no movement."""
-        T = at_offset(estimate, self._offset.used_s)
-        return se3.rotation_error_deg(self.T, T), se3.translation_error_m(self.T, T)
+    # ---- estimates ----------------------------------------------------------------------------------------------------
 
     def _reject(self, estimate: Result, why: str) -> None:
         self._result = replace(
@@ -237,7 +268,7 @@ class Tracker:
             self.settled = False
 
     def _accept(self, estimate: Result, share_new: float, on_request: bool, covers_all: bool) -> None:
-        before, (deg, m) = self.T, self._innovation_of(estimate)
+        before, (deg, m) = self.T, self.filter.away(estimate)
         saved = self._accepted == 0 and self.last_good is not None
         self._rejected_in_a_row, self._innovation = 0, normalised_innovation(before, estimate.T_camera_lidar)
         near = deg < SETTLED_DEG and m < SETTLED_M
@@ -247,17 +278,16 @@ class Tracker:
             if self.state is TrackerState.INITIAL:
                 self._change(TrackerEvent.AGREES_WITH_SAVED)
         elif on_request and self.lost:
-            self._begin_confirmation()
+            self._consistent_keyframes, self._agreed = 0, False
         elif on_request or not (self.lost or self._has_settled):
             self._change(TrackerEvent.ESTIMATE_ELSEWHERE)
         if on_request:
             self.settled = False
-        elif self._has_settled and not self.settled and not self.lost and self._too_far(estimate):
+        elif self._has_settled and not self.settled and not self.lost and self.filter.why_too_far(estimate):
             # Rejected estimates have opened the search, and it ended elsewhere: one estimate is not enough to believe that.
             self._change(TrackerEvent.MOVED)
             self._accepted_since_moved, self._search_start = 0, before
-        restart = not self.settled or covers_all or self._offset.differs(estimate, KNOWN_Z)
-        self._fuse(estimate, share_new, restart)
+        restart = not self.settled or covers_all or self.filter.offset.differs(estimate, KNOWN_Z)
         self._agreeing_in_a_row = self._agreeing_in_a_row + 1 if agrees else 0
         if self.lost and (self._agreeing_in_a_row >= RECOVERING or on_request):
             self._change(TrackerEvent.FOUND_AGAIN)
@@ -269,19 +299,51 @@ class Tracker:
         self._accepted_since_moved += 1
         self._clocks.add(estimate, self.config)
         self._estimated_at = estimate.data_stamp
-        self._result = self._fused_result(estimate)
+        self._result = self._fused(estimate, share_new, restart)
         if self._result.status == CONVERGED and not self.lost:
             self.last_good = self._result
+
+    def _fused(self, estimate: Result, share_new: float, restart: bool) -> Result:
+        """The estimate with the filter's pose and covariance; insufficient while a direction is not known well enough."""
+        self.filter.update(estimate, share_new, self._box_covariance(), restart)
+        if estimate.covariance is not None:
+            # Both are within the limits; the pose between them on SE(3) may be a hair outside.
+            limits = pose_constraints(self.initial.T_camera_lidar, self.config.constraints, 1).limits
+            self.filter.T = limits.clip(self.filter.T)
+        config, covariance = self.config.tracker, self.filter.covariance
+        weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)  # more scenes would help there
+        if estimate.shared_covariance is not None:
+            covariance = covariance + estimate.shared_covariance
+        whole = estimate.covariance_with_intrinsics
+        if whole is not None and estimate.covariance is not None:
+            whole = covariance + whole - estimate.covariance
+        hidden = f"the scenes do not show {', '.join(map(str, weak))} well; drive on" if weak else ""
+        reason = "; ".join(filter(None, [hidden, estimate.reason]))
+        known = self.filter.offset.sigma_s
+        return replace(
+            estimate,
+            time_offset_s=None if known is None else self.filter.offset.used_s,
+            time_offset_sigma_s=known,
+            stamping=estimate.stamping or self._result.stamping,
+            T_camera_lidar=self.filter.T,
+            covariance=None if estimate.covariance is None else covariance,
+            covariance_with_intrinsics=whole,
+            status=INSUFFICIENT if weak else CONVERGED,
+            reason=reason,
+        )
+
+    def _box_covariance(self) -> Covariance:
+        """Covariance (6, 6) of an extrinsic that has not settled: it lies in the search box."""
+        search = self.config.search
+        deg, m = search.rotation_deg or REFINEMENT_DEG, search.translation_m or REFINEMENT_M
+        return np.diag(np.concatenate([np.full(3, np.deg2rad(deg)), np.full(3, m)]) ** 2)
 
     # ---- states -------------------------------------------------------------------------------------------------------
 
     def _change(self, event: TrackerEvent) -> None:
         self.state = TRANSITIONS[self.state, event]
         if event in (TrackerEvent.ESTIMATE_ELSEWHERE, TrackerEvent.MOVED):
-            self._begin_confirmation()
-
-    def _begin_confirmation(self) -> None:
-        self._consistent_keyframes, self._agreed = 0, False
+            self._consistent_keyframes, self._agreed = 0, False
 
     def _published(self) -> Extrinsic:
         """The new current extrinsic, after a change that may have confirmed it: once confirmed, it stays so."""
@@ -315,62 +377,8 @@ class Tracker:
         needed, agreeing = self.confirmations, int(self._agreed)
         if self.lost:
             agreeing = self._agreeing_in_a_row + min(self._accepted_since_moved, 1)
-        return Confirmations(
-            max(needed.keyframes - self._consistent_keyframes, 0), max(needed.estimates - agreeing, 0), needed.clocks
-        )
-
-    # ---- fusion -------------------------------------------------------------------------------------------------------
-
-    def _fuse(self, estimate: Result, share_new: float, restart: bool) -> None:
-        """Update the filter. restart: from a box in which any pose is as likely, instead of from earlier estimates."""
-        T, offset, before = self.T, self._offset, self._offset.used_s
-        if restart:
-            offset.restart(estimate)
-        else:
-            offset.update(estimate, share_new)
-        if estimate.covariance is None:
-            self.filter = PoseFilter(estimate.T_camera_lidar, self._box_covariance())
-            return
-        if restart:
-            self.filter, share_new, self.fused_keyframes = PoseFilter(T, self._box_covariance()), 1.0, 0.0
-        elif estimate.clock_direction is not None:
-            self.filter.T = se3.exp(estimate.clock_direction * (offset.used_s - before)) @ self.filter.T
-        self.fused_keyframes += share_new * estimate.frames_used
-        shared = np.zeros((6, 6)) if estimate.shared_covariance is None else estimate.shared_covariance
-        self.filter.update(at_offset(estimate, offset.used_s), estimate.covariance - shared, share_new)
-        # Both are within the limits; the pose between them on SE(3) may be a hair outside.
-        limits = pose_constraints(self.initial.T_camera_lidar, self.config.constraints, 1).limits
-        self.filter.T = limits.clip(self.filter.T)
-
-    def _fused_result(self, estimate: Result) -> Result:
-        """The estimate with the filter's pose and covariance; insufficient while a direction is not known well enough."""
-        config, covariance = self.config.tracker, self.filter.covariance
-        weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)  # more scenes would help there
-        if estimate.shared_covariance is not None:
-            covariance = covariance + estimate.shared_covariance
-        whole = estimate.covariance_with_intrinsics
-        if whole is not None and estimate.covariance is not None:
-            whole = covariance + whole - estimate.covariance
-        hidden = f"the scenes do not show {', '.join(map(str, weak))} well; drive on" if weak else ""
-        reason = "; ".join(filter(None, [hidden, estimate.reason]))
-        known = self._offset.sigma_s
-        return replace(
-            estimate,
-            time_offset_s=None if known is None else self._offset.used_s,
-            time_offset_sigma_s=known,
-            stamping=estimate.stamping or self._result.stamping,
-            T_camera_lidar=self.filter.T,
-            covariance=None if estimate.covariance is None else covariance,
-            covariance_with_intrinsics=whole,
-            status=INSUFFICIENT if weak else CONVERGED,
-            reason=reason,
-        )
-
-    def _box_covariance(self) -> Covariance:
-        """Covariance (6, 6) of an extrinsic that has not settled: it lies in the search box."""
-        search = self.config.search
-        deg, m = search.rotation_deg or REFINEMENT_DEG, search.translation_m or REFINEMENT_M
-        return np.diag(np.concatenate([np.full(3, np.deg2rad(deg)), np.full(3, m)]) ** 2)
+        keyframes, estimates = needed.keyframes - self._consistent_keyframes, needed.estimates - agreeing
+        return Confirmations(max(keyframes, 0), max(estimates, 0), needed.clocks)
 
     # ---- what is published --------------------------------------------------------------------------------------------
 
@@ -401,8 +409,7 @@ class Tracker:
         elif result.converged and not self._accepted and not self._consistent_keyframes:
             result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")
         told = assessment or Assessment(Verdict.INCONCLUSIVE, "", math.nan)
-        usable = self._is_usable(result.status)
-        monitored = told.message, told.p_value, usable, self._estimated_at, told.since_stamp
+        monitored = told.message, told.p_value, self._is_usable(result.status), self._estimated_at, told.since_stamp
         return Extrinsic(result, self._innovation, self._accepted, *monitored)
 
     def _is_usable(self, status: str) -> bool:

@@ -19,7 +19,7 @@ from calib_ros.extensions import NodeService
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
 from calib_ros.online.events import ExtrinsicUpdated, Problem, QuietLog
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
-from calib_ros.online.pairing.health import PairingHealth
+from calib_ros.online.pairing import PairingHealth
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic

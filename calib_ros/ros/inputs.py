@@ -25,7 +25,7 @@ from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyE
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.messages import decode_camera_info, stamp_ns
 from calib_ros.online.common import Common
-from calib_ros.online.pairing.health import MISSING_SHARE
+from calib_ros.online.pairing import MISSING_SHARE
 from calib_ros.rig.description import CAMERA
 from calib_ros.rig.edges import SEEN, seen_share
 from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message

@@ -18,7 +18,7 @@ from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.requests import Pending
+from calib_ros.online.worker import Pending
 from calib_ros.registration.judgement.hypotheses import distorts
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.parallel import cpu_time

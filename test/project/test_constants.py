@@ -16,7 +16,7 @@ JUDGES = (
         "calib_ros_check/*.py",
         "benchmarks/compare.py",
     ),
-    *(f"calib_ros/online/{name}.py" for name in ("evidence", "monitor", "glance", "tracker", "clocks")),
+    *(f"calib_ros/online/{name}.py" for name in ("evidence", "monitor", "glance", "tracker", "pose_filter", "clocks")),
 )
 SYSTEMATIC_ERROR = ("calib_ros/registration/objective.py", "SYSTEMATIC_ERROR")  # whose other constants judge nothing
 OF_PAGES = {"report", "page", "cli", "commands"}

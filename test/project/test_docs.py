@@ -16,7 +16,7 @@ from calib_ros import __version__
 from calib_ros.cli.main import main
 from calib_ros.config import Config
 from calib_ros.config.removed import REMOVED
-from calib_ros.online.tracker_states import TRANSITIONS, TrackerEvent, TrackerState
+from calib_ros.online.tracker import TRANSITIONS, TrackerEvent, TrackerState
 from calib_ros.ros.parameters import SETTINGS
 
 DOCUMENT = ROOT / "docs/method.md"

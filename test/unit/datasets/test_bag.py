@@ -41,7 +41,7 @@ from calib_ros.datasets.bag_topics import choose_points
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.pairing.synchronizer import Synchronizer
+from calib_ros.online.pairing import Synchronizer
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.se3 import exp, inverse
 from calib_ros_check.recording import CheckOptions

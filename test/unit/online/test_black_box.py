@@ -1,22 +1,26 @@
-"""The black box: which occasions are recorded, when, how often, with which extrinsic, and what is told of the time before."""
+"""What is kept and told of what happens: occasions that the black box records, with what led to them, and lines in the log."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from driven import Driven, config
 from sample_sources import frames
 
 from calib_ros.config import Config
+from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.black_box import KEPT_EVENTS, KEYFRAMES_AFTER, LONGEST_AFTER_S, SPACING_S, BlackBox, Occasion
-from calib_ros.online.events import ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.events import ExtrinsicUpdated, FrameIngested, Inputs, Problem, QuietLog
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import BLINDED, CONVERGED, MOVED, REFUSED, SUSPECT, Extrinsic, RefusalCode, Result
+from calib_ros_synthetic.drive import SyntheticDrive
 
 STAMP = 7_000_000_000
 (FRAME,) = frames(1)
@@ -154,3 +158,35 @@ def test_events_tell_what_led_to_it(box: Box) -> None:
     assert moved[7]["message"] == "no messages on points"
     box.keyframes(2 * KEPT_EVENTS)
     assert len(box.events().splitlines()) == KEPT_EVENTS
+
+
+def test_what_differs_in_its_figures_alone_is_one_line_in_ten_seconds_and_counted() -> None:
+    now, lines = [0.0], list[str]()
+    log = QuietLog(lambda: now[0])
+    for tenth in range(250):
+        now[0] = tenth / 10
+        log.add("cloud", f"{tenth} points", lines.append)
+        if tenth in (3, 4):
+            log.add("camera", "no image", lines.append)
+        log.catch_up()
+    assert lines == ["0 points", "no image", "100 points (99 more in 10 s)", "no image", "200 points (99 more in 10 s)"]
+    for now[0] in (29.0, 30.0, 60.0):  # what came last is told although nothing comes any more
+        log.catch_up()
+    assert lines[5:] == ["249 points (48 more in 10 s)"]
+
+
+def test_a_blinded_sensor_is_told_when_it_begins_to_be_for_another_reason_and_when_it_sees(
+    drive: SyntheticDrive, street: list[Frame]
+) -> None:
+    dark = replace(street[1], image=np.zeros_like(street[1].image))
+    empty = replace(street[1], cloud=PointCloud(np.zeros((0, 3), np.float32)))
+    frames = iter(k * 10**8 for k in range(1, 100))
+
+    def later(frame: Frame) -> Frame:
+        return replace(frame, stamp=street[1].stamp + next(frames), cloud_stamp=None)
+
+    with Driven(drive, config(mode="manual")) as driven:
+        driven.feed(*street[:2], *(later(frame) for frame in [dark] * 6 + [empty] * 6 + [street[1]] * 2))
+    said = [line for line in driven.errors if "intensity" not in line]
+    assert [line.partition(" (")[0] for line in said] == ["the camera shows nothing", "the LiDAR shows nothing"]
+    assert driven.notices == ["camera and LiDAR work again"]

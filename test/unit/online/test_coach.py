@@ -13,7 +13,7 @@ from calib_ros.config.online import MANUAL
 from calib_ros.lidar.edges import UPWARD
 from calib_ros.online.coach import LYING, STANDING, Advice, Counted, Need, Sight, advise, need, sights
 from calib_ros.online.sensor_health import SensorFault
-from calib_ros.online.tracker_states import Confirmations
+from calib_ros.online.tracker import Confirmations
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox

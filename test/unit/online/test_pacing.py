@@ -1,12 +1,27 @@
-"""The budget of CPU time, with a clock and costs that the tests set."""
+"""The budget of CPU time, with a clock and costs that the tests set; and when estimates run under it, by the modes."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from driven import Driven, config
 
 from calib_ros.config import OnlineConfig
-from calib_ros.online.pacing import CLASSES_EVERY_S, ESTIMATE_EVERY_S, KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work, is_due
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online.pacing import (
+    CLASSES_EVERY_S,
+    ESTIMATE_EVERY_S,
+    KEYFRAME_EVERY_S,
+    SAVED_S,
+    LoadBudget,
+    Purse,
+    Schedule,
+    Work,
+    is_due,
+)
+from calib_ros_synthetic.drive import SyntheticDrive
 
 INTAKE, KEYFRAME, ESTIMATE = 0.005, 0.22, 0.4  # s of CPU time; as on KITTI
 STEP = 0.1  # s between pairs
@@ -146,3 +161,92 @@ def test_what_is_done_in_step_falls_on_the_same_stamps_wherever_it_began(in_step
     assert (late[0] == late[1] == late[2]) == in_step
     assert is_due(stamps[9], stamps[3], every_s, in_step)  # the clock was set back
     assert is_due(None, stamps[0], every_s, in_step)
+
+
+def test_pairs_spend_one_budget_and_have_their_least_of_keyframes_each() -> None:
+    now = [0.0]
+    config = OnlineConfig(max_load=0.5)
+    purse = Purse(config, lambda: now[0])
+    first, second = (LoadBudget(config, purse=purse) for _ in range(2))
+    first.add(Work.KEYFRAMES, 2 * SAVED_S * config.max_load)
+    assert second.allows_keyframe()  # the first one in so many seconds, beyond the budget
+    assert not second.allows_keyframe()
+    assert second.counts().forced == 1
+    now[0] += 2 * SAVED_S
+    assert second.allows_keyframe()
+    assert second.counts().forced == 1
+
+
+def seconds(s: float) -> int:
+    return round(s * NANOSECONDS)
+
+
+def moments(schedule: Schedule, *times: float, waits: bool = False) -> list[bool]:
+    """Whether an estimate is due at each of these times, s; where it is, it begins."""
+    out = []
+    for t in times:
+        schedule.add_frame(seconds(t))
+        out.append(schedule.due(waits=waits))
+        if out[-1]:
+            schedule.start_estimate()
+    return out
+
+
+@pytest.mark.parametrize(("mode", "due"), [("continuous", True), ("manual", False)])
+def test_continuous_mode_is_always_due_and_manual_never(mode: str, due: bool) -> None:
+    assert moments(Schedule(OnlineConfig(mode=mode)), 0.0, 1.0, 1000.0, 0.5) == [due] * 4
+
+
+@pytest.mark.parametrize(
+    ("config", "waits"),
+    [(OnlineConfig(mode="periodic", period_s=10.0), False), (OnlineConfig(rest_period_s=10.0), True)],
+    ids=["periodic", "rest"],
+)
+def test_periods_count_the_datas_own_stamps(config: OnlineConfig, waits: bool) -> None:
+    schedule = Schedule(config)
+    assert schedule.due(waits=waits)
+    assert moments(schedule, 100.0, 109.9, 110.0, 119.9, 500.0, waits=waits) == [True, False, True, False, True]
+    assert moments(schedule, 20.0, 20.0, waits=waits) == [True, False]  # a looping bag begins anew
+    schedule.add_frame(seconds(28))
+    schedule.start_estimate()  # as a request does: it starts the period anew
+    assert moments(schedule, 32.0, 38.0, waits=waits) == [False, True]
+
+
+def test_the_pipeline_in_manual_mode_waits_for_the_service(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Driven(drive, config(mode="manual")) as driven:
+        driven.feed(*street[:5])
+        assert driven.estimates == 0
+        assert driven.kept == [frame.stamp for frame in street[:5]]
+        assert driven.pipeline.request_estimate().result(60).result.converged
+        assert driven.estimates == 1
+        # From here on it goes by itself: the change takes effect with the next frame.
+        driven.pipeline.configure(config(mode="continuous"))
+        driven.feed(street[5])
+        assert (driven.estimates, driven.errors) == (2, [])
+
+
+def test_an_overdrawn_budget_delays_all_but_requested_estimates(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Driven(drive, config(max_load=0.05)) as driven:
+        driven.feed(*street[:2])
+        assert driven.estimates == 1
+        driven.pipeline.load.add(Work.ESTIMATES, 1e9)  # as after one that took very long
+        driven.feed(*street[2:5])
+        assert (driven.estimates, len(driven.kept), driven.pipeline.load.counts().postponed) == (1, 2, 3)
+        assert driven.pipeline.request_estimate().result(60).result.converged
+        assert driven.estimates == 2
+
+
+def test_cpu_time_is_booked_under_the_work_it_went_into(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Driven(drive, config(mode="manual")) as driven:
+        driven.feed(street[0])
+        once = driven.pipeline.load.counts().seconds
+        soon = dataclasses.replace(street[0], stamp=street[0].stamp + seconds(0.01), cloud_stamp=None)
+        driven.feed(soon)  # too soon for a keyframe
+        twice = driven.pipeline.load.counts().seconds
+        assert once[Work.KEYFRAMES] > once[Work.INTAKE] > 0
+        assert twice[Work.INTAKE] > once[Work.INTAKE]
+        assert twice[Work.KEYFRAMES] == once[Work.KEYFRAMES]
+        assert twice[Work.ESTIMATES] == twice[Work.CLASSES] == twice[Work.MESSAGES] == 0
+        driven.feed(street[1])
+        assert driven.pipeline.request_estimate().result(60).result.converged
+        assert driven.pipeline.load.counts().seconds[Work.ESTIMATES] > 0

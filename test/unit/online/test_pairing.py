@@ -14,9 +14,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros.lidar.sweep import SweepOffset
-from calib_ros.online.pairing.epochs import ClockDifference
-from calib_ros.online.pairing.health import PairingHealth
-from calib_ros.online.pairing.synchronizer import Synchronizer
+from calib_ros.online.pairing import ClockDifference, PairingHealth, Synchronizer
 
 MS = 10**6
 T0 = 1_700_000_000 * NANOSECONDS

@@ -15,7 +15,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online import pacing
 from calib_ros.online.monitor import CONFIRM
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.tracker_states import Confirmations
+from calib_ros.online.tracker import Confirmations
 from calib_ros.result import BLINDED, CONVERGED, MOVED, SUSPECT
 from calib_ros_synthetic.drive import SyntheticDrive
 

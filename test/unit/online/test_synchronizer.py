@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib_ros.frame import NANOSECONDS
-from calib_ros.online.pairing.synchronizer import Synchronizer
+from calib_ros.online.pairing import Synchronizer
 
 MS = 10**6
 T0 = 1_700_000_000 * NANOSECONDS

@@ -28,8 +28,7 @@ from calib_ros import se3
 from calib_ros.config import Config, TrackerConfig
 from calib_ros.online.monitor import Verdict
 from calib_ros.online.pose_filter import SYSTEMATIC_COVARIANCE, PoseFilter, without_systematic_error
-from calib_ros.online.tracker import SETTLED_DEG, SETTLED_M, UNSETTLING_REJECTIONS, Tracker
-from calib_ros.online.tracker_states import TRANSITIONS, TrackerState
+from calib_ros.online.tracker import SETTLED_DEG, SETTLED_M, TRANSITIONS, UNSETTLING_REJECTIONS, Tracker, TrackerState
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, Result
 
