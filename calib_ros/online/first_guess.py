@@ -14,11 +14,11 @@ from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import CLOUD, IMAGE, PoseHypothesis
 from calib_ros.registration.features import FrameFeatures, views_of
 from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, MOTION
+from calib_ros.registration.judgement.refusal import joined
 from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.motion_guess.registration import best_registration, better
 from calib_ros.registration.progress import Callback

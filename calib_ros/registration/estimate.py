@@ -9,21 +9,19 @@ import numpy as np
 
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
-from calib_ros.config import Config, MotionConfig
+from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.intrinsics import RefinedCamera, change_between
-from calib_ros.registration.acceptance.refusal import KEPT, LEFT_OUT, NO_INTENSITY, ONE_FRAME, Refusal, joined
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.joint import Optimised
+from calib_ros.registration.judgement.clocks import Effect, offset_effect, with_known_motion
 from calib_ros.registration.judgement.lens import LensEstimate
-from calib_ros.registration.nuisance.clock_offset import ClockOffset
-from calib_ros.registration.nuisance.parameters import Effect
-from calib_ros.registration.nuisance.time_offset import with_known_motion
+from calib_ros.registration.judgement.refusal import KEPT, LEFT_OUT, NO_INTENSITY, ONE_FRAME, Refusal, joined
 from calib_ros.registration.objective import Objective, penalised
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.chance import NullDistribution, null_distribution
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SearchBox
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Cause, Evidence, RefusalCode, Result
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Cause, Evidence, LensEffect, RefusalCode, Result
 
 UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
 NEGLIGIBLE = 3e-5  # of the score: what steps of a thousandth of a degree leave of an optimum
@@ -31,7 +29,6 @@ OUTLIER_ROUNDS = 3  # an outlier frame may hide another
 # Causes that a corrected camera may mend; of others, it would only be another wrong one.
 OF_LENSES = (Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.NOT_RECTIFIED, Cause.ALREADY_RECTIFIED)
 CAMERA_ROUNDS = 3  # after two, changes are those by which pictures differ that are rectified a fraction of a pixel apart
-Nuisance = tuple[Covariance, tuple[Matrix, Covariance] | None, Effect | None]  # see Estimate.nuisance
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +61,7 @@ class Estimate:
         """Of the features that the optimum is one of."""
         return self.optimised.objective
 
-    def nuisance(self, config: Config, lens: LensEstimate | None) -> Nuisance:
+    def nuisance(self, config: Config, lens: LensEstimate | None) -> tuple[Covariance, LensEffect | None, Effect | None]:
         """What the clocks and this lens leave open of the optimum, however many such scenes there are: covariance (6, 6) by the
         clocks, how the lens moves it, and the effect of an offset as large as motion.max_time_offset_s; None where the motion is
         not known."""
@@ -73,32 +70,26 @@ class Estimate:
         sigma_s, clocks = self.optimised.clocks(config.motion)
         active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
-        nothing, by_lens = np.zeros((6, 6)), None
-        if not limits.open_axes.any():
-            return nothing, by_lens, None
-        if lens is not None:
+        by_clocks, by_lens, any_offset = np.zeros((6, 6)), None, None
+        if lens is not None and limits.open_axes.any():
             kept = [axis for direction in self.unobservable for axis in direction.axes]
             by_lens = lens.effect(constraints, covariance, kept)
-        moving = with_known_motion(self.optimised.features, score)
-        if moving is None:
-            return nothing, by_lens, None
-        known, offset = clocks is not None, ClockOffset(sigma_s, moving[1])
-        if clocks is None or active.any():  # else it is that of the same optimum
-            clocks = offset.effect(moving[0], T, limits)
-        effect = replace(clocks, information=0.0) if known else clocks  # these scenes count only once
-        by_clocks = effect.constrained(constraints, covariance, sigma_s).covariance(sigma_s)
-        return by_clocks, by_lens, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s)
+        moving = with_known_motion(self.optimised.features, score) if limits.open_axes.any() else None
+        if moving is not None:
+            known = clocks is not None
+            if clocks is None or active.any():  # else it is that of the same optimum
+                clocks = offset_effect(moving[0], T, moving[1], limits)
+            effect = replace(clocks, information=0.0) if known else clocks  # these scenes count only once
+            by_clocks = effect.constrained(constraints, covariance, sigma_s).covariance(sigma_s)
+            any_offset = clocks.constrained(constraints, covariance, config.motion.max_time_offset_s)
+        return by_clocks, by_lens, any_offset
 
-    def result(self, nuisance: Nuisance, refusal: Refusal | None, motion: MotionConfig, notes: Sequence[str]) -> Result:
-        """The Result, with the extrinsic that it started from where it is refused. nuisance: see there. notes: for its reason."""
-        shared, by_lens, clocks = nuisance
+    def result(self, config: Config, lens: LensEstimate | None, refusal: Refusal | None, notes: Sequence[str]) -> Result:
+        """The Result, with the start where it is refused. lens: see `nuisance`. notes: for its reason."""
         objective, features, search = self.objective, self.optimised.features, self.optimised.search
         names = [f.name or str(k) for k, f in enumerate(features)]
         outliers = [names[k] for k in self.alignment.outliers]
         used = len(features) - len(outliers)
-        offset, whole = self.optimised.offset, self.covariance + shared
-        moves, moment = (np.zeros((6, 1)), np.eye(1)) if by_lens is None else by_lens
-        known = None if refusal or offset is None or not offset.observable(motion) else self.optimised
         reasons = [
             str(refusal) if refusal else "",
             *notes,
@@ -108,19 +99,14 @@ class Estimate:
             "" if all(f.has_reflectivity for f in features) else NO_INTENSITY,
             ONE_FRAME if used == 1 else "",
         ]
-        return Result(
-            self.initial if refusal else self.T,
-            REFUSED if refusal else CONVERGED,
+        found = Result(
+            self.T,
+            CONVERGED,
             joined(reasons),
             frames_used=used,
             initial=self.initial,
             frame_names=tuple(names),
             frames_left_out=tuple(outliers),
-            refusal=refusal.code if refusal else None,
-            refusal_figures=refusal.figures if refusal else {},
-            cause=refusal.cause if refusal else None,
-            optimum=self.T if refusal else None,
-            optimum_covariance=self.covariance if refusal else None,
             data_stamp=max(f.stamp for f in features),
             score=objective.value(self.T),
             initial_score=objective.value(self.start),
@@ -128,19 +114,29 @@ class Estimate:
             frame_scores=tuple(float(s) for s in objective.frame_scores(self.T)),
             starts=None if search is None else (search.agreed, search.optimised),
             intrinsics={} if self.lens is None else self.lens.in_files(),
-            covariance=None if refusal else whole,
-            covariance_with_intrinsics=None if refusal else whole + moves @ moment @ moves.T,
-            lens_effect=None if refusal else by_lens,
-            shared_covariance=None if refusal else shared,
-            clock_direction=None if refusal or clocks is None else clocks.direction,
-            clock_sigma_s=None if refusal or clocks is None else clocks.sigma(motion.max_time_offset_s),
-            clock_offset_s=None
-            if refusal or offset is None
-            else motion.time_offset_s + (self.optimised.seconds or offset.seconds),
-            time_offset_s=None if known is None else motion.time_offset_s + known.seconds,
-            time_offset_sigma_s=None if known is None else known.clocks(motion)[0],
-            stamping=None if known is None else known.stamping,
         )
+        if refusal is not None:
+            found = replace(
+                found, T_camera_lidar=self.initial, status=REFUSED, optimum=self.T, optimum_covariance=self.covariance
+            )
+            return replace(found, refusal=refusal.code, refusal_figures=refusal.figures, cause=refusal.cause)
+        shared, by_lens, clocks = self.nuisance(config, lens)
+        motion, offset, whole = config.motion, self.optimised.offset, self.covariance + shared
+        moves, moment = (np.zeros((6, 1)), np.eye(1)) if by_lens is None else by_lens
+        found = replace(
+            found,
+            covariance=whole,
+            covariance_with_intrinsics=whole + moves @ moment @ moves.T,
+            lens_effect=by_lens,
+            shared_covariance=shared,
+            clock_direction=None if clocks is None else clocks.direction,
+            clock_sigma_s=None if clocks is None else clocks.sigma(motion.max_time_offset_s),
+            clock_offset_s=None if offset is None else motion.time_offset_s + (self.optimised.seconds or offset.seconds),
+        )
+        if offset is None or not offset.observable(motion):
+            return found
+        seconds, sigma_s = motion.time_offset_s + self.optimised.seconds, self.optimised.clocks(motion)[0]
+        return replace(found, time_offset_s=seconds, time_offset_sigma_s=sigma_s, stamping=self.optimised.stamping)
 
 
 def insufficient(error: CalibrationError, initial: Transform, frames: int, notes: Sequence[str] = ()) -> Result:

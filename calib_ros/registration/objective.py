@@ -15,11 +15,11 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.classes import consistency_score
-from calib_ros.registration.features import FrameFeatures, other_objective, views_of
+from calib_ros.registration.features import FrameFeatures, other_objective, search_margin, views_of
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.fast_score import FastScore
-from calib_ros.registration.score.point_score import MARGIN, PointScore, SmoothScore
+from calib_ros.registration.score.point_score import PointScore, SmoothScore
 from calib_ros.registration.search.constraints import (
     REFINEMENT_DEG,
     REFINEMENT_M,
@@ -86,14 +86,6 @@ class Objective(Protocol):
 def penalised(objective: Objective, T: Transform) -> float:
     """What is maximised: the score less the cost of the prior."""
     return objective.value(T) - objective.constraints.cost(T)
-
-
-def search_margin(camera: Camera, box: SearchBox | None) -> float:
-    """How far around the image points may come into view anywhere in a box, as a share of its width."""
-    if box is None:
-        return MARGIN
-    deg, m = box.reach
-    return max(MARGIN, float(1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)))
 
 
 class FastObjective:

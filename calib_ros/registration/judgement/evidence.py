@@ -11,9 +11,16 @@ import math
 from dataclasses import dataclass
 
 from calib_ros.arrays import Transform
-from calib_ros.registration.acceptance.split_half import disagreement, inflation
-from calib_ros.registration.covariance import REGIONS, USUAL_CELLS, effective_frames, effective_points
-from calib_ros.registration.nuisance.parameters import GROSSLY, noise_of
+from calib_ros.registration.covariance import (
+    REGIONS,
+    USUAL_CELLS,
+    disagreement,
+    effective_frames,
+    effective_points,
+    inflation,
+    noise_of,
+)
+from calib_ros.registration.judgement.refusal import GROSSLY
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import unlimited
 

@@ -2,7 +2,7 @@
 
 Each is a guess of what was meant instead, and is tried: the extrinsic that is right if the guess is, refined, and compared with
 chance like any other optimum. What may be wrong by little of the lens and the clocks is told at an optimum (lens.py,
-nuisance/clock_offset.py).
+clocks.py).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.lens import LENSES, PERSPECTIVE
 from calib_ros.lidar.scanner_pose import ScannerPose
-from calib_ros.registration.acceptance.refusal import AS_RAW
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.judgement.refusal import AS_RAW
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.result import Cause
 

@@ -38,13 +38,13 @@ from calib_ros.registration.judgement.hypotheses import (
     turned_over,
 )
 from calib_ros.registration.judgement.lens import LensEstimate, estimate_lens, lens_unknowns
-from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, REACH, TOLERANCE_DEG, refined
 from calib_ros.registration.objective import ObjectiveMaker
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.chance import LOWEST_DECOY_Z, null_distribution, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.search.optimizers import LEVELS, NEAR_LEVELS, POINTS, REACH, TOLERANCE_DEG, refined
 from calib_ros.registration.search.search import search_decoy, search_once
 from calib_ros.result import Cause
 

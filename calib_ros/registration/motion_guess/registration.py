@@ -10,11 +10,11 @@ import numpy as np
 from calib_ros.arrays import Matrix
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.classes import PoseHypothesis
 from calib_ros.registration.estimate import insufficient
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import MOTION, SEMANTIC, nominal
+from calib_ros.registration.judgement.refusal import joined
 from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, Result

@@ -16,9 +16,9 @@ from calib_ros import se3
 from calib_ros.config import Config, ScoreConfig, SearchConfig, update
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import ConfigError
-from calib_ros.registration.acceptance.checks import check_uncertainty
-from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.covariance import disagreement
+from calib_ros.registration.judgement.acceptance import check_uncertainty
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.chance import null_distribution, p_value
 from calib_ros.registration.score.fast_score import FastScore

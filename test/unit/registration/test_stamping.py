@@ -12,7 +12,7 @@ from calib_ros.config import update
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.nuisance.stamping import convention
+from calib_ros.registration.joint import convention
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Stamping, parse
 

@@ -22,6 +22,9 @@ ONE_FRAME = "one frame only: a direction that it does not show may be wrong; use
 AS_RAW = "give --no-rectified, or image_is_rectified: false to the node"
 # And where intrinsics may be at fault, of a Camera.said_rectified.
 MAYBE_RAW = f"the images are taken for rectified, but camera_info has a distortion: if straight lines are bent in them, {AS_RAW}"
+SIGNIFICANCE = 1e-3  # largest probability of a false refusal
+GROSSLY = 0.01  # share of what is given that is plainly wrong, as the intrinsics of another image size are
+OPEN_PROBABILITY = 0.1  # of being plainly wrong: a search must reach its tolerance with 90 %
 USUAL_ASPECT, MIDDLE = 0.05, 0.25  # shares: fy and fx differ by less, and the principal point lies farther from every border
 SUSPECT_INTRINSICS = (RefusalCode.WRONG_INTRINSICS, RefusalCode.NOT_SIGNIFICANT, RefusalCode.LOW_SCORE)
 

@@ -16,7 +16,13 @@ from calib_ros.arrays import Covariance, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config
 from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
-from calib_ros.registration.acceptance.refusal import (
+from calib_ros.registration.classes import consistency_score
+from calib_ros.registration.covariance import disagreement, inflation, unobservable_directions
+from calib_ros.registration.estimate import Alignment, Estimate
+from calib_ros.registration.features import views_of
+from calib_ros.registration.joint import Optimised, estimates_offset
+from calib_ros.registration.judgement.clocks import refuse_clocks, with_known_motion
+from calib_ros.registration.judgement.refusal import (
     Refusal,
     low_score,
     not_significant,
@@ -26,14 +32,6 @@ from calib_ros.registration.acceptance.refusal import (
     worse_than_start,
     wrong_times,
 )
-from calib_ros.registration.acceptance.split_half import disagreement, inflation
-from calib_ros.registration.classes import consistency_score
-from calib_ros.registration.covariance import unobservable_directions
-from calib_ros.registration.estimate import Alignment, Estimate
-from calib_ros.registration.features import views_of
-from calib_ros.registration.joint import Optimised, estimates_offset
-from calib_ros.registration.nuisance.clock_offset import ClockOffset, estimate_clocks
-from calib_ros.registration.nuisance.time_offset import with_known_motion
 from calib_ros.registration.objective import Objective, penalised, trust_region
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, UNDOUBTED_Z, null_extrinsics, p_value
@@ -124,10 +122,10 @@ class Acceptance:
         limited = tolerance[0] < NO_LIMIT_DEG or tolerance[1] < NO_LIMIT_M
         if evidence.p_value > refine.max_p_value:  # where nothing matches, neither do clocks
             return None if wrong is None else replace(wrong, cause=None)
-        fault = found.lens.fault(*tolerance) if limited and found.lens is not None else None
+        fault = found.lens.fault(self.camera, *tolerance) if limited and found.lens is not None else None
         # A lens that is plainly wrong looks like other clocks, too, and those in vain: it is wrong at theirs as well.
-        if fault is not None and (wrong is None or fault.probability == 1):
-            return fault.refusal(self.camera, *tolerance)
+        if fault is not None and (wrong is None or fault.code is RefusalCode.WRONG_INTRINSICS):
+            return fault
         if wrong is not None or not limited:
             return wrong
         if not self.searched:
@@ -135,10 +133,9 @@ class Acceptance:
         moving = with_known_motion(optimised.features, objective.edges.score)
         # An offset that was found may be the best of those that were looked at only.
         if moving is not None and (optimised.seconds != 0 or not estimates_offset(optimised.features, self.config)):
-            clocks, inflated = ClockOffset(self.config.motion.time_offset_sigma_s, moving[1]), inflation(evidence.disagreement)
-            limits = objective.constraints.limits
-            estimate = estimate_clocks(clocks, moving[0], found.alignment.T, limits, inflated)
-            return None if estimate is None else estimate.refusal(*tolerance)
+            limits, prior_s = objective.constraints.limits, self.config.motion.time_offset_sigma_s
+            inflated = inflation(evidence.disagreement)
+            return refuse_clocks(moving[0], found.alignment.T, moving[1], limits, prior_s, tolerance, inflated)
         return None
 
     def _check_offset(self, optimised: Optimised) -> Refusal | None:
