@@ -25,11 +25,10 @@ from calib_ros.frame import Frame
 from calib_ros.intrinsics import CENTRE
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
-from calib_ros.registration.covariance import covariance, disagreement, inflation, noise_of
+from calib_ros.registration.covariance import covariance, disagreement, freedom, inflation, noise_of, shows_lens, shows_noise
 from calib_ros.registration.features import FrameFeatures, ScanEdges, at_time_offset, usable_frames, with_classes
-from calib_ros.registration.judgement.evidence import Match, convinces, freedom, log_odds, rare_odds, shows_lens, shows_noise
 from calib_ros.registration.judgement.hypotheses import MIXED_UP, AsTaken, fisheyes
-from calib_ros.registration.judgement.judge import NEAR, Candidate, Question, is_only_off
+from calib_ros.registration.judgement.judge import NEAR, Candidate, Match, Question, convinces, is_only_off, log_odds, rare_odds
 from calib_ros.registration.judgement.lens import LensEstimate
 from calib_ros.registration.judgement.refusal import Refusal
 from calib_ros.registration.progress import Callback, Progress

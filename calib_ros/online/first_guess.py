@@ -19,8 +19,7 @@ from calib_ros.registration.classes import CLOUD, IMAGE, PoseHypothesis
 from calib_ros.registration.features import FrameFeatures, views_of
 from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, MOTION
 from calib_ros.registration.judgement.refusal import joined
-from calib_ros.registration.motion_guess.guess import motion_guess
-from calib_ros.registration.motion_guess.registration import best_registration, better
+from calib_ros.registration.motion_guess.guess import best_registration, better, motion_guess
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import INSUFFICIENT, InitialSource, Result

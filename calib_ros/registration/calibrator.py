@@ -46,12 +46,12 @@ from calib_ros.registration.features import (
 )
 from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import JointSearch
-from calib_ros.registration.judgement.acceptance import Acceptance, leaves_doubt
+from calib_ros.registration.judgement.acceptance import evidence_of, leaves_doubt, refusal_of
 from calib_ros.registration.judgement.hypotheses import AsTaken
 from calib_ros.registration.judgement.judge import Judge, Question, is_only_off
 from calib_ros.registration.judgement.lens import LensEstimate, LensUnknown, estimate_lens, lens_unknowns
 from calib_ros.registration.judgement.refusal import MAYBE_RAW, SUSPECT_INTRINSICS, joined, odd_intrinsics
-from calib_ros.registration.motion_guess.registration import best_registration, from_anything, from_motion
+from calib_ros.registration.motion_guess.guess import best_registration, from_anything, from_motion
 from calib_ros.registration.objective import Objective, ObjectiveMaker
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z
@@ -258,8 +258,7 @@ class Calibrator:
             alignment = reject_outlier_frames(objective, optimised.T, watch)
             alignment = refine_start(objective, alignment, start, watch)
             # Covariance.
-            acceptance = Acceptance(self.config, self.extract.source_camera, box)
-            evidence = acceptance.evidence(objective, alignment, optimised.search)
+            evidence = evidence_of(self.config, objective, alignment, optimised.search)
             inflated = inflation(evidence.disagreement)
             pose = observable_pose(
                 objective, alignment.T, start, box, inflated, optimised.search.nearby if optimised.search else ()
@@ -267,8 +266,8 @@ class Calibrator:
             lens = self._lens(objective, alignment.T, inflated)
             found = Estimate(initial, start, optimised, alignment, evidence, *pose, lens)
             # Accept, with what intrinsics and clocks leave open, or say why not.
-            refusal = acceptance.refusal(found, watch)
-            stated = self.extract.source_camera
+            stated, searched = self.extract.source_camera, box is not None and not box.is_empty
+            refusal = refusal_of(found, self.config, stated, searched, watch)
             if refusal is not None and refusal.code in SUSPECT_INTRINSICS and stated.said_rectified:
                 notes = [MAYBE_RAW, *notes]
             notes = [*odd_intrinsics(stated), *notes]

@@ -45,6 +45,9 @@ HALF_LEVELS = (2, 3, 4)  # on which one is refined: coarse enough to leave an op
 AGREEING, MOST = 0.7, 5.0
 SECTOR = np.deg2rad(6.0)  # width of interleaved sectors of azimuth: wider than an object's edge, narrower than a scene
 
+UNKNOWNS = 6  # of an extrinsic
+INDEPENDENT = 2.0  # frames; one scene alone does not tell noise from what is wrong in it
+
 AXIS_NAMES = ("pitch", "yaw", "roll", "sideways shift", "vertical shift", "forward shift")  # of a twist
 TAKES_PART = 0.4  # share of the largest component of a direction, in units of the limits, from which an axis is named
 
@@ -181,6 +184,23 @@ def effective_frames(score: PointScore) -> float:
         return float(len(frames))
     correlation = score.atlas.correlation(min(DUPLICATE_LEVEL, score.n_levels - 1))
     return float(len(frames) ** 2 / correlation[np.ix_(frames, frames)].sum())
+
+
+def freedom(score: PointScore) -> float:
+    """Degrees of freedom of the noise of a score: the regions of all frames that show different places, with those that the usual
+    noise counts for, less the unknowns."""
+    return REGIONS * effective_frames(score) + USUAL_CELLS - UNKNOWNS - 1
+
+
+def shows_noise(score: PointScore) -> bool:
+    """Whether there are scenes enough to tell noise from what is wrong in one of them."""
+    return effective_frames(score) >= INDEPENDENT
+
+
+def shows_lens(score: PointScore) -> bool:
+    """Whether intrinsics can be judged: by several scenes, one may gain much by chance, and not on unrolled pictures, where a
+    shift is a rotation and lenses of another focal length are unrolled otherwise."""
+    return shows_noise(score) and not score.camera.is_sphere
 
 
 def share_of_weight(values: Matrix, weights: NDArray[np.float32], parts: int) -> NDArray[np.intp]:

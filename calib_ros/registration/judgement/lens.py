@@ -36,10 +36,10 @@ from calib_ros.registration.covariance import (
 )
 from calib_ros.registration.judgement.refusal import GROSSLY, OPEN_PROBABILITY, SIGNIFICANCE, Refusal, left_open, wrong_intrinsics
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
+from calib_ros.registration.score.chance import EvenPoints
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, unlimited
 from calib_ros.registration.search.optimizers import NEAR_LEVELS, POINTS, REACH, JointView, ascend_jointly, linearised
-from calib_ros.registration.starts import EvenPoints
 
 LEVELS = (2, 3, 4)  # blurred as far as a lens that is 5 % off moves the border of a picture
 NODES = (65, 49)  # across and down, at which the effect on rays is computed; between, it is smooth

@@ -56,8 +56,10 @@ class Atlas:
         )
         for j, own in enumerate(levels):
             if kept is None or kept._frames[j]() is not own[0]:
-                for k, level in enumerate(self.levels):
-                    _fill(level, self.channels * j, own[k].packed)
+                for k, level in enumerate(self.levels):  # no point of a frame with fewer maps looks at the others' room
+                    corners = level.corner[self.channels * j :].astype(int)
+                    for tile, (u, v) in zip(own[k].packed, corners, strict=False):
+                        level.image[v : v + level.height, u : u + level.width] = tile
 
     def correlation(self, level: int) -> NDArray[np.float64]:
         """How alike the edge maps of all frames are at a level, (n_frames, n_frames), 0..1. Computed once."""
@@ -126,9 +128,3 @@ def _undistorted(level: AtlasLevel, tiles: int, barrel: float) -> AtlasLevel:
         own = slice(v0, v0 + level.height), slice(u0, u0 + level.width)
         image[own] = cv2.remap(level.image[own], maps[0], maps[1], cv2.INTER_LINEAR)
     return replace(level, image=image)
-
-
-def _fill(level: AtlasLevel, tile: int, maps: NDArray[np.int16]) -> None:
-    """Write the maps (c, h, w) of a frame from the given tile on; no point of one with fewer looks at the others' room."""
-    for own, (u0, v0) in zip(maps, level.corner[tile : tile + len(maps)].astype(int), strict=True):
-        level.image[v0 : v0 + level.height, u0 : u0 + level.width] = own

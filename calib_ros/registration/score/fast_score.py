@@ -48,19 +48,16 @@ class FastScore(PointScore):
                 "wait for a scene with objects, or check the initial extrinsic"
             )
         weights = np.concatenate([_weights(p, config) for p in kept])
+        # A camera mounted on its side sees side and upward edges exchanged.
+        axes = [np.abs(T_prior[:3, :3] @ p.pose.axis) for p in kept]
+        channels = [(_IS_UPWARD[p.kind] != (axis[0] > axis[1])).astype(np.intp) for p, axis in zip(kept, axes, strict=True)]
         super().__init__(
             np.concatenate([p.xyz for p in kept]).T,
             (weights / weights.sum()).astype(np.float32),
             frame,
-            np.concatenate([_channels(p, T_prior) for p in kept]),
+            np.concatenate(channels),
             atlas or Atlas([f.levels for f in features], camera),
         )
-
-
-def _channels(points: EdgePoints, T_prior: Transform) -> NDArray[np.intp]:
-    """Which map each of a frame's points (n,) is to meet: a camera mounted on its side sees side and upward edges exchanged."""
-    axis = T_prior[:3, :3] @ points.pose.axis
-    return np.asarray(_IS_UPWARD[points.kind] != (abs(axis[0]) > abs(axis[1])), np.intp)
 
 
 def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:

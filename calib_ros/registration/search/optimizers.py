@@ -133,7 +133,7 @@ def ascend_jointly(
     n, of_x = len(x), np.ones(len(x), bool) if free is None else free
 
     def penalised(value: float, T: Transform) -> float:
-        return value - (prior.value(T) if prior else 0.0)
+        return value - (prior.cost(T)[0] if prior else 0.0)
 
     for level in levels:
         here = see(T, x)

@@ -14,7 +14,7 @@ from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor, at_time_offset
 from calib_ros.registration.joint import Optimised
-from calib_ros.registration.judgement.acceptance import Acceptance
+from calib_ros.registration.judgement.acceptance import check_offset
 from calib_ros.registration.judgement.clocks import Effect, TimeOffset, estimate_time_offset, scatter_gain
 from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
@@ -124,7 +124,7 @@ def test_an_offset_that_cannot_be_reached_is_never_accepted_wrong(scene):
 )
 def test_an_extrinsic_at_other_clocks_is_refused(scene, applied_s, seconds, sigma_s, gain, refused):
     offset = TimeOffset(seconds, scene.truth, sigma_s, gain, Effect(np.zeros(6), 1 / sigma_s**2), 0.3, 1.0, 0.1)
-    wrong = Acceptance(Config(), 640, None)._check_offset(Optimised([], None, scene.truth, None, offset, applied_s))
+    wrong = check_offset(Optimised([], None, scene.truth, None, offset, applied_s), Config().motion)
     assert (wrong is not None) == refused
 
 
