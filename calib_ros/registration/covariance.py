@@ -6,7 +6,7 @@ rad and m.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -289,8 +289,14 @@ def disagreement(score: PointScore, T: Transform, limits: Limits) -> float:
     # A half of the weight has twice the noise of all.
     noise = 2 * noise_level(part, T, inverse_curvature(part, T, axes), axes)
     systematic = np.diag((2 * SYSTEMATIC_ERROR[axes]) ** 2)
-    factors = []
-    for half in _halvings(part, T):
+    p, factors = T[:3, :3] @ part.points + T[:3, 3:], []
+    quarter = share_of_weight(np.arctan2(p[0], p[2]), part.weights, 4)
+    sector = np.floor(np.arctan2(part.points[1], part.points[0]) / SECTOR)
+    # Sectors of the scan, sides of the image, middle, near ones, alternate frames.
+    middle, near = (quarter == 0) | (quarter == 3), share_of_weight(p[2], part.weights, 2) > 0
+    for half in (sector % 2 > 0, quarter >= 2, middle, near, part.frame % 2 > 0):
+        if not MIN_POINTS <= np.count_nonzero(half) <= len(half) - MIN_POINTS:
+            continue
         both = [part.select(np.flatnonzero(half == k)) for k in (False, True)]
         ends = [T, T]
         for level, (k, own) in product(HALF_LEVELS, enumerate(both)):
@@ -304,19 +310,3 @@ def disagreement(score: PointScore, T: Transform, limits: Limits) -> float:
 def inflation(disagreement: float) -> float:
     """By how much the variance of the optimum is larger than its curvature and its noise tell."""
     return AGREEING + disagreement
-
-
-def _halvings(score: PointScore, T: Transform) -> Iterator[NDArray[np.bool_]]:
-    """Masks (n,) of halves with enough points: sectors of the scan, sides of the image, middle, near ones, alternate frames."""
-    p = T[:3, :3] @ score.points + T[:3, 3:]
-    quarter = share_of_weight(np.arctan2(p[0], p[2]), score.weights, 4)
-    azimuth = np.arctan2(score.points[1], score.points[0])
-    for mask in (
-        np.floor(azimuth / SECTOR) % 2 > 0,
-        quarter >= 2,
-        (quarter == 0) | (quarter == 3),
-        share_of_weight(p[2], score.weights, 2) > 0,
-        score.frame % 2 > 0,
-    ):
-        if MIN_POINTS <= np.count_nonzero(mask) <= len(mask) - MIN_POINTS:
-            yield mask

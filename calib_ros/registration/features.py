@@ -163,7 +163,18 @@ class FeatureExtractor:
     def _of_edges(self, frame: Frame, image: NDArray[np.uint8], plain: FrameFeatures | None) -> FrameFeatures:
         """Edges of scan and image. plain: whose edge maps are taken over."""
         twist = used_twist(frame, self.config.motion)
-        still, reflectivity, edges = self._scan_edges(frame, twist)
+        key, still = None if self.scans is None else scan_key(frame), frame
+        found = None if self.scans is None or key is None else self.scans.get(key)
+        if found is None:
+            scan = range_image(frame.cloud, self.config.lidar)
+            if scan.layout == "projection" and twist is not None:
+                # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
+                still = deskewed_frame(frame, self.config.motion)
+                scan = range_image(still.cloud, self.config.lidar)
+            found = scan.reflectivity is not None, edge_points(scan, self.config.lidar)
+            if self.scans is not None and key is not None and still is frame:
+                self.scans[key] = found
+        reflectivity, edges = found
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
         points = deskewed_edges(edges, still, self.config.motion)
         levels = self._levels(image, points, of=frame) if plain is None else plain.levels
@@ -174,21 +185,6 @@ class FeatureExtractor:
             sweep_s = self.config.motion.scan_period_s * self.source_camera.field_deg / 720
             features = replace(features, unknown_motion_s=sweep_s)
         return features
-
-    def _scan_edges(self, frame: Frame, twist: NDArray[np.float64] | None) -> tuple[Frame, bool, EdgePoints]:
-        """A frame as its scan was searched, whether that has reflectivities, and its edges."""
-        key = None if self.scans is None else scan_key(frame)
-        if self.scans is not None and key is not None and (known := self.scans.get(key)) is not None:
-            return frame, *known
-        scan, still = range_image(frame.cloud, self.config.lidar), frame
-        if scan.layout == "projection" and twist is not None:
-            # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
-            still = deskewed_frame(frame, self.config.motion)
-            scan = range_image(still.cloud, self.config.lidar)
-        found = scan.reflectivity is not None, edge_points(scan, self.config.lidar)
-        if self.scans is not None and key is not None and still is frame:
-            self.scans[key] = found
-        return still, *found
 
     def _levels(
         self, image: NDArray[np.uint8], points: EdgePoints, semantic: Map | None = None, of: Frame | None = None

@@ -159,13 +159,11 @@ class Judge:
                     done.add(one)
                     odds = rare_odds(count) if own is None or not is_only_off(own, deg, m) else EVEN
                     if own is not None and self._beyond_chance(own, count) and convinces(log_odds(own, given), odds):
-                        return own if asked.box is None else self._simplest_as_good(own, tried, asked)
+                        return own if asked.box is None or own.hypothesis.of_lens else self._simpler(own, tried, asked)
         return None
 
-    def _simplest_as_good(self, found: Candidate, tried: Sequence[Candidate], asked: Question) -> Candidate:
+    def _simpler(self, found: Candidate, tried: Sequence[Candidate], asked: Question) -> Candidate:
         """What was found, or a simpler hypothesis that predicts about the same optimum as well: a rough start ranks none."""
-        if found.hypothesis.of_lens:
-            return found
         simpler = [own for own in tried if own.hypothesis.rank < found.hypothesis.rank and not own.hypothesis.of_lens]
         rivals = [own for own in simpler if _distance(own.hypothesis.T, found.T) <= found.surprise + SLACK]
         others = [self._confirmed(own, asked) for own in rivals[:CONFIRMED]]
@@ -257,28 +255,25 @@ class Judge:
                 if anew is None:
                     return None
                 one = anew
-        return self._with_lens(one) if guess.of_lens and shows_lens(one.score) else one
+        score, camera = one.score, one.score.camera
+        if not guess.of_lens or not shows_lens(score):
+            return one
+        lens = estimate_lens(score, one.T, unlimited(one.T), lens_unknowns(CameraConfig(), camera, camera))
+        if lens is None:
+            return one
+        seen, T = lens.seen(score)
+        left, share = next((k for k, own in enumerate(lens.unknowns) if own.name == FOCAL), None), guess.lens[0]
+        told = left is not None and abs(lens.change[left]) > SHOWN_SIGMAS * lens.sigma[left]
+        if told and share and guess.cause is Cause.OTHER_CAMERA:
+            guess = replace(guess, message=of_another_size((1 + share) * (1 + float(lens.change[left]))))
+        T = refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0]
+        return max(one, replace(one, score=seen, T=T, hypothesis=guess), key=evidence)
 
     def _searched(self, one: Candidate, asked: Question) -> Candidate:
         """The same at the best optimum that one round of a search near it finds: the sensors as given are searched as well."""
         start = one.T if asked.box is None else one.hypothesis.T
         T = search_once(one.score, start, asked.box or NEAR, self.config.search, unlimited(start))
         return replace(max(one, replace(one, T=T), key=evidence), searched=True)
-
-    def _with_lens(self, one: Candidate) -> Candidate:
-        """A hypothesis about the lens, with what is left of it refined."""
-        score, camera = one.score, one.score.camera
-        lens = estimate_lens(score, one.T, unlimited(one.T), lens_unknowns(CameraConfig(), camera, camera))
-        if lens is None:
-            return one
-        seen, T = lens.seen(score)
-        other = replace(one, score=seen, T=refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0])
-        left = next((k for k, own in enumerate(lens.unknowns) if own.name == FOCAL), None)
-        hypothesis, share = one.hypothesis, one.hypothesis.lens[0]
-        told = left is not None and abs(lens.change[left]) > SHOWN_SIGMAS * lens.sigma[left]
-        if told and share and hypothesis.cause is Cause.OTHER_CAMERA:
-            hypothesis = replace(hypothesis, message=of_another_size((1 + share) * (1 + float(lens.change[left]))))
-        return max(one, replace(other, hypothesis=hypothesis), key=evidence)
 
     def _beyond_chance(self, best: Candidate, tried: int) -> bool:
         """Does the best match of so many that were tried exceed what a decoy reaches?"""

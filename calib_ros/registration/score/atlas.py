@@ -87,7 +87,22 @@ class Atlas:
     def with_distortion(self, barrel: float) -> Atlas:
         """The same maps as an ideal lens would see them, if those of the pictures had a radial distortion that moves the corner
         towards the principal point by the share `barrel` of its radius, and other pixels less, by its square."""
-        out = self._with([_undistorted(level, self.channels * self.n_frames, barrel) for level in self.levels])
+
+        def undistorted(level: AtlasLevel) -> AtlasLevel:
+            centre = level.K[:2, 2]
+            u, v = np.arange(level.width) - centre[0], np.arange(level.height) - centre[1]
+            corner = max(abs(u[0]), abs(u[-1])) ** 2 + max(abs(v[0]), abs(v[-1])) ** 2
+            factor = 1 - barrel * (u**2 + v[:, None] ** 2) / corner
+            maps: Any = cv2.convertMaps(
+                (centre[0] + u * factor).astype(np.float32), (centre[1] + v[:, None] * factor).astype(np.float32), cv2.CV_16SC2
+            )
+            image = np.zeros_like(level.image)
+            for u0, v0 in level.corner[: self.channels * self.n_frames].astype(int):
+                own = slice(v0, v0 + level.height), slice(u0, u0 + level.width)
+                image[own] = cv2.remap(level.image[own], maps[0], maps[1], cv2.INTER_LINEAR)
+            return replace(level, image=image)
+
+        out = self._with([undistorted(level) for level in self.levels])
         out._correlations = {}
         return out
 
@@ -112,19 +127,3 @@ def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> A
     scale, sigma = level.scale, level.sigma
     S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
     return AtlasLevel(image, corner, S @ camera.K, w, h, sigma / scale)
-
-
-def _undistorted(level: AtlasLevel, tiles: int, barrel: float) -> AtlasLevel:
-    """A level with its tiles resampled; see Atlas.with_distortion."""
-    centre = level.K[:2, 2]
-    u, v = np.arange(level.width) - centre[0], np.arange(level.height) - centre[1]
-    corner = max(abs(u[0]), abs(u[-1])) ** 2 + max(abs(v[0]), abs(v[-1])) ** 2
-    factor = 1 - barrel * (u**2 + v[:, None] ** 2) / corner
-    maps: Any = cv2.convertMaps(
-        (centre[0] + u * factor).astype(np.float32), (centre[1] + v[:, None] * factor).astype(np.float32), cv2.CV_16SC2
-    )
-    image = np.zeros_like(level.image)
-    for u0, v0 in level.corner[:tiles].astype(int):
-        own = slice(v0, v0 + level.height), slice(u0, u0 + level.width)
-        image[own] = cv2.remap(level.image[own], maps[0], maps[1], cv2.INTER_LINEAR)
-    return replace(level, image=image)

@@ -213,19 +213,20 @@ class Rounds:
             own = progress.part(0.6 * k / len(self.strategies), 0.6 * (k + 1) / len(self.strategies))
             starts = self.seed_starts(strategy, self._rounds == 0, own.part(0, 0.25))
             self._optimise(starts, strategy[2], own.part(0.25, 1))
+
+        def polish(optimum: Optimum) -> None:
+            """On the middle levels, by simplex: it is robust where the slope misleads."""
+            optimum.coarse_T = optimum.T
+            for level, step in SIMPLEX_DEG.items():
+                score = self.middle.at(level)
+                optimum.T, optimum.value = nelder_mead(score, optimum.T, step, SIMPLEX_EVALUATIONS, self.penalty, self.limits)
+
         waiting = sorted((o for o in self._all if o.coarse_T is None), key=lambda o: -o.value)[:POLISHED]
-        for k, _ in enumerate(self.workers.map(self._polish, waiting)):
+        for k, _ in enumerate(self.workers.map(polish, waiting)):
             progress(0.6 + 0.3 * (k + 1) / len(waiting))
         self._polished += waiting
         self._polished.sort(key=lambda o: -o.value)
         self._rounds += 1
-
-    def _polish(self, optimum: Optimum) -> None:
-        """On the middle levels, by simplex: it is robust where the slope misleads."""
-        optimum.coarse_T = optimum.T
-        for level, step in SIMPLEX_DEG.items():
-            score = self.middle.at(level)
-            optimum.T, optimum.value = nelder_mead(score, optimum.T, step, SIMPLEX_EVALUATIONS, self.penalty, self.limits)
 
     def best(self) -> tuple[Matrix, int]:
         """The best extrinsic (4, 4) so far, and how many starts ended there."""
