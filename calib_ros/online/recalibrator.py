@@ -32,8 +32,8 @@ from calib_ros.online.worker import Cancelled
 from calib_ros.registration.calibrator import NO_MATCH, Calibrator
 from calib_ros.registration.classes import ALL, CLASSES, Segmentation
 from calib_ros.registration.classes import segmentation as models_of
+from calib_ros.registration.estimate import leaves_doubt
 from calib_ros.registration.features import FrameFeatures, points_in_reach
-from calib_ros.registration.judgement.acceptance import leaves_doubt
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, RefusalCode, Result

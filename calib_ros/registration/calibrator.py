@@ -28,10 +28,13 @@ from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.covariance import inflation
 from calib_ros.registration.estimate import (
     Estimate,
+    evidence_of,
     insufficient,
+    leaves_doubt,
     observable_pose,
     refine_start,
     refined_with_camera,
+    refusal_of,
     reject_outlier_frames,
 )
 from calib_ros.registration.features import (
@@ -46,7 +49,6 @@ from calib_ros.registration.features import (
 )
 from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import JointSearch
-from calib_ros.registration.judgement.acceptance import evidence_of, leaves_doubt, refusal_of
 from calib_ros.registration.judgement.hypotheses import AsTaken
 from calib_ros.registration.judgement.judge import Judge, Question, is_only_off
 from calib_ros.registration.judgement.lens import LensEstimate, LensUnknown, estimate_lens, lens_unknowns

@@ -18,10 +18,10 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import ConfigError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import disagreement
-from calib_ros.registration.judgement.acceptance import check_uncertainty
+from calib_ros.registration.estimate import check_uncertainty
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.chance import null_distribution, p_value
-from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 from calib_ros.registration.search.parallel import Workers, cpu_time

@@ -12,11 +12,11 @@ from scenes import QUICK, Scene, assert_not_used, driven
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.estimate import check_offset
 from calib_ros.registration.features import FeatureExtractor, at_time_offset
 from calib_ros.registration.joint import Optimised
-from calib_ros.registration.judgement.acceptance import check_offset
 from calib_ros.registration.judgement.clocks import Effect, TimeOffset, estimate_time_offset, scatter_gain
-from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode, Result
 
