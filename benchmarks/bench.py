@@ -26,9 +26,8 @@ from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import CLOUD, IMAGE
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros.registration.frames import points_in_reach
-from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, points_in_reach
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.maps import complete_depth, complete_fast, far_level

@@ -218,7 +218,17 @@ def with_edges(data: bytes, path: str, edges: Edges, joint: str | None = None) -
             raise BadInputError(f"{path} is no valid YAML{io.what_is_wrong(error)}; correct it") from None
         ours = [(parent, child) for parent, child in edges if _value_of(_value_of(root, parent), child) is not None]
         ours = ours if joint is None else ours[:1]
-        data = _with_entries(text, path, root, {edge: edges[edge] for edge in ours})
+        places: list[tuple[int, int, float]] = []
+        for parent, child in ours:
+            entry = _value_of(_value_of(root, parent), child)
+            for name, value in zip(POSE_NAMES, xyz_rpy(edges[parent, child]), strict=True):
+                node = _value_of(entry, name)
+                if not isinstance(node, yaml.ScalarNode):
+                    raise BadInputError(f"{path}: the entry of {child} must hold {', '.join(POSE_NAMES)}")
+                places.append((node.start_mark.index, node.end_mark.index, value))
+        for begin, end, value in sorted(places, reverse=True):
+            text = text[:begin] + _number(value) + text[end:]
+        data = text.encode()
     if not ours:
         what = "entry of the extrinsic" if joint is not None else f"{'joint' if of_robot else 'entry'} between the sensors"
         raise BadInputError(f"{path} has no {what}; {_no_edge(edges)}")
@@ -302,21 +312,6 @@ def _with_origin(data: bytes, path: str, name: str, edges: Edges) -> bytes:
         else:
             text = b'<origin %s="%s"' % (attribute, value) + text.removeprefix(b"<origin")
     return data[:at] + text + data[tag.end() :]
-
-
-def _with_entries(text: str, path: str, root: yaml.Node | None, edges: Edges) -> bytes:
-    """Autoware's YAML with the numbers of entries that it has replaced."""
-    places: list[tuple[int, int, float]] = []
-    for (parent, child), T in edges.items():
-        entry = _value_of(_value_of(root, parent), child)
-        for name, value in zip(POSE_NAMES, xyz_rpy(T), strict=True):
-            node = _value_of(entry, name)
-            if not isinstance(node, yaml.ScalarNode):
-                raise BadInputError(f"{path}: the entry of {child} must hold {', '.join(POSE_NAMES)}")
-            places.append((node.start_mark.index, node.end_mark.index, value))
-    for begin, end, value in sorted(places, reverse=True):
-        text = text[:begin] + _number(value) + text[end:]
-    return text.encode()
 
 
 def _value_of(node: yaml.Node | None, name: str) -> yaml.Node | None:

@@ -11,7 +11,8 @@ from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import ESTIMATE
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.judgement.hypotheses import MIXED_UP, Hypothesis, distorts
-from calib_ros.registration.judgement.lens import LensEstimate, LensFault
+from calib_ros.registration.judgement.lens import LensEstimate
+from calib_ros.registration.judgement.refusal import Refusal
 from calib_ros.result import Cause, RefusalCode, Result
 from calib_ros_check.outcome import CauseFinding, CauseState, Tolerance
 
@@ -63,20 +64,17 @@ def findings(causes: Iterable[Cause], state: CauseState, message: str) -> tuple[
     return tuple(CauseFinding(cause, state, message) for cause in causes)
 
 
-def lens_findings(
-    lens: LensEstimate | None, fault: LensFault | None, why_not: str, camera: Camera, tolerance: Tolerance
-) -> tuple[CauseFinding, ...]:
+def lens_findings(lens: LensEstimate | None, fault: Refusal | None, why_not: str, camera: Camera) -> tuple[CauseFinding, ...]:
     """Do focal length, principal point and distortion fit? lens: None = not judged, and why_not. camera: as it is claimed."""
     if lens is None:
         return findings(of_cameras(camera), CauseState.NOT_JUDGED, why_not)
     if fault is None:
         return findings(of_cameras(camera), CauseState.EXCLUDED, "no other camera matches clearly better")
-    refusal = fault.refusal(camera, tolerance.deg, tolerance.m)
     names = {"focal": "focal", "aspect": "aspect", "u": "u_px", "v": "v_px"}
-    values = {names[name]: value for name, value in refusal.figures.items() if name in names}
-    values["barrel"] = -refusal.figures.get("radial", 0.0)
-    assert refusal.cause is not None
-    return instead(CauseFinding(refusal.cause, CauseState.FOUND, str(refusal), values), of_cameras(camera))
+    values = {names[name]: value for name, value in fault.figures.items() if name in names}
+    values["barrel"] = -fault.figures.get("radial", 0.0)
+    assert fault.cause is not None
+    return instead(CauseFinding(fault.cause, CauseState.FOUND, str(fault), values), of_cameras(camera))
 
 
 def explained(hypothesis: Hypothesis, camera: Camera) -> tuple[CauseFinding, ...]:

@@ -23,21 +23,19 @@ from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import CENTRE
-from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
-from calib_ros.registration.covariance import covariance
-from calib_ros.registration.features import FrameFeatures, ScanEdges, at_time_offset
-from calib_ros.registration.frames import usable_frames, with_classes
-from calib_ros.registration.judgement.evidence import Match, convinces, freedom, log_odds, rare_odds, shows_lens, shows_noise
+from calib_ros.registration.covariance import covariance, disagreement, freedom, inflation, noise_of, shows_lens, shows_noise
+from calib_ros.registration.features import FrameFeatures, ScanEdges, at_time_offset, usable_frames, with_classes
 from calib_ros.registration.judgement.hypotheses import MIXED_UP, AsTaken, fisheyes
-from calib_ros.registration.judgement.judge import NEAR, Candidate, Question, is_only_off
-from calib_ros.registration.judgement.lens import LensEstimate, LensFault
-from calib_ros.registration.nuisance.parameters import NEAR_LEVELS, TOLERANCE_DEG, noise_of, refined
+from calib_ros.registration.judgement.judge import NEAR, Candidate, Match, Question, convinces, is_only_off, log_odds, rare_odds
+from calib_ros.registration.judgement.lens import LensEstimate
+from calib_ros.registration.judgement.refusal import Refusal
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.registration.search.optimizers import NEAR_LEVELS, TOLERANCE_DEG, refined
 from calib_ros.registration.search.search import FRUITLESS_ROUNDS
 from calib_ros.result import CONVERGED, Cause, Evidence, RefusalCode, Result
 from calib_ros_check.causes import (
@@ -211,7 +209,7 @@ class Checker:
         turned = None if se3.rotation_error_deg(inputs.T, found) <= inputs.tolerance.deg else inputs.T
         lens, fault = self._lens(score, found, result, inputs, turned)
         shared, whole = result.shared_covariance, result.covariance_with_intrinsics
-        causes = lens_findings(lens, fault, NOT_JUDGED, self.camera, inputs.tolerance)
+        causes = lens_findings(lens, fault, NOT_JUDGED, self.camera)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
         other = None if fault is not None else self._another_fisheye(score, found, inputs, offset)
@@ -237,12 +235,12 @@ class Checker:
 
     def _lens(
         self, score: PointScore, T: Matrix, result: Result, inputs: CheckInputs, turned: Matrix | None = None
-    ) -> tuple[LensEstimate | None, LensFault | None]:
+    ) -> tuple[LensEstimate | None, Refusal | None]:
         """What the scenes tell of the lens at the optimum T (4, 4) of an estimate, and what is wrong of it with 99 %."""
         inflated = 1.0 if result.evidence is None else inflation(result.evidence.disagreement)
         lens = self._judge.lens(score, T, inflated, turned)
-        fault = None if lens is None else lens.fault(inputs.tolerance.deg, inputs.tolerance.m, ACCUSATION)
-        return lens, fault if fault is not None and fault.probability == 1 else None
+        fault = None if lens is None else lens.fault(self.camera, inputs.tolerance.deg, inputs.tolerance.m, ACCUSATION)
+        return lens, fault if fault is not None and fault.code is RefusalCode.WRONG_INTRINSICS else None
 
     def _another_fisheye(self, score: PointScore, found: Matrix, inputs: CheckInputs, offset_s: float) -> Candidate | None:
         """A fisheye with another focal length, or one that is said to be rectified, if it explains the frames better than the

@@ -18,9 +18,9 @@ from scipy.stats import chi2
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
-from calib_ros.registration.judgement.evidence import CONFIDENCE, EVEN, Match, convinces, evidence, log_odds
-from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, TOLERANCE_DEG, refined
+from calib_ros.registration.judgement.judge import CONFIDENCE, EVEN, Match, convinces, evidence, log_odds
 from calib_ros.registration.search.constraints import Limits
+from calib_ros.registration.search.optimizers import LEVELS, NEAR_LEVELS, POINTS, TOLERANCE_DEG, refined
 from calib_ros_check.outcome import CauseFinding, CheckVerdict, Deviation, Tolerance
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")

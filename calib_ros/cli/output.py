@@ -111,7 +111,7 @@ def _clocks(result: Result, scan_period_s: float) -> str:
     seconds, sigma_s = result.time_offset_s or 0.0, result.time_offset_sigma_s or 0.0
     text = f"time offset {1000 * seconds:+.1f} ms, 1 sigma {1000 * sigma_s:.1f} ms"
     if result.stamping is not None:
-        from calib_ros.registration.nuisance.stamping import convention
+        from calib_ros.registration.joint import convention
 
         found, left = convention(result.stamping, seconds, scan_period_s)
         return f"{text}; scans are stamped otherwise than configured: set {found}, motion.time_offset_s: {left:.4f}"

@@ -14,10 +14,8 @@ from calib_ros.frame import NANOSECONDS
 from calib_ros.online.monitor import MIN_TWIST
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.features import FrameFeatures, at_time_offset
-from calib_ros.registration.joint import clocks_are_estimated
-from calib_ros.registration.nuisance.parameters import SIGNIFICANT_Z
-from calib_ros.registration.nuisance.stamping import at_stamping, restamped
-from calib_ros.registration.nuisance.time_offset import STAMP_SCATTER_S
+from calib_ros.registration.joint import at_stamping, clocks_are_estimated, restamped
+from calib_ros.registration.judgement.clocks import SIGNIFICANT_Z, STAMP_SCATTER_S
 from calib_ros.result import Result
 
 # Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.

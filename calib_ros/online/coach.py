@@ -22,8 +22,8 @@ from calib_ros.config import Config
 from calib_ros.config.online import MANUAL
 from calib_ros.online.sensor_health import SensorFault
 from calib_ros.online.tracker import NOTHING, Confirmations
-from calib_ros.registration.acceptance.checks import largest_sigmas
 from calib_ros.registration.covariance import unobservable_directions
+from calib_ros.registration.estimate import largest_sigmas
 from calib_ros.result import BLINDED, CONVERGED, MOVED, REFUSED, SUSPECT, TENTATIVE, RefusalCode, Result
 
 AXES = ("pitch", "yaw", "roll", "sideways", "height", "forward")  # of a twist, as seen by the camera

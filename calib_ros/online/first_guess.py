@@ -16,14 +16,12 @@ from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.calibrator import NO_MATCH, Calibrator
 from calib_ros.registration.classes import ALL, CLASSES, CLOUD, IMAGE, FrameSemantics, PoseHypothesis
-from calib_ros.registration.features import FrameFeatures, views_of
-from calib_ros.registration.frames import points_in_reach
+from calib_ros.registration.features import FrameFeatures, points_in_reach, views_of
 from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, MOTION
-from calib_ros.registration.motion_guess.guess import motion_guess
-from calib_ros.registration.motion_guess.registration import best_registration, better
+from calib_ros.registration.judgement.refusal import joined
+from calib_ros.registration.motion_guess.guess import best_registration, better, motion_guess
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import INSUFFICIENT, InitialSource, Result

@@ -16,12 +16,10 @@ from calib_ros.config import MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, ShiftNoise, shift_evidence
 from calib_ros.online.glance import EVERY_S
-from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.covariance import REGIONS, covariance, distance, effective_frames, effective_points
+from calib_ros.registration.covariance import REGIONS, covariance, disagreement, distance, effective_frames, effective_points
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.nuisance.clock_offset import ClockOffset
-from calib_ros.registration.nuisance.time_offset import STAMP_SCATTER_S
+from calib_ros.registration.judgement.clocks import STAMP_SCATTER_S, at_offset
 from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
 
@@ -343,8 +341,7 @@ def clocks_that_explain(calibrator: Calibrator, keyframes: Sequence[FrameFeature
         score = calibrator.objectives.of_edges(keyframes, T).score
     except TooFewFeaturesError:
         return ""
-    offset = ClockOffset(0.0, twists)
-    scores = [offset.changed(score, T, float(seconds))[0].at(-1).value(T) for seconds in TIME_OFFSETS_S]
+    scores = [at_offset(score, T, twists, float(seconds))[0].at(-1).value(T) for seconds in TIME_OFFSETS_S]
     best = int(np.argmax(scores))
     seconds = float(TIME_OFFSETS_S[best])
     if abs(seconds) < MIN_TIME_OFFSET_S or scores[best] < EXPLAINED_SHARE * reached:

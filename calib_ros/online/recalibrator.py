@@ -28,10 +28,10 @@ from calib_ros.online.pacing import LONGEST_REST_S, REST_SPACING_S, Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
-from calib_ros.registration.acceptance.checks import leaves_doubt
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.classes import segmentation as models_of
+from calib_ros.registration.estimate import leaves_doubt
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox

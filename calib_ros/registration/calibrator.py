@@ -23,27 +23,37 @@ from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import change_between
-from calib_ros.registration.acceptance.checks import Acceptance, leaves_doubt
-from calib_ros.registration.acceptance.refusal import MAYBE_RAW, SUSPECT_INTRINSICS, joined, odd_intrinsics
-from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.classes import ALL, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
+from calib_ros.registration.covariance import inflation
 from calib_ros.registration.estimate import (
     Estimate,
+    evidence_of,
     insufficient,
+    leaves_doubt,
     observable_pose,
     refine_start,
     refined_with_camera,
+    refusal_of,
     reject_outlier_frames,
 )
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, ScanEdges, other_objective, views_of
-from calib_ros.registration.frames import Used, usable_frames, with_classes
+from calib_ros.registration.features import (
+    FeatureExtractor,
+    FrameFeatures,
+    ScanEdges,
+    Used,
+    other_objective,
+    usable_frames,
+    views_of,
+    with_classes,
+)
 from calib_ros.registration.initial_guess import BY_CLASSES, CENTROIDS, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import JointSearch
 from calib_ros.registration.judgement.hypotheses import AsTaken
 from calib_ros.registration.judgement.judge import Judge, Question, is_only_off
 from calib_ros.registration.judgement.lens import LensEstimate, LensUnknown, estimate_lens, lens_unknowns
-from calib_ros.registration.motion_guess.registration import best_registration, from_anything, from_motion
+from calib_ros.registration.judgement.refusal import MAYBE_RAW, SUSPECT_INTRINSICS, joined, odd_intrinsics
+from calib_ros.registration.motion_guess.guess import best_registration, from_anything, from_motion
 from calib_ros.registration.objective import Objective, ObjectiveMaker
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z
@@ -249,23 +259,21 @@ class Calibrator:
             # Reject outlier frames, and refine.
             alignment = reject_outlier_frames(objective, optimised.T, watch)
             alignment = refine_start(objective, alignment, start, watch)
-            # Covariance, with what intrinsics and clocks leave open.
-            acceptance = Acceptance(self.config, self.extract.source_camera, box)
-            evidence = acceptance.evidence(objective, alignment, optimised.search)
+            # Covariance.
+            evidence = evidence_of(self.config, objective, alignment, optimised.search)
             inflated = inflation(evidence.disagreement)
             pose = observable_pose(
                 objective, alignment.T, start, box, inflated, optimised.search.nearby if optimised.search else ()
             )
             lens = self._lens(objective, alignment.T, inflated)
             found = Estimate(initial, start, optimised, alignment, evidence, *pose, lens)
-            nuisance = found.nuisance(self.config, lens if self._given is None else None)
-            # Accept, or say why not.
-            refusal = acceptance.refusal(found, watch)
-            stated = self.extract.source_camera
+            # Accept, with what intrinsics and clocks leave open, or say why not.
+            stated, searched = self.extract.source_camera, box is not None and not box.is_empty
+            refusal = refusal_of(found, self.config, stated, searched, watch)
             if refusal is not None and refusal.code in SUSPECT_INTRINSICS and stated.said_rectified:
                 notes = [MAYBE_RAW, *notes]
             notes = [*odd_intrinsics(stated), *notes]
-            result = found.result(nuisance, refusal, self.config.motion, notes)
+            result = found.result(self.config, lens if self._given is None else None, refusal, notes)
             if self.config.camera.intrinsics == REFINE and lens is not None:
                 result = replace(result, refined_camera=lens.refined_camera(stated, found.T, found.covariance))
             self.objectives.keep_maps(objective)

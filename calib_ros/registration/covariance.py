@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,8 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.constraints import PoseConstraints
+from calib_ros.registration.search.constraints import Limits, PoseConstraints
+from calib_ros.registration.search.optimizers import levenberg_marquardt
 
 REGIONS = 12  # of equal weight, side by side in the image; the slopes of regions and frames vary independently of each other
 # Noise of a score in units of its curvature, per frame (0.002 to 0.02 of five scanners), that counts as that of so many cells.
@@ -34,6 +36,17 @@ PROFILE_ROUNDS, PROFILE_CHANGE = 2, 4.0  # of the variance of a direction per ro
 NO_NOISE = 1e-9  # of a score
 POINTS = 8000  # points that tell the curvature; more cost time and change nothing
 LEAST_VARIANCE = 1e-18  # rad^2, m^2; less is what rounding leaves of an axis that is fixed
+
+# Of disjoint halves of the data: unlike a decoy, they tell a biased optimum from the right one.
+HALVED_POINTS = 6000  # edge points used for both, so that many frames do not cost more
+MIN_POINTS = 60  # of a half: ten per unknown
+HALF_LEVELS = (2, 3, 4)  # on which one is refined: coarse enough to leave an optimum that only both together hold up
+# These make the errors of 111 single frames and 54 sets most likely; 2 of the single ones are accepted too far off, 6 without.
+AGREEING, MOST = 0.7, 5.0
+SECTOR = np.deg2rad(6.0)  # width of interleaved sectors of azimuth: wider than an object's edge, narrower than a scene
+
+UNKNOWNS = 6  # of an extrinsic
+INDEPENDENT = 2.0  # frames; one scene alone does not tell noise from what is wrong in it
 
 AXIS_NAMES = ("pitch", "yaw", "roll", "sideways shift", "vertical shift", "forward shift")  # of a twist
 TAKES_PART = 0.4  # share of the largest component of a direction, in units of the limits, from which an axis is named
@@ -117,12 +130,17 @@ def inverse_curvature(score: PointScore, T: Transform, axes: NDArray[np.intp]) -
     H = (before - after) / (2 * STEP[:, None])
     H = 0.5 * (H + H.T)
     units = np.outer(UNKNOWN[axes], UNKNOWN[axes])
-    # It may be indefinite: its eigenvalues relative to the Gauss-Newton scale rise to LEAST_CURVATURE.
     values, vectors = np.linalg.eigh(score.at(-1).linearise(T)[1][np.ix_(axes, axes)] * units)
     root = vectors / np.sqrt(np.maximum(values, 0) + USUAL_NOISE / len(score.frames))
-    values, vectors = np.linalg.eigh(root.T @ (H[np.ix_(axes, axes)] * units) @ root)
+    return np.asarray(units * inverse_above(H[np.ix_(axes, axes)] * units, root))
+
+
+def inverse_above(H: Matrix, root: Matrix) -> Matrix:
+    """Inverse (k, k) of a curvature H that may be indefinite: its eigenvalues relative to the Gauss-Newton scale, whose inverse
+    is root root^T, rise to LEAST_CURVATURE."""
+    values, vectors = np.linalg.eigh(root.T @ H @ root)
     half = root @ vectors
-    return np.asarray(units * ((half / np.maximum(values, LEAST_CURVATURE)) @ half.T))
+    return np.asarray((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)
 
 
 def noise_level(score: PointScore, T: Transform, bread: Matrix, axes: NDArray[np.intp]) -> float:
@@ -147,6 +165,12 @@ def noise_level(score: PointScore, T: Transform, bread: Matrix, axes: NDArray[np
     return pooled * len(frames) / effective_frames(score)
 
 
+def noise_of(score: PointScore, T: Transform, limits: Limits) -> float:
+    """Noise of the score at its optimum T (4, 4): twice what is lost by one standard deviation; see `noise_level`."""
+    axes = np.flatnonzero(limits.open_axes)
+    return max(noise_level(score, T, inverse_curvature(score, T, axes), axes), NO_NOISE)
+
+
 def effective_points(score: PointScore) -> float:
     """How many equally weighted points the points of a score are worth (Kish)."""
     return 1 / max(float(np.sum(np.square(score.weights, dtype=np.float64))), 1e-12)
@@ -160,6 +184,23 @@ def effective_frames(score: PointScore) -> float:
         return float(len(frames))
     correlation = score.atlas.correlation(min(DUPLICATE_LEVEL, score.n_levels - 1))
     return float(len(frames) ** 2 / correlation[np.ix_(frames, frames)].sum())
+
+
+def freedom(score: PointScore) -> float:
+    """Degrees of freedom of the noise of a score: the regions of all frames that show different places, with those that the usual
+    noise counts for, less the unknowns."""
+    return REGIONS * effective_frames(score) + USUAL_CELLS - UNKNOWNS - 1
+
+
+def shows_noise(score: PointScore) -> bool:
+    """Whether there are scenes enough to tell noise from what is wrong in one of them."""
+    return effective_frames(score) >= INDEPENDENT
+
+
+def shows_lens(score: PointScore) -> bool:
+    """Whether intrinsics can be judged: by several scenes, one may gain much by chance, and not on unrolled pictures, where a
+    shift is a rotation and lenses of another focal length are unrolled otherwise."""
+    return shows_noise(score) and not score.camera.is_sphere
 
 
 def share_of_weight(values: Matrix, weights: NDArray[np.float32], parts: int) -> NDArray[np.intp]:
@@ -233,3 +274,39 @@ def _information(covariance: Covariance) -> Matrix:
     free = free_axes(covariance)
     sigma = np.where(free, np.sqrt(np.maximum(np.diag(covariance), LEAST_VARIANCE)), np.inf)
     return np.asarray(np.linalg.pinv(covariance / np.outer(sigma, sigma), rcond=1e-12, hermitian=True) / np.outer(sigma, sigma))
+
+
+def disagreement(score: PointScore, T: Transform, limits: Limits) -> float:
+    """The distance of halves of the data, each refined from the optimum T (4, 4): squared, in units of what their covariances
+    let expect, on average over several ways to halve the data, each at most MOST. About 1 for a right optimum; see `inflation`.
+
+    limits: axes that are fixed stay so. 1.0 where there are too few points.
+    """
+    part = score.subset(HALVED_POINTS, np.random.default_rng(0))
+    axes = np.flatnonzero(limits.open_axes)
+    if not len(axes):
+        return 1.0
+    # A half of the weight has twice the noise of all.
+    noise = 2 * noise_level(part, T, inverse_curvature(part, T, axes), axes)
+    systematic = np.diag((2 * SYSTEMATIC_ERROR[axes]) ** 2)
+    p, factors = T[:3, :3] @ part.points + T[:3, 3:], []
+    quarter = share_of_weight(np.arctan2(p[0], p[2]), part.weights, 4)
+    sector = np.floor(np.arctan2(part.points[1], part.points[0]) / SECTOR)
+    # Sectors of the scan, sides of the image, middle, near ones, alternate frames.
+    middle, near = (quarter == 0) | (quarter == 3), share_of_weight(p[2], part.weights, 2) > 0
+    for half in (sector % 2 > 0, quarter >= 2, middle, near, part.frame % 2 > 0):
+        if not MIN_POINTS <= np.count_nonzero(half) <= len(half) - MIN_POINTS:
+            continue
+        both = [part.select(np.flatnonzero(half == k)) for k in (False, True)]
+        ends = [T, T]
+        for level, (k, own) in product(HALF_LEVELS, enumerate(both)):
+            ends[k] = levenberg_marquardt(own.at(level), ends[k], limits=limits, tolerance_deg=0.005, near=True)[0]
+        expected = sum((noise * inverse_curvature(own, T, axes) for own in both), systematic)
+        gap = se3.log(ends[0] @ se3.inverse(ends[1]))[axes]
+        factors.append(float(gap @ np.linalg.solve(expected, gap)) / len(axes))
+    return float(np.minimum(factors, MOST).mean()) if factors else 1.0
+
+
+def inflation(disagreement: float) -> float:
+    """By how much the variance of the optimum is larger than its curvature and its noise tell."""
+    return AGREEING + disagreement

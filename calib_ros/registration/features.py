@@ -16,17 +16,22 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera, Rectifier, across_meridians
 from calib_ros.config import Config
 from calib_ros.datasets.recent import Recent
-from calib_ros.errors import BadInputError
+from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import EdgeLevel, edge_levels
 from calib_ros.image.mask import used_pixels
 from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, has_times, used_twist
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
-from calib_ros.registration.classes import EDGE_SHARE, OF_MASKS, FrameSemantics, class_models, edge_weights
+from calib_ros.registration.classes import EDGE_SHARE, OF_MASKS, FrameSemantics, Segmentation, class_models, edge_weights
+from calib_ros.registration.progress import Progress
+from calib_ros.registration.score.point_score import MARGIN, near_image
+from calib_ros.registration.search.constraints import SearchBox
 
 Map = NDArray[np.float32]
 KEY_STEP = 61  # of points that tell a scan from others, a few thousand
+Used = tuple[Frame, "FrameFeatures"]
+BESIDE = 0.1  # of the image width: objects at the border have to be seen as a whole, or they have no shape
 WIDE_DEG = 125.0  # field from left to right border above which a pinhole cuts images down
 
 
@@ -158,7 +163,18 @@ class FeatureExtractor:
     def _of_edges(self, frame: Frame, image: NDArray[np.uint8], plain: FrameFeatures | None) -> FrameFeatures:
         """Edges of scan and image. plain: whose edge maps are taken over."""
         twist = used_twist(frame, self.config.motion)
-        still, reflectivity, edges = self._scan_edges(frame, twist)
+        key, still = None if self.scans is None else scan_key(frame), frame
+        found = None if self.scans is None or key is None else self.scans.get(key)
+        if found is None:
+            scan = range_image(frame.cloud, self.config.lidar)
+            if scan.layout == "projection" and twist is not None:
+                # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
+                still = deskewed_frame(frame, self.config.motion)
+                scan = range_image(still.cloud, self.config.lidar)
+            found = scan.reflectivity is not None, edge_points(scan, self.config.lidar)
+            if self.scans is not None and key is not None and still is frame:
+                self.scans[key] = found
+        reflectivity, edges = found
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
         points = deskewed_edges(edges, still, self.config.motion)
         levels = self._levels(image, points, of=frame) if plain is None else plain.levels
@@ -169,21 +185,6 @@ class FeatureExtractor:
             sweep_s = self.config.motion.scan_period_s * self.source_camera.field_deg / 720
             features = replace(features, unknown_motion_s=sweep_s)
         return features
-
-    def _scan_edges(self, frame: Frame, twist: NDArray[np.float64] | None) -> tuple[Frame, bool, EdgePoints]:
-        """A frame as its scan was searched, whether that has reflectivities, and its edges."""
-        key = None if self.scans is None else scan_key(frame)
-        if self.scans is not None and key is not None and (known := self.scans.get(key)) is not None:
-            return frame, *known
-        scan, still = range_image(frame.cloud, self.config.lidar), frame
-        if scan.layout == "projection" and twist is not None:
-            # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
-            still = deskewed_frame(frame, self.config.motion)
-            scan = range_image(still.cloud, self.config.lidar)
-        found = scan.reflectivity is not None, edge_points(scan, self.config.lidar)
-        if self.scans is not None and key is not None and still is frame:
-            self.scans[key] = found
-        return still, *found
 
     def _levels(
         self, image: NDArray[np.uint8], points: EdgePoints, semantic: Map | None = None, of: Frame | None = None
@@ -280,3 +281,63 @@ def working_camera(camera: Camera, max_width: int) -> Camera:
     S = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
     model = camera.model if camera.is_sphere else "plumb_bob"
     return Camera(S @ camera.K, width, height, model, said_rectified=camera.said_rectified)
+
+
+def usable_frames(
+    frames: Sequence[Frame],
+    extract: FeatureExtractor,
+    segmentation: Segmentation | None,
+    progress: Progress,
+    around: tuple[Transform, SearchBox | None] | None = None,
+) -> tuple[list[Used], list[str]]:
+    """The frames that can be used with their features, and notes on others and on failed models. segmentation: None = without.
+    around: T (4, 4) and the box about it, from where points come into view that need a class; None = all do."""
+    used: list[Used] = []
+    notes: list[str] = []
+    for k, frame in enumerate(frames):
+        try:
+            points = points_in_reach(frame, extract, *around) if segmentation and around else None
+            semantics = segmentation(frame, points=points) if segmentation else None
+            used.append((frame, extract(frame, semantics)))
+            notes += semantics.problems if semantics else ()
+            notes += [frame.cloud.time_problem] if frame.cloud.time_problem and frame.cloud.time_problem not in notes else []
+        except (TooFewFeaturesError, BadTimesError) as error:
+            notes.append(f"frame {frame.name or k} left out: {error}")
+        progress((k + 1) / len(frames))
+    return used, notes
+
+
+def with_classes(
+    used: Sequence[Used],
+    extract: FeatureExtractor,
+    segmentation: Segmentation,
+    T: Transform,
+    box: SearchBox | None,
+    progress: Progress,
+) -> tuple[list[FrameFeatures], list[str]]:
+    """Features with classes of points that may come into view from T (4, 4), anywhere in the box, the same where nothing was
+    found; and notes on models that failed."""
+    out: list[FrameFeatures] = []
+    notes: list[str] = []
+    for k, (frame, plain) in enumerate(used):
+        semantics = segmentation(frame, points=points_in_reach(frame, extract, T, box))
+        found = any(part is not None for part in (semantics.edges, semantics.classes, semantics.labels))
+        out.append(extract(frame, semantics, plain) if found else plain)
+        notes += semantics.problems
+        progress((k + 1) / len(used))
+    return out, notes
+
+
+def points_in_reach(frame: Frame, extract: FeatureExtractor, T: Transform, box: SearchBox | None) -> NDArray[np.intp]:
+    """Indices of a frame's points that may come into view from T (4, 4), anywhere in the box."""
+    margin = search_margin(extract.camera, box) + BESIDE
+    with np.errstate(invalid="ignore", over="ignore"):  # lost returns are NaN or inf, which are not near anything
+        return near_image(frame.cloud.xyz, T, extract.camera, margin)
+
+
+def search_margin(camera: Camera, box: SearchBox | None) -> float:
+    """How far around the image points may come into view anywhere in a box, as a share of its width."""
+    if box is None:
+        return MARGIN
+    deg, m = box.reach
+    return max(MARGIN, float(1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)))

@@ -2,6 +2,10 @@
 
 The search takes the clocks as they are configured. Frames that move differently then disagree by what the offset moves them; if
 that hides the match, it is repeated a scan period earlier and later, as drivers err that stamp a scan at its other end.
+
+How a driver stamps scans without point times is found out as well: which way the scanner turns, and where a scan begins. Each
+convention gives every edge point another time, and the vehicle's motion then another place: the right one makes all frames agree.
+Which part of the scan is stamped is a time offset of half a scan period at most.
 """
 
 from __future__ import annotations
@@ -14,10 +18,15 @@ import numpy as np
 from calib_ros.arrays import Transform
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import ESTIMATE
+from calib_ros.lidar.deskew import moved, scan_times
 from calib_ros.registration.features import FrameFeatures, at_time_offset, other_objective
-from calib_ros.registration.nuisance.parameters import MIN_FRAMES, Effect
-from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, restamped
-from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset, with_known_motion
+from calib_ros.registration.judgement.clocks import (
+    MIN_FRAMES,
+    Effect,
+    TimeOffset,
+    estimate_time_offset,
+    with_known_motion,
+)
 from calib_ros.registration.objective import Objective
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z, null_distribution, p_value
@@ -28,6 +37,11 @@ from calib_ros.result import Stamping
 MakeObjective = Callable[..., Objective]  # of features; T_rows: (4, 4), where points fall in the image, for a rolling shutter
 # Frames whose optima a scan period would move apart by more hide their match from a search: what counts as one optimum there.
 APART_RAD, APART_M = np.deg2rad(0.5), 0.1
+AHEAD, BEHIND = 0.0, 180.0  # deg, azimuth half a turn away from where a scan begins and ends
+CONVENTIONS = (
+    *(Stamping(spin, azimuth) for azimuth in (AHEAD, BEHIND) for spin in ("clockwise", "counterclockwise")),
+    Stamping("none", AHEAD),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +98,11 @@ class JointSearch:
         way = np.abs(twists - twists.mean(axis=0)).max(axis=0) * period_s
         if way[:3].max() <= APART_RAD and way[3:].max() <= APART_M:
             return found
-        tried, best, highest = 1, found, _z_score(found)
+
+        def z_score(found: Optimised) -> float:
+            return null_distribution(found.objective.edges.score, found.T).z_score
+
+        tried, best, highest = 1, found, z_score(found)
         for seconds in (-period_s, period_s):
             search = best.search
             if search is None or highest >= UNDOUBTED_Z:
@@ -92,10 +110,9 @@ class JointSearch:
             if p_value(highest, search.decoy_z, tried * search.rounds) <= config.refine.max_p_value:
                 break
             tried += 1
-            found = self._near(_moved(features, seconds))
-            z_score = _z_score(found)
-            if z_score > highest:
-                best, highest = replace(found, seconds=found.seconds + seconds), z_score
+            found = self._near([at_time_offset(f, seconds) for f in features])
+            if (own := z_score(found)) > highest:
+                best, highest = replace(found, seconds=found.seconds + seconds), own
         if best.search is None or tried == 1:
             return best
         return replace(best, search=replace(best.search, rounds=tried * best.search.rounds))  # as many more optima of chance
@@ -118,17 +135,17 @@ class JointSearch:
         untold = by_azimuth and motion.stamping == "auto" and all(f.own is None for f in features)
         if offset is not None and search is not None and untold:
             for other in CONVENTIONS:
-                if at_stamping(motion, other) == motion:
+                if (after := at_stamping(motion, other)) == motion:
                     continue
-                score = self.make_objective(_restamped(features, motion, other)).edges.score
+                score = self.make_objective([restamped(f, motion, after) for f in features]).edges.score
                 found = estimate_time_offset(score, T, limits, prior, moving[1], motion, search=True)
                 if found is not None and found.better_than(offset, len(CONVENTIONS) - 1):
                     offset, stamping = found, other
         if offset is None or not (offset.exists(motion) or stamping):
             return Optimised(features, objective, T, search, offset)
         if stamping is not None:
-            features = _restamped(features, motion, stamping)
-        features = _moved(features, offset.seconds)
+            features = [restamped(f, motion, at_stamping(motion, stamping)) for f in features]
+        features = [at_time_offset(f, offset.seconds) for f in features]
         objective = self.make_objective(features)
         T = objective.optimise(limits.clip(offset.T), searched=True, progress=self.progress)
         return Optimised(features, objective, T, search, offset, offset.seconds, stamping)
@@ -146,14 +163,31 @@ def estimates_offset(features: Sequence[FrameFeatures], config: Config) -> bool:
     return clocks_are_estimated(config) and moving >= MIN_FRAMES and all(f.own is None for f in features)
 
 
-def _restamped(features: Sequence[FrameFeatures], before: MotionConfig, stamping: Stamping) -> list[FrameFeatures]:
-    after = at_stamping(before, stamping)
-    return [restamped(f, before, after) for f in features]
+def at_stamping(config: MotionConfig, stamping: Stamping) -> MotionConfig:
+    """The configuration that says so."""
+    return replace(config, spin=stamping.spin, stamp_azimuth_deg=stamping.azimuth_deg, stamp_at="middle")
 
 
-def _moved(features: Sequence[FrameFeatures], seconds: float) -> list[FrameFeatures]:
-    return [at_time_offset(f, seconds) for f in features]
+def restamped(features: FrameFeatures, before: MotionConfig, after: MotionConfig) -> FrameFeatures:
+    """Features extracted by `before` with points where `after` has them; the same if their times do not come from the azimuth, or
+    the LiDAR's velocity is not known."""
+    points = features.points
+    if not features.timed_by_azimuth or features.twist is None or points.time is None or features.own is not None:
+        return features
+    measured = moved(points.xyz, features.twist, -points.time.astype(float))
+    change = scan_times(measured, after, points.pose) - scan_times(measured, before, points.pose)
+    time = points.time + change
+    points = replace(points, xyz=moved(measured, features.twist, time).astype(np.float32), time=time.astype(np.float32))
+    plain = None if features.plain is None else restamped(features.plain, before, after)
+    return replace(features, points=points, plain=plain, view=None)  # points of a view have no times
 
 
-def _z_score(found: Optimised) -> float:
-    return null_distribution(found.objective.edges.score, found.T).z_score
+def convention(stamping: Stamping, seconds: float, scan_period_s: float) -> tuple[str, float]:
+    """What to set for a driver that stamps as was found, for people, by the nearest usual convention; and the time offset that is
+    left then, s. seconds: that of `stamping`, whose scans are stamped half a turn after they begin."""
+    halves = {"start": 0.5, "middle": 0.0, "end": -0.5} if stamping.spin != "none" else {"middle": 0.0}
+    name, azimuth = min(halves, key=lambda n: abs(seconds - halves[n] * scan_period_s)), stamping.azimuth_deg
+    if name != "middle":
+        azimuth = azimuth + 180.0 if azimuth <= 0 else azimuth - 180.0
+    found = f"motion.spin: {stamping.spin}, motion.stamp_at: {name}, motion.stamp_azimuth_deg: {azimuth:g}"
+    return found, seconds - halves[name] * scan_period_s

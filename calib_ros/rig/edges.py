@@ -142,12 +142,13 @@ class RigMeasurer:
         pairs, lidars = self.description.camera_pairs, self.description.lidars
         if self.description.pairs is not None:
             return pairs
-        return sorted((pair for pair in pairs if self._sees(*pair, known)), key=lambda pair: lidars.index(pair[1]))
 
-    def _sees(self, camera: str, lidar: str, known: RigSolution) -> bool:
-        own, T = self.rig.camera(camera), known.between(camera, lidar)[0]
-        shares = [seen_share(own, T, points) for points in self.scans[lidar].glimpses]
-        return bool(shares) and float(np.median(shares)) >= SEEN
+        def shares_view(camera: str, lidar: str) -> bool:
+            own, T = self.rig.camera(camera), known.between(camera, lidar)[0]
+            shares = [seen_share(own, T, points) for points in self.scans[lidar].glimpses]
+            return bool(shares) and float(np.median(shares)) >= SEEN
+
+        return sorted((pair for pair in pairs if shares_view(*pair)), key=lambda pair: lidars.index(pair[1]))
 
     def camera_edge(self, camera: str, lidar: str, known: RigSolution) -> Measurement:
         """Registration of a camera with a LiDAR, around where they are by what is known."""

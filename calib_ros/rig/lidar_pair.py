@@ -112,7 +112,9 @@ class LidarPair:
             self._against.clear()
         else:
             self._against.append(new)
-            status = MOVED if len(self._against) == CONFIRM and self._agree() else SUSPECT
+            (edge, scale), pairs = self._edge, combinations(self._against, 2)
+            agree = all(self._is_same(a.T, b.T, edge.covariance, scale, a, b) for a, b in pairs)
+            status = MOVED if len(self._against) == CONFIRM and agree else SUSPECT
         if status == MOVED:  # until the next one
             self._found = deque(self._against, SCANS)
             self._against.clear()
@@ -127,27 +129,15 @@ class LidarPair:
     def _fits(self, new: Registration, edge: Edge, scale: float) -> bool:
         """Whether a registration may be of the transform of the edge, the clocks being off by what the edge says."""
         offset, sigma_s = edge.time_offset_s or 0.0, edge.time_sigma_s or 0.0
-        T = se3.exp(new.twist * offset) @ edge.T
         C = edge.covariance + np.outer(new.twist, new.twist) * sigma_s**2
-        return self._is_same(new.T, T, C + self._covariance(new, scale), len(self._found))
+        return self._is_same(new.T, se3.exp(new.twist * offset) @ edge.T, C, scale, new)
 
-    def _agree(self) -> bool:
-        """Whether those that contradict the edge are of one transform."""
-        assert self._edge is not None
-        edge, scale = self._edge
-        return all(
-            self._is_same(a.T, b.T, edge.covariance + self._covariance(a, scale) + self._covariance(b, scale), len(self._found))
-            for a, b in combinations(self._against, 2)
-        )
-
-    @staticmethod
-    def _covariance(new: Registration, scale: float) -> Covariance:
-        return np.asarray(np.linalg.inv(new.information) * scale)
-
-    @staticmethod
-    def _is_same(a: Transform, b: Transform, C: Covariance, n: int) -> bool:
-        """Whether transforms differ by what chance explains, by a covariance whose scale is known from n registrations."""
+    def _is_same(self, a: Transform, b: Transform, C: Covariance, scale: float, *measured: Registration) -> bool:
+        """Whether transforms differ by what chance explains: by a covariance, and those of registrations of a common scale, which
+        is known from all that were found."""
         xi = se3.log(a @ se3.inverse(b))
+        C = sum((np.asarray(np.linalg.inv(new.information) * scale) for new in measured), C)
+        n = len(self._found)
         return bool(scipy.special.fdtrc(6, 6 * max(n - 1, 1), float(xi @ np.linalg.solve(C, xi)) / 6) > SIGNIFICANCE)
 
     def say(self, status: str, reason: str) -> None:

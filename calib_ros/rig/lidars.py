@@ -132,10 +132,7 @@ class LidarScans:
             return None
         twists = np.array([known[k] for k in range(*best)])
         times = (self.stamps[best[0] : best[1] + 1] - self.stamps[0]) / NANOSECONDS
-        poses = [np.eye(4)]
-        for twist, gap in zip(twists, np.diff(times), strict=True):
-            poses.append(poses[-1] @ se3.exp(twist * gap))
-        return Run(best[0], times, times, np.array(poses), twists)
+        return Run.of(best[0], times, times, twists)
 
 
 def shared_view(a: LidarScans, b: LidarScans, T: Transform) -> float:
@@ -229,8 +226,12 @@ def fused(target: str, source: str, found: Sequence[Registration], clock_sigma_s
     Ts, Hs, twists = [f.T for f in found], [f.information for f in found], [f.twist for f in found]
     n, T, offset = len(Ts), Ts[len(Ts) // 2], 0.0
     weights, J = np.ones(n), [np.c_[np.eye(6), twist] for twist in twists]
+
+    def squared(x: Matrix, H: Matrix) -> float:
+        return float(x @ H @ x)
+
     # At first no registration is known to be right: the one nearest to all.
-    spread = [np.median([_squared(se3.log(a @ se3.inverse(b)), H) for a, H in zip(Ts, Hs, strict=True)]) for b in Ts]
+    spread = [np.median([squared(se3.log(a @ se3.inverse(b)), H) for a, H in zip(Ts, Hs, strict=True)]) for b in Ts]
     T = Ts[int(np.argmin(spread))]
     scale = max(float(min(spread)) / MEDIAN_OF_SIX, 1e-9)
     for _ in range(ROUNDS):
@@ -241,7 +242,7 @@ def fused(target: str, source: str, found: Sequence[Registration], clock_sigma_s
         step = np.linalg.solve(A, g)
         T, offset = se3.exp(step[:6]) @ T, offset + float(step[6])
         r = [se3.log(t @ se3.inverse(T)) - twist * offset for t, twist in zip(Ts, twists, strict=True)]
-        squares = np.array([_squared(x, H) for x, H in zip(r, Hs, strict=True)])
+        squares = np.array([squared(x, H) for x, H in zip(r, Hs, strict=True)])
         scale = max(float(np.median(squares)) / MEDIAN_OF_SIX * n / max(n - 1, 1), 1e-9)
         weights = 1 / (1 + np.maximum(squares / scale - 6, 0) / 6)  # beyond what is expected, as Cauchy's
     covariance = np.linalg.inv(A)
@@ -253,10 +254,6 @@ def fused(target: str, source: str, found: Sequence[Registration], clock_sigma_s
     sigma = float(np.sqrt(total[6, 6]))
     twist = np.asarray(se3.adjoint(se3.inverse(T)) @ np.mean(twists, axis=0))
     return Edge(target, source, T, _symmetric(total[:6, :6] + common), SCANS_KIND, offset, sigma, twist, n), scale
-
-
-def _squared(x: Matrix, H: Matrix) -> float:
-    return float(x @ H @ x)
 
 
 def _symmetric(C: Matrix) -> Covariance:

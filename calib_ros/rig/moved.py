@@ -114,13 +114,9 @@ class _Model:
         self.before, self.edges = before, edges
         self.seen = {name for edge in edges for name in (edge.target, edge.source)}
         known = {(e.target, e.source): e for e in before.edges}
-        rows, A, noise = [], [], []
-        n = 6 * len(before.columns)
-        for edge in edges:
-            P, J = predicted(before.poses, before.columns, edge.target, edge.source)
-            rows.append(se3.log(edge.T @ se3.inverse(P)))
-            A.append(J)
-            noise.append(edge.covariance)
+        at = [predicted(before.poses, before.columns, edge.target, edge.source) for edge in edges]
+        rows = [se3.log(edge.T @ se3.inverse(P)) for edge, (P, _) in zip(edges, at, strict=True)]
+        A, noise = [np.zeros((0, 6 * len(before.columns))), *(J for _, J in at)], [edge.covariance for edge in edges]
         self.offsets: list[tuple[Edge, int]] = []  # edges whose clocks are known, with their rows
         for edge in edges:
             old = known.get((edge.target, edge.source))
@@ -129,17 +125,13 @@ class _Model:
             if len(offsets) == len(sigmas) == 2:
                 self.offsets.append((edge, 6 * len(edges) + len(self.offsets)))
                 rows.append(np.array([offsets[0] - offsets[1]]))
-                A.append(np.zeros((1, n)))
+                A.append(np.zeros((1, A[0].shape[1])))
                 noise.append(np.array([[sigmas[0] ** 2 + sigmas[1] ** 2]]))
-        self.y = np.concatenate(rows) if rows else np.zeros(0)
-        self.covariance = np.zeros((len(self.y), len(self.y)))
-        at = 0
+        self.y, whole, covariance = np.concatenate([np.zeros(0), *rows]), np.concatenate(A), np.zeros((0, 0))
         for block in noise:
-            self.covariance[at : at + len(block), at : at + len(block)] = block
-            at += len(block)
-        whole = np.concatenate(A) if A else np.zeros((0, n))
-        self.covariance += whole @ before.covariance @ whole.T
-        self._root = np.linalg.inv(np.linalg.cholesky(self.covariance))
+            apart = np.zeros((len(covariance), len(block)))
+            covariance = np.block([[covariance, apart], [apart.T, block]])
+        self._root = np.linalg.inv(np.linalg.cholesky(covariance + whole @ before.covariance @ whole.T))
 
     def moved(self, group: Sequence[str]) -> Matrix:
         """B (n, 6) of a group that moves rigidly by a left twist in the reference's frame."""

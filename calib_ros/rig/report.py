@@ -145,8 +145,7 @@ class RigReport:
             "covariance": self.solution.marginal(name).tolist(),
         }
         for key, other in (("prior_error", self.solution.prior.get(name, (None,))[0]), ("reference_error", self.truth.get(name))):
-            deg, m = (None, None) if other is None else se3.error(other, T)
-            found[key] = None if other is None else {"rotation_deg": deg, "translation_m": m}
+            found[key] = None if other is None else _amount(se3.error(other, T))
         return found
 
     def _fate(self, measured: Measurement) -> str:
@@ -241,15 +240,17 @@ class RigReport:
 
 
 def _change(found: RigHypothesis) -> dict[str, Any]:
-    names = "kind", "sensors", "posterior", "rotation_deg", "translation_m", "displacement", "p_value"
-    values = found.kind, list(found.sensors), found.posterior, *found.size, found.displacement.tolist(), found.p_value
-    return dict(zip(names, values, strict=True))
+    own = {"kind": found.kind, "sensors": list(found.sensors), "posterior": found.posterior, **_amount(found.size)}
+    return {**own, "displacement": found.displacement.tolist(), "p_value": found.p_value}
 
 
 def loop_dict(loop: Loop) -> dict[str, Any]:
     """Plain numbers, lists and texts of a loop."""
-    names = "sensors", "rotation_deg", "translation_m", "p_value", "closes"
-    return dict(zip(names, (list(loop.sensors), *loop.size, loop.p_value, loop.closes), strict=True))
+    return {"sensors": list(loop.sensors), **_amount(loop.size), "p_value": loop.p_value, "closes": loop.closes}
+
+
+def _amount(size: tuple[float, float]) -> dict[str, float]:
+    return {"rotation_deg": size[0], "translation_m": size[1]}
 
 
 def load(path: str | Path) -> RigSolution:

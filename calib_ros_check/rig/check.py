@@ -14,7 +14,7 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.datasets.open import open_rig
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.registration.judgement.evidence import CONFIDENCE
+from calib_ros.registration.judgement.judge import CONFIDENCE
 from calib_ros.result import VERSION, Cause
 from calib_ros.rig.description import MAX_SIGMA_DEG, MAX_SIGMA_M, RigDescription, prior_covariance, read_rig
 from calib_ros.rig.edges import Measurement, Progress, RigMeasurer

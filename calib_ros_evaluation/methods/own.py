@@ -15,7 +15,7 @@ from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.score.point_score import LevelScore, PointScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead

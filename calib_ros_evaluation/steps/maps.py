@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.score.point_score import Score, project
 from calib_ros_evaluation.curves import AXES, Curves, curves
 from calib_ros_evaluation.methods.method import MeanScore

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.classes import PoseHypothesis
 from calib_ros.registration.initial_guess import MAX_DISTANCE_M, MAX_TILT_DEG, allowed, poses, rotation_distance_deg
+from calib_ros.registration.score.chance import EvenPoints
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.starts import EvenPoints
 from calib_ros_semantics.first_guess.centroids import agreed_poses, find_pairs
 from calib_ros_semantics.first_guess.score import (
     AROUND_DEG,

@@ -15,11 +15,11 @@ from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.initial_guess import MAX_DISTANCE_M, allowed, near_lidar, rotation_distance_deg
 from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.chance import EvenPoints
 from calib_ros.registration.score.point_score import PointScore, SmoothScore
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, Prior
 from calib_ros.registration.search.optimizers import levenberg_marquardt
-from calib_ros.registration.starts import EvenPoints
 from calib_ros_semantics.first_guess.view import MATCHED, ClassView
 
 Matrix = NDArray[np.float64]

@@ -23,13 +23,12 @@ from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import Direction, covariance, unobservable_directions
-from calib_ros.registration.features import FrameFeatures, at_time_offset
-from calib_ros.registration.frames import usable_frames
-from calib_ros.registration.nuisance.parameters import LEVELS, TOLERANCE_DEG, refined
+from calib_ros.registration.features import FrameFeatures, at_time_offset, usable_frames
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
+from calib_ros.registration.search.optimizers import LEVELS, TOLERANCE_DEG, refined
 
 STEP_DEG, STEP_CM, LARGE = 0.05, 1.0, 10  # of a key, and with shift so many times as far
 CURVE_DEG, CURVE_M, SAMPLES = 2.0, 0.3, 41  # half widths of the curves, and scores along each

@@ -15,7 +15,7 @@ from calib_ros.config import Config, preset
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.edges import Castorena, Levinson

@@ -9,7 +9,7 @@ from pathlib import Path
 from paths import ROOT
 
 JUDGES = (
-    *(f"calib_ros/registration/{name}.py" for name in ("acceptance/*", "nuisance/*", "judgement/*", "covariance")),
+    *(f"calib_ros/registration/{name}.py" for name in ("judgement/*", "covariance", "search/optimizers")),
     *(
         "calib_ros/registration/score/chance.py",
         "calib_ros/registration/estimate.py",

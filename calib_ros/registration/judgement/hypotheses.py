@@ -2,7 +2,7 @@
 
 Each is a guess of what was meant instead, and is tried: the extrinsic that is right if the guess is, refined, and compared with
 chance like any other optimum. What may be wrong by little of the lens and the clocks is told at an optimum (lens.py,
-nuisance/clock_offset.py).
+clocks.py).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.lens import LENSES, PERSPECTIVE
 from calib_ros.lidar.scanner_pose import ScannerPose
-from calib_ros.registration.acceptance.refusal import AS_RAW
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.judgement.refusal import AS_RAW
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.result import Cause
 
@@ -81,9 +81,9 @@ class Hypothesis:
 
     def seen_by(self, score: PointScore) -> PointScore:
         """The score of the picture as it is if the guess holds."""
-        score = score.mirrored() if self.mirrored else score
-        score = score.with_distortion(self.barrel) if self.barrel else score
-        return score.with_intrinsics(*self.lens) if any(self.lens) else score
+        atlas = score.atlas.mirrored() if self.mirrored else score.atlas
+        atlas = atlas.with_distortion(self.barrel) if self.barrel else atlas
+        return score.on(atlas.with_intrinsics(*self.lens) if any(self.lens) else atlas)
 
 
 def transforms(T: Transform) -> Iterator[Hypothesis]:
@@ -184,7 +184,14 @@ def other_lenses(T: Transform, camera: Camera) -> Iterator[Hypothesis]:
     for share in FOCALS:
         yield Hypothesis(Cause.FOCAL_LENGTH, f"{focal_words(share)}; {INTRINSICS}", T, lens=(share, 0.0, 0.0))
     for barrel in BARREL:
-        yield Hypothesis(Cause.NOT_RECTIFIED, _bent(barrel, camera), T, barrel=barrel)
+        corners = f"corners lie {abs(barrel):.0%} of the radius {'towards' if barrel > 0 else 'away from'} the centre"
+        said = (
+            f"the image shows a lens distortion that its CameraInfo does not have: {corners}; take the rectified topic, or the "
+            "CameraInfo of the camera as it is"
+        )
+        if camera.said_rectified:
+            said = f"the image is taken for rectified, but is raw: {corners}; {AS_RAW}"
+        yield Hypothesis(Cause.NOT_RECTIFIED, said, T, barrel=barrel)
 
 
 def rectified_otherwise(T: Transform, camera: Camera) -> Iterator[Hypothesis]:
@@ -292,13 +299,3 @@ def of_another_size(scale: float) -> str:
     """What is wrong with intrinsics of an image that is smaller by this factor, in words."""
     times = f"{scale:.2g} times smaller" if scale > 1 else f"{1 / scale:.2g} times larger"
     return f"CameraInfo is of an image {times}: scale fx, fy, cx and cy by {scale:.3g}"
-
-
-def _bent(barrel: float, camera: Camera) -> str:
-    corners = f"corners lie {abs(barrel):.0%} of the radius {'towards' if barrel > 0 else 'away from'} the centre"
-    if camera.said_rectified:
-        return f"the image is taken for rectified, but is raw: {corners}; {AS_RAW}"
-    return (
-        f"the image shows a lens distortion that its CameraInfo does not have: {corners}; take the rectified topic, or the "
-        "CameraInfo of the camera as it is"
-    )

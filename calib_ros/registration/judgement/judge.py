@@ -2,6 +2,10 @@
 
 All are tried from where the extrinsic is if they hold; the best matches are searched, and have to stand out from chance and from
 the sensors as they are given, at the odds of something so rare.
+
+There is one standard of evidence for all explanations, that the extrinsic is as given, or off, or something was mixed up. Any two
+are compared at the optimum of each: the difference of their scores over the noise of the score is a log-likelihood ratio, and has
+to outweigh how rare the better one is in advance. One under which a scene is symmetric matches as well, and outweighs nothing.
 """
 
 from __future__ import annotations
@@ -21,8 +25,8 @@ from calib_ros.config import CameraConfig, Config
 from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.intrinsics import FOCAL
+from calib_ros.registration.covariance import disagreement, effective_points, freedom, inflation, noise_of, shows_lens
 from calib_ros.registration.features import FrameFeatures, at_time_offset
-from calib_ros.registration.judgement.evidence import EVEN, Match, convinces, evidence, log_odds, rare_odds, shows_lens
 from calib_ros.registration.judgement.hypotheses import (
     OF_PICTURE,
     AsTaken,
@@ -38,13 +42,14 @@ from calib_ros.registration.judgement.hypotheses import (
     turned_over,
 )
 from calib_ros.registration.judgement.lens import LensEstimate, estimate_lens, lens_unknowns
-from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, REACH, TOLERANCE_DEG, refined
+from calib_ros.registration.judgement.refusal import GROSSLY
 from calib_ros.registration.objective import ObjectiveMaker
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.chance import LOWEST_DECOY_Z, null_distribution, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.search.optimizers import LEVELS, NEAR_LEVELS, POINTS, REACH, TOLERANCE_DEG, refined
 from calib_ros.registration.search.search import search_decoy, search_once
 from calib_ros.result import Cause
 
@@ -53,7 +58,17 @@ CONFIRMED = 3  # of the hypotheses with the best matches, how many are searched
 FEW_FRAMES = 3  # tell which camera may have taken the pictures
 SLACK = 5.0  # of `_distance`: a turned picture moves the centre of a lens by some per cent of its width
 ALIKE = 0.85  # of the best z-score; hypotheses that lead to the same extrinsic differ by the points that they keep in view
+CONFIDENCE = 0.9  # probability from which a verdict is one
+EVEN = 1.0  # prior odds, that an extrinsic which somebody checks is off
 SHOWN_SIGMAS = 2.0  # of what a size lacks to the one that was tried
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """An explanation at its optimum T (4, 4), with the score of the frames as they look if it holds."""
+
+    score: PointScore
+    T: Transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,13 +159,11 @@ class Judge:
                     done.add(one)
                     odds = rare_odds(count) if own is None or not is_only_off(own, deg, m) else EVEN
                     if own is not None and self._beyond_chance(own, count) and convinces(log_odds(own, given), odds):
-                        return own if asked.box is None else self._simplest_as_good(own, tried, asked)
+                        return own if asked.box is None or own.hypothesis.of_lens else self._simpler(own, tried, asked)
         return None
 
-    def _simplest_as_good(self, found: Candidate, tried: Sequence[Candidate], asked: Question) -> Candidate:
+    def _simpler(self, found: Candidate, tried: Sequence[Candidate], asked: Question) -> Candidate:
         """What was found, or a simpler hypothesis that predicts about the same optimum as well: a rough start ranks none."""
-        if found.hypothesis.of_lens:
-            return found
         simpler = [own for own in tried if own.hypothesis.rank < found.hypothesis.rank and not own.hypothesis.of_lens]
         rivals = [own for own in simpler if _distance(own.hypothesis.T, found.T) <= found.surprise + SLACK]
         others = [self._confirmed(own, asked) for own in rivals[:CONFIRMED]]
@@ -242,28 +255,25 @@ class Judge:
                 if anew is None:
                     return None
                 one = anew
-        return self._with_lens(one) if guess.of_lens and shows_lens(one.score) else one
+        score, camera = one.score, one.score.camera
+        if not guess.of_lens or not shows_lens(score):
+            return one
+        lens = estimate_lens(score, one.T, unlimited(one.T), lens_unknowns(CameraConfig(), camera, camera))
+        if lens is None:
+            return one
+        seen, T = lens.seen(score)
+        left, share = next((k for k, own in enumerate(lens.unknowns) if own.name == FOCAL), None), guess.lens[0]
+        told = left is not None and abs(lens.change[left]) > SHOWN_SIGMAS * lens.sigma[left]
+        if told and share and guess.cause is Cause.OTHER_CAMERA:
+            guess = replace(guess, message=of_another_size((1 + share) * (1 + float(lens.change[left]))))
+        T = refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0]
+        return max(one, replace(one, score=seen, T=T, hypothesis=guess), key=evidence)
 
     def _searched(self, one: Candidate, asked: Question) -> Candidate:
         """The same at the best optimum that one round of a search near it finds: the sensors as given are searched as well."""
         start = one.T if asked.box is None else one.hypothesis.T
         T = search_once(one.score, start, asked.box or NEAR, self.config.search, unlimited(start))
         return replace(max(one, replace(one, T=T), key=evidence), searched=True)
-
-    def _with_lens(self, one: Candidate) -> Candidate:
-        """A hypothesis about the lens, with what is left of it refined."""
-        score, camera = one.score, one.score.camera
-        lens = estimate_lens(score, one.T, unlimited(one.T), lens_unknowns(CameraConfig(), camera, camera))
-        if lens is None:
-            return one
-        seen, T = lens.seen(score)
-        other = replace(one, score=seen, T=refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0])
-        left = next((k for k, own in enumerate(lens.unknowns) if own.name == FOCAL), None)
-        hypothesis, share = one.hypothesis, one.hypothesis.lens[0]
-        told = left is not None and abs(lens.change[left]) > SHOWN_SIGMAS * lens.sigma[left]
-        if told and share and hypothesis.cause is Cause.OTHER_CAMERA:
-            hypothesis = replace(hypothesis, message=of_another_size((1 + share) * (1 + float(lens.change[left]))))
-        return max(one, replace(other, hypothesis=hypothesis), key=evidence)
 
     def _beyond_chance(self, best: Candidate, tried: int) -> bool:
         """Does the best match of so many that were tried exceed what a decoy reaches?"""
@@ -300,3 +310,31 @@ def _distance(a: Matrix, b: Matrix) -> float:
     """Between two extrinsics (4, 4), in units of half a degree and 10 cm."""
     xi = se3.log(a @ se3.inverse(b))
     return float(np.rad2deg(np.linalg.norm(xi[:3])) / 0.5 + np.linalg.norm(xi[3:]) / 0.1)
+
+
+def evidence(match: Match) -> float:
+    """What the points together say for a match: their score times how many there are, since other extrinsics see others."""
+    return match.score.at(-1).value(match.T) * effective_points(match.score)
+
+
+def log_odds(better: Match, other: Match | None) -> float:
+    """Log-likelihood ratio of two matches of the same frames, by the noise at the better one; negative if it is none. other: None
+    = nothing is in view.
+
+    Student's distribution: few regions tell their own noise badly. Noise is inflated by the disagreement of halves.
+    """
+    score, T = better.score, better.T
+    noise = noise_of(score, T, unlimited(T)) * inflation(disagreement(score, T, unlimited(T)))
+    gain = (evidence(better) - (evidence(other) if other is not None else 0.0)) / effective_points(score) / noise
+    degrees = freedom(score)
+    return math.copysign(0.5 * (degrees + 1) * math.log1p(2 * abs(gain) / degrees), gain)
+
+
+def convinces(log_ratio: float, prior_odds: float) -> bool:
+    """Whether an explanation is more probable than another one by CONFIDENCE."""
+    return math.log(prior_odds) + log_ratio >= math.log(CONFIDENCE / (1 - CONFIDENCE))
+
+
+def rare_odds(tried: int) -> float:
+    """Prior odds of one of so many explanations, all of which together are GROSSLY rare."""
+    return GROSSLY / (1 - GROSSLY) / tried

@@ -22,34 +22,24 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig
-from calib_ros.intrinsics import (
-    ASPECT,
-    CENTRE,
-    COEFFICIENTS,
-    FOCAL,
-    RADIAL,
-    IntrinsicEstimate,
-    RefinedCamera,
-    changed,
-)
+from calib_ros.intrinsics import ASPECT, CENTRE, COEFFICIENTS, FOCAL, RADIAL, IntrinsicEstimate, RefinedCamera, changed
 from calib_ros.lens import PERSPECTIVE
-from calib_ros.registration.acceptance.refusal import Refusal, left_open, wrong_intrinsics
-from calib_ros.registration.acceptance.split_half import disagreement, inflation
-from calib_ros.registration.covariance import LEAST_CURVATURE, NO_NOISE, REGIONS, STEP, effective_frames
-from calib_ros.registration.nuisance.parameters import (
-    GROSSLY,
-    NEAR_LEVELS,
-    OPEN_PROBABILITY,
-    POINTS,
-    REACH,
-    SIGNIFICANCE,
+from calib_ros.registration.covariance import (
+    NO_NOISE,
+    REGIONS,
+    STEP,
+    disagreement,
+    effective_frames,
+    inflation,
+    inverse_above,
     noise_of,
 )
+from calib_ros.registration.judgement.refusal import GROSSLY, OPEN_PROBABILITY, SIGNIFICANCE, Refusal, left_open, wrong_intrinsics
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
+from calib_ros.registration.score.chance import EvenPoints
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, unlimited
-from calib_ros.registration.search.optimizers import JointView, ascend_jointly, linearised
-from calib_ros.registration.starts import EvenPoints
+from calib_ros.registration.search.optimizers import NEAR_LEVELS, POINTS, REACH, JointView, ascend_jointly, linearised
 
 LEVELS = (2, 3, 4)  # blurred as far as a lens that is 5 % off moves the border of a picture
 NODES = (65, 49)  # across and down, at which the effect on rays is computed; between, it is smooth
@@ -159,23 +149,20 @@ class LensEstimate:
     """What the scenes tell of a lens.
 
     change: (n,) where they match best, with T (4, 4), the extrinsic there; information: (n, n) of it, noise counted, the
-    extrinsic free. directions: (6, n) twist of the extrinsic, rad and m, per unit of each; 0 along fixed axes. T_given: (4, 4),
-    the optimum by the lens as it is. gain: log-likelihood over that. freedom: degrees of freedom of the noise. centre: (n,)
-    change that is expected: back to the stated camera, where this one corrects it. open_axes: (6,) of the extrinsic, which a lens
-    may move. instead: (n,) with T (4, 4) and the log-likelihood that is lost there, where a principal point takes the place of a
-    rotation; None where none was asked about.
+    extrinsic free. moves: (6, n) twist of the extrinsic, rad and m, per unit of each; 0 along fixed axes. freedom: degrees of
+    freedom of the noise. centre: (n,) change that is expected: back to the stated camera, where this one corrects it. gain:
+    log-likelihood over the lens as it is. instead: (n,) with T (4, 4) and the log-likelihood that is lost there, where a
+    principal point takes the place of a rotation; None where none was asked about.
     """
 
     unknowns: tuple[LensUnknown, ...]
     change: Matrix
     T: Transform
     information: Matrix
-    directions: Matrix
-    T_given: Transform
+    moves: Matrix
     freedom: float
     centre: Matrix
     gain: float
-    open_axes: NDArray[np.bool_]
     instead: tuple[Matrix, Transform, float] | None = None
 
     @cached_property
@@ -215,16 +202,6 @@ class LensEstimate:
         spread = (own.probability * (own.covariance + np.outer(own.mean - mean, own.mean - mean)) for own in self.explanations)
         return mean, np.asarray(sum(spread))
 
-    @cached_property
-    def moves(self) -> Matrix:
-        """(6, n) twist of the extrinsic per unit of each change, such that the one to the optimum is included: farther away than
-        a step, the score bends otherwise (the secant of Broyden 1965)."""
-        if not self.open_axes.all():  # both optima are those of all axes
-            return self.directions
-        missing = se3.log(self.T @ se3.inverse(self.T_given)) - self.directions @ self.change
-        weighed = self.information @ self.change
-        return self.directions + np.outer(missing, weighed) / (float(self.change @ weighed) + 1)
-
     def effect(self, constraints: PoseConstraints, covariance: Covariance, kept: Sequence[int] = ()) -> tuple[Matrix, Covariance]:
         """Twist (6, n) of the extrinsic from the optimum by the lens as it is, whose own covariance is `covariance`, per unit of
         each change, and the second moment (n, n) of these. kept: axes that are those of the start, whatever the lens."""
@@ -263,31 +240,50 @@ class LensEstimate:
             for own, value, sigma in zip(self.unknowns, self.change, self.sigma, strict=True)
         }
 
-    def fault(self, deg: float, m: float, doubt: float = 0.5) -> LensFault | None:
-        """What is wrong such that it matters, with a probability of 1 - doubt, or of OPEN_PROBABILITY if it is plainly so: points
-        are seen more than deg elsewhere, or the extrinsic is more than deg or m elsewhere; None where all may be right.
+    def fault(self, camera: Camera, deg: float, m: float, doubt: float = 0.5) -> Refusal | None:
+        """What is wrong such that it matters, with a probability of 1 - doubt, or too uncertain, of OPEN_PROBABILITY if it is
+        plainly so: points are seen more than deg elsewhere, or the extrinsic is more than deg or m elsewhere; None where all may
+        be right. camera: as it is stated.
 
         A turn across the view does not count: it looks like another principal point, and who projects with the camera as it is
         stated never sees it.
         """
         moves = self.moves[2:] / np.array([[np.deg2rad(deg)], [m], [m], [m]])
         bends = np.stack([own.bend for own in self.unknowns], axis=-1) / np.deg2rad(deg)
-        best, off = self.explanations[0], [self._off(own, moves) if own.wrong.any() else 0.0 for own in self.explanations]
+
+        def off_by(own: LensHypothesis) -> float:
+            """Probability that it holds, something is plainly wrong, and the extrinsic is off."""
+            draws = np.linalg.cholesky(own.covariance) @ _draws(len(self.unknowns))
+            ends = moves @ (own.mean[:, None] + draws)
+            return own.probability * float(((np.abs(ends[0]) > 1) | (np.linalg.norm(ends[1:], axis=0) > 1)).mean())
+
+        best, off = self.explanations[0], [off_by(own) if own.wrong.any() else 0.0 for own in self.explanations]
         farthest = bends[int(np.linalg.norm(bends @ best.mean, axis=1).argmax())]
         parts = farthest, moves[:1], moves[1:]
         beyond = [_beyond(part @ best.mean, part @ best.covariance @ part.T) for part in parts]
         ratio = 0.5 * (self.freedom + 1) * float(np.log1p(max(beyond) / self.freedom))  # Student's distribution
         part = parts[int(np.argmax(beyond))]
-        fault = LensFault(self, _main(part, best), best.mean, 1.0)
-        # What is not shown, and only expected to be as it may be usually, accuses nothing.
-        shown = abs(self.change[fault.k]) > ACCUSING * self.sigma[fault.k]
-        if shown and ratio > np.log(1 / doubt - 1) and self._gains:
-            return fault
+        # What the score hardly gains by accuses nothing: its top may be narrower than the way to it is high.
+        gains, k = self._exceeds(2 * self.gain, ACCUSED), int(np.linalg.norm(part * best.mean, axis=0).argmax())
+        # Nor does what is not shown, and only expected to be as it may be usually.
+        if gains and abs(self.change[k]) > ACCUSING * self.sigma[k] and ratio > np.log(1 / doubt - 1):
+            return self._wrong(k, best.mean, camera)
         if sum(off) <= OPEN_PROBABILITY:
             return None
         most = self.explanations[int(np.argmax(off))]
-        certain = sum(off) >= 1 - doubt and self._gains
-        return LensFault(self, _main(moves, most), most.mean, 1.0 if certain else min(sum(off), 1 - 1e-9))
+        k = int(np.linalg.norm(moves * most.mean, axis=0).argmax())
+        if gains and sum(off) >= 1 - doubt:
+            return self._wrong(k, most.mean, camera)
+        own = self.unknowns[k]
+        return left_open(own.name, own.unit * self.change[k], own.unit * self.sigma[k], min(sum(off), 1 - 1e-9), deg, m)
+
+    def _wrong(self, k: int, change: Matrix, camera: Camera) -> Refusal:
+        """It is off by this change (n,), of which the unknown k matters most."""
+        own, values = self.unknowns[k], {own.name: float(value) for own, value in zip(self.unknowns, change, strict=True)}
+        removed = bool(abs(own.stated + change[k]) < 0.5 * abs(own.stated))
+        # By how many standard deviations of the scenes and in advance together.
+        deviations = float(abs(self.change[k] - self.centre[k]) / np.hypot(self.sigma[k], self.usual[k]))
+        return wrong_intrinsics(own.name, values, camera, removed, deviations)
 
     def seen(self, score: PointScore) -> tuple[PointScore, Transform]:
         """A score as it is by the lens that is expected by now, and the extrinsic (4, 4) there."""
@@ -297,26 +293,10 @@ class LensEstimate:
         back = se3.inverse(T).astype(np.float32)
         return score.with_points(back[:3, :3] @ P + back[:3, 3:]), T
 
-    @property
-    def _gains(self) -> bool:
-        """What the score hardly gains by accuses nothing: its top may be narrower than the way to it is high."""
-        return self._exceeds(2 * self.gain, ACCUSED)
-
     def _exceeds(self, square: float, share: float) -> bool:
         """F test of all unknowns: whether only so small a share of right lenses shows more."""
         n = len(self.unknowns)
         return square > n and bool(square > n * scipy.special.fdtri(n, self.freedom, 1 - share))
-
-    def _off(self, explanation: LensHypothesis, moves: Matrix) -> float:
-        """Probability that it holds, and the extrinsic is off. moves: (4, n), see `fault`, per unit of each change."""
-        draws = np.linalg.cholesky(explanation.covariance) @ _draws(len(self.unknowns))
-        ends = moves @ (explanation.mean[:, None] + draws)
-        return explanation.probability * float(((np.abs(ends[0]) > 1) | (np.linalg.norm(ends[1:], axis=0) > 1)).mean())
-
-
-def _main(part: Matrix, explanation: LensHypothesis) -> int:
-    """Which unknown moves most. part: (k, n) what each moves."""
-    return int(np.linalg.norm(part * explanation.mean, axis=0).argmax())
 
 
 @cache
@@ -336,37 +316,6 @@ def _beyond(mean: Matrix, covariance: Matrix) -> float:
         near = np.linalg.solve(information + middle * np.eye(len(mean)), information @ mean)
         low, high = (middle, high) if np.linalg.norm(near) > 1 else (low, middle)
     return float((mean - near) @ information @ (mean - near))
-
-
-@dataclass(frozen=True, eq=False)
-class LensFault:
-    """What is wrong of a lens. k: the unknown that matters most. change: (n,). probability: less than 1 where it is left open."""
-
-    estimate: LensEstimate
-    k: int
-    change: Matrix
-    probability: float
-
-    @property
-    def deviations(self) -> float:
-        """How far the one that matters most is off, in standard deviations of the scenes and in advance together."""
-        e, k = self.estimate, self.k
-        return float(abs(e.change[k] - e.centre[k]) / np.hypot(e.sigma[k], e.usual[k]))
-
-    def refusal(self, camera: Camera, deg: float, m: float) -> Refusal:
-        """Why an extrinsic is not to be used. camera: as it is stated. deg, m: the tolerance."""
-        own = self.estimate.unknowns[self.k]
-        if self.probability < 1:
-            value, sigma = (own.unit * known[self.k] for known in (self.estimate.change, self.estimate.sigma))
-            return left_open(own.name, value, sigma, self.probability, deg, m)
-        values = dict(zip([own.name for own in self.estimate.unknowns], map(float, self.change), strict=True))
-        return wrong_intrinsics(own.name, values, camera, self.removes_distortion, self.deviations)
-
-    @property
-    def removes_distortion(self) -> bool:
-        """Whether the scenes show hardly any of the distortion that is stated."""
-        stated = self.estimate.unknowns[self.k].stated
-        return bool(abs(stated + self.change[self.k]) < 0.5 * abs(stated))
 
 
 def estimate_lens(
@@ -404,12 +353,16 @@ def estimate_lens(
     there, own = see(T, change)[0], unlimited(np.eye(4))
     # Halves may disagree because of the wrong lens.
     noise = noise_of(there, np.eye(4), own) * min(inflated, inflation(disagreement(there, np.eye(4), own)))
-    bending = _bending(see, T, change, unknowns, part, noise, limits.open_axes)
+    information, moves = _bending(see, T, change, unknowns, part, noise, limits.open_axes)
+    if limits.open_axes.all():  # both optima are those of all axes
+        # Such that the move to the optimum is included: farther away than a step, the score bends otherwise (Broyden 1965).
+        missing, weighed = se3.log(T @ se3.inverse(T_given)) - moves @ change, information @ change
+        moves = moves + np.outer(missing, weighed) / (float(change @ weighed) + 1)
     freedom = max(REGIONS * effective_frames(score) - 6 - n, 1.0)
     centre, gain = as_it_is if centre is None else centre, max(higher - lower, 0.0) / noise
     at, by, value = ends[-1]
     instead = None if turned is None else (by, at, (higher - value) / noise)
-    return LensEstimate(tuple(unknowns), change, T, *bending, T_given, freedom, centre, gain, limits.open_axes, instead)
+    return LensEstimate(tuple(unknowns), change, T, information, moves, freedom, centre, gain, instead)
 
 
 def _seeing(score: PointScore, unknowns: Sequence[LensUnknown]) -> Callable[[Transform, Matrix], JointView]:
@@ -456,7 +409,6 @@ def _bending(
         ahead, behind = (linearised(see(se3.exp(sign * off[:6]) @ T, change + sign * off[6:]), n, level)[0] for sign in (1, -1))
         H[k] = (behind - ahead) / (2 * steps[k])
     H = 0.5 * (H + H.T)
-    # It may be indefinite: its eigenvalues relative to the Gauss-Newton scale rise to LEAST_CURVATURE.
     units = np.outer(steps, steps)
     scale = linearised(see(T, change), n, level)[1]
     # What no point shows of the extrinsic lies within reach.
@@ -464,9 +416,7 @@ def _bending(
     H, scale = H + nothing, scale + nothing
     values, vectors = np.linalg.eigh(scale * units)
     root = vectors / np.sqrt(np.maximum(values, NO_NOISE * values.max()))
-    values, vectors = np.linalg.eigh(root.T @ (H * units) @ root)
-    half = root @ vectors
-    C = (half / np.maximum(values, LEAST_CURVATURE)) @ half.T
+    C = inverse_above(H * units, root)
     lens, own = units[6:, 6:] * C[6:, 6:], np.flatnonzero(open_axes)
     bent, directions = np.linalg.inv(C), np.zeros((6, n))
     # The optimum of the open axes, the others held.
@@ -474,4 +424,4 @@ def _bending(
     # What shifts the border of the image as far as the systematic error of a rotation does.
     px = SYSTEMATIC_ERROR[0] * K[0, 0]
     systematic = np.array([px / score.camera.width * (1.0 if own.name in CENTRE else 2.0) for own in unknowns])
-    return np.linalg.inv(noise * lens + np.diag(systematic**2)), directions
+    return np.asarray(np.linalg.inv(noise * lens + np.diag(systematic**2))), directions

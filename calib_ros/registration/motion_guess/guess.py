@@ -1,21 +1,27 @@
-"""The first guess from motion: the rotation by which images move as the LiDAR does, and what the motion does not show of it."""
+"""The first guess: from motion, the rotation by which images move as the LiDAR does, and what the motion does not show of it; and
+the registration from guesses by classes, motion or whatever is available, of which the best that comes out counts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
-from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import Frame
+from calib_ros.registration.classes import PoseHypothesis
+from calib_ros.registration.estimate import insufficient
 from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.initial_guess import MOTION, SEMANTIC, nominal
+from calib_ros.registration.judgement.refusal import joined
 from calib_ros.registration.motion_guess.hand_eye import CLOCK_S, SAME_DEG, Fit, HandEye, distinct
 from calib_ros.registration.motion_guess.tracks import Run, Tracks, lidar_runs, tracked_points
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, SearchBox
+from calib_ros.result import InitialSource, Result
 
 LEAST_M, LEAST_RAD = 0.5, np.deg2rad(3.0)  # of travel or of turning; tracked points and aligned scans wander a tenth of it
 MIN_TRACKS, MIN_PAIRS = 100, 3
@@ -35,34 +41,33 @@ SIGMAS, LEAST_DEG = 3.0, 5.0  # half width of the box: so many standard deviatio
 CLOCK_KNOWN_S = CLOCK_S / 2  # standard deviation of the clocks' offset at which the motion has told most of it
 CLOCK_INFLATION = 2.5  # of that: poses between two scans average their errors, which looks like a better fit
 
+MIN_SCORE_RATIO = 0.8  # to the best score, for a hypothesis to be tried; one near the truth had 0.92 or more on KITTI
+ROUNDS = 4  # of the search around a hypothesis, of which most are wrong: what they do not show, more rounds hardly do
+
+
+Register = Callable[[Matrix | str, SearchBox | None], Result]  # an initial extrinsic (4, 4) or the name of a guess, and its box
+
 
 @dataclass(frozen=True, eq=False)
 class MotionGuess:
     """What consecutive frames tell of the extrinsic by their motion.
 
     hypotheses: (k, 4, 4) T_camera_lidar, best first; the camera is at the LiDAR, since motion tells little of its place.
-    covariance: (3, 3) of the first one's rotation, a turn about the camera's axes, rad^2, with what was assumed where an axis is
-    hidden. hidden: (j, 3) unit vectors in the camera's frame about which the motion does not tell the rotation. time_offset_s,
-    time_sigma_s: what ``motion.time_offset_s`` lacks, and its standard deviation; None where the motion does not tell. note: for
-    people, one line.
+    covariance: (3, 3) of the first one's rotation, a turn about the camera's axes, rad^2, with what was assumed where the motion
+    does not tell about an axis. time_offset_s: what ``motion.time_offset_s`` lacks; None where the motion does not tell. note:
+    for people, one line.
     """
 
     hypotheses: Matrix
     covariance: Matrix
-    hidden: Matrix
     time_offset_s: float | None
-    time_sigma_s: float | None
     note: str
-
-    @property
-    def sigma_deg(self) -> Matrix:
-        """Standard deviations (3,) of the rotation about the camera's x, y and z axis, deg."""
-        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.covariance))))
 
     @property
     def box(self) -> SearchBox:
         """Where to search around a hypothesis."""
-        x, y, z = np.clip(SIGMAS * self.sigma_deg, LEAST_DEG, SearchBox.MAX_DEG).tolist()
+        sigma_deg = np.rad2deg(np.sqrt(np.diag(self.covariance)))
+        x, y, z = np.clip(SIGMAS * sigma_deg, LEAST_DEG, SearchBox.MAX_DEG).tolist()
         return SearchBox((x, y, z), SEMANTIC_BOX.translation_m)
 
 
@@ -131,10 +136,8 @@ def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> Mot
     hypotheses = np.array([se3.from_parts(fit.R, np.zeros(3)) for fit in fits])
     hypotheses = hypotheses[distinct(hypotheses, np.arange(float(len(fits))), SAME_DEG)]
     sigma = CLOCK_INFLATION * float(np.sqrt(fits[0].covariance[6, 6]))
-    known = sigma < CLOCK_KNOWN_S
-    offset = -fits[0].clock_s if known else None
-    note = _note(runs, covariance, hidden, travel, offset, sigma)
-    return MotionGuess(hypotheses, covariance, hidden, offset, sigma if known else None, note)
+    offset = -fits[0].clock_s if sigma < CLOCK_KNOWN_S else None
+    return MotionGuess(hypotheses, covariance, offset, _note(runs, covariance, hidden, travel, offset, sigma))
 
 
 def _path(runs: Sequence[Run]) -> tuple[float, float]:
@@ -182,3 +185,67 @@ def _note(runs: Sequence[Run], covariance: Matrix, hidden: Matrix, travel: Matri
     if offset is not None and abs(offset) > SIGMAS * sigma:
         parts.append(f"clocks {1000 * offset:.0f} +-{1000 * sigma:.0f} ms apart (motion.time_offset_s)")
     return "; ".join(parts)
+
+
+def search_boxes(box: SearchBox) -> tuple[SearchBox, ...]:
+    """What is searched around every hypothesis: half the box in two rounds, and the box, where none converged. An empty box is
+    refined in once."""
+    if box.is_empty:
+        return (box,)
+    near = np.array_split(box.half_width() / 2, 2)
+    (rx, ry, rz), (tx, ty, tz) = np.rad2deg(near[0]).tolist(), near[1].tolist()
+    return SearchBox((rx, ry, rz), (tx, ty, tz), 2), replace(box, rounds=box.rounds or ROUNDS)
+
+
+def best_registration(
+    hypotheses: Sequence[PoseHypothesis], estimate: Callable[[Matrix, SearchBox], Result], box: SearchBox = SEMANTIC_BOX
+) -> tuple[Result, int]:
+    """The result that counts, and how many hypotheses were tried: converged before not, then by score.
+
+    estimate: T_camera_lidar (4, 4) and the box around it -> Result of the registration from there. A hypothesis is tried after
+    the first only if it scores nearly as much.
+    """
+    tried = [h for h in hypotheses if h.score >= MIN_SCORE_RATIO * hypotheses[0].score]
+    results: list[Result] = []
+    for around in search_boxes(box):
+        results += [estimate(h.T, around) for h in tried]
+        if any(r.converged for r in results):
+            break
+    return better(results), len(tried)
+
+
+def better(results: Sequence[Result]) -> Result:
+    """The result that counts: converged before not, then by score."""
+    return max(results, key=lambda r: (r.converged, np.nan_to_num(r.score, nan=-np.inf)))
+
+
+def from_motion(
+    register: Register, frames: int, consecutive: Sequence[Frame], extract: FeatureExtractor, box: SearchBox | None
+) -> Result:
+    """Registers so many frames from the hypotheses of the motion in consecutive ones. box: None = as the guess proposes. Raises
+    MissingDependencyError as `motion_guess`."""
+    try:
+        guess = motion_guess(consecutive, extract, extract.config.search.seed)
+    except TooFewFeaturesError as error:
+        return insufficient(error, nominal(), frames)
+    hypotheses = [PoseHypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
+    result, _ = best_registration(hypotheses, register, box or guess.box)
+    return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
+
+
+def from_anything(
+    register: Register, frames: int, consecutive: Sequence[Frame], extract: FeatureExtractor, box: SearchBox | None, classes: bool
+) -> Result:
+    """The first that converges from motion, from classes where there are some, and from the nominal extrinsic; else the best."""
+    tried = {}
+    try:
+        tried[MOTION] = from_motion(register, frames, consecutive, extract, box)
+    except (BadInputError, MissingDependencyError) as error:
+        tried[MOTION] = insufficient(error, nominal(), frames)
+    if not tried[MOTION].converged and classes:
+        tried[SEMANTIC] = register(SEMANTIC, box)
+    if not any(result.converged for result in tried.values()):
+        tried["nominal"] = replace(register(nominal(), box or NOMINAL_BOX), origin=InitialSource.NOMINAL)
+    best = better(list(tried.values()))
+    others = [f"not by {name}: {result.reason}" for name, result in tried.items() if result is not best]
+    return replace(best, reason=joined([best.reason, *others]))

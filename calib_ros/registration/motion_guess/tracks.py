@@ -48,6 +48,14 @@ class Run:
     poses: Matrix
     twists: Matrix
 
+    @classmethod
+    def of(cls, first: int, times: Matrix, images: Matrix, twists: Matrix) -> Run:
+        """A run by its velocities."""
+        poses = [np.eye(4)]
+        for twist, gap in zip(twists, np.diff(times), strict=True):
+            poses.append(poses[-1] @ se3.exp(twist * gap))
+        return cls(first, times, images, np.array(poses), twists)
+
     def __len__(self) -> int:
         return len(self.times)
 
@@ -85,7 +93,9 @@ def lidar_runs(frames: Sequence[Frame], config: MotionConfig) -> tuple[list[Run]
         if reason:
             reasons.append(reason)
         if twists:
-            runs.append(_run(frames[first:k], first, np.array(twists), origin, config))
+            times = np.array([(f.moment_of_cloud - origin) / NANOSECONDS for f in frames[first:k]])
+            images = np.array([(f.stamp - origin) / NANOSECONDS - config.time_offset_s for f in frames[first:k]])
+            runs.append(Run.of(first, times, images, np.array(twists)))
         twists, first = [], k
     return runs, reasons
 
@@ -104,15 +114,6 @@ def _between(before: Frame, frame: Frame, config: MotionConfig, start: Matrix | 
         before, frame = (replace(f, cloud=replace(f.cloud, time=None)) for f in (before, frame))
     motion = estimate_motion(before.cloud, frame.cloud, gap_s, config, start)
     return motion.twist, motion.reason
-
-
-def _run(frames: Sequence[Frame], first: int, twists: Matrix, origin: int, config: MotionConfig) -> Run:
-    times = np.array([(f.moment_of_cloud - origin) / NANOSECONDS for f in frames])
-    images = np.array([(f.stamp - origin) / NANOSECONDS - config.time_offset_s for f in frames])
-    poses = [np.eye(4)]
-    for twist, gap in zip(twists, np.diff(times), strict=True):
-        poses.append(poses[-1] @ se3.exp(twist * gap))
-    return Run(first, times, images, np.array(poses), twists)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,22 +184,20 @@ def tracked_points(frames: Sequence[Frame], runs: Sequence[Run], extract: Featur
 def picture_pairs(run: Run) -> list[tuple[int, int]]:
     """Positions of pictures to compare: from each of a sequence, the first one after enough motion, or the last one in time."""
     pairs: list[tuple[int, int]] = []
-    a = 0
-    poses = run.pose(run.images)
+    a, poses = 0, run.pose(run.images)
+
+    def moved(before: Matrix, after: Matrix) -> bool:
+        turn = np.arccos(np.clip((np.trace(before[:3, :3].T @ after[:3, :3]) - 1) / 2, -1, 1))
+        return bool(np.linalg.norm(after[:3, 3] - before[:3, 3]) >= STEP_M or turn >= STEP_RAD)
+
     while a < len(run) - 1:
         b = a + 1
-        while b < len(run) - 1 and run.images[b + 1] - run.images[a] <= LONGEST_S and not _moved(poses[a], poses[b]):
+        while b < len(run) - 1 and run.images[b + 1] - run.images[a] <= LONGEST_S and not moved(poses[a], poses[b]):
             b += 1
         if run.images[b] > run.images[a]:
             pairs.append((a, b))
         a += max((b - a + 1) // 2, 1)  # pairs overlap by half: all pictures count twice
     return pairs
-
-
-def _moved(before: Matrix, after: Matrix) -> bool:
-    R = before[:3, :3].T @ after[:3, :3]
-    turn = np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))
-    return bool(np.linalg.norm(after[:3, 3] - before[:3, 3]) >= STEP_M or turn >= STEP_RAD)
 
 
 def track(pictures: Sequence[Gray], mask: Gray | None = None) -> tuple[Matrix, Matrix]:

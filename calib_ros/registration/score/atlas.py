@@ -56,8 +56,10 @@ class Atlas:
         )
         for j, own in enumerate(levels):
             if kept is None or kept._frames[j]() is not own[0]:
-                for k, level in enumerate(self.levels):
-                    _fill(level, self.channels * j, own[k].packed)
+                for k, level in enumerate(self.levels):  # no point of a frame with fewer maps looks at the others' room
+                    corners = level.corner[self.channels * j :].astype(int)
+                    for tile, (u, v) in zip(own[k].packed, corners, strict=False):
+                        level.image[v : v + level.height, u : u + level.width] = tile
 
     def correlation(self, level: int) -> NDArray[np.float64]:
         """How alike the edge maps of all frames are at a level, (n_frames, n_frames), 0..1. Computed once."""
@@ -85,7 +87,22 @@ class Atlas:
     def with_distortion(self, barrel: float) -> Atlas:
         """The same maps as an ideal lens would see them, if those of the pictures had a radial distortion that moves the corner
         towards the principal point by the share `barrel` of its radius, and other pixels less, by its square."""
-        out = self._with([_undistorted(level, self.channels * self.n_frames, barrel) for level in self.levels])
+
+        def undistorted(level: AtlasLevel) -> AtlasLevel:
+            centre = level.K[:2, 2]
+            u, v = np.arange(level.width) - centre[0], np.arange(level.height) - centre[1]
+            corner = max(abs(u[0]), abs(u[-1])) ** 2 + max(abs(v[0]), abs(v[-1])) ** 2
+            factor = 1 - barrel * (u**2 + v[:, None] ** 2) / corner
+            maps: Any = cv2.convertMaps(
+                (centre[0] + u * factor).astype(np.float32), (centre[1] + v[:, None] * factor).astype(np.float32), cv2.CV_16SC2
+            )
+            image = np.zeros_like(level.image)
+            for u0, v0 in level.corner[: self.channels * self.n_frames].astype(int):
+                own = slice(v0, v0 + level.height), slice(u0, u0 + level.width)
+                image[own] = cv2.remap(level.image[own], maps[0], maps[1], cv2.INTER_LINEAR)
+            return replace(level, image=image)
+
+        out = self._with([undistorted(level) for level in self.levels])
         out._correlations = {}
         return out
 
@@ -110,25 +127,3 @@ def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> A
     scale, sigma = level.scale, level.sigma
     S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
     return AtlasLevel(image, corner, S @ camera.K, w, h, sigma / scale)
-
-
-def _undistorted(level: AtlasLevel, tiles: int, barrel: float) -> AtlasLevel:
-    """A level with its tiles resampled; see Atlas.with_distortion."""
-    centre = level.K[:2, 2]
-    u, v = np.arange(level.width) - centre[0], np.arange(level.height) - centre[1]
-    corner = max(abs(u[0]), abs(u[-1])) ** 2 + max(abs(v[0]), abs(v[-1])) ** 2
-    factor = 1 - barrel * (u**2 + v[:, None] ** 2) / corner
-    maps: Any = cv2.convertMaps(
-        (centre[0] + u * factor).astype(np.float32), (centre[1] + v[:, None] * factor).astype(np.float32), cv2.CV_16SC2
-    )
-    image = np.zeros_like(level.image)
-    for u0, v0 in level.corner[:tiles].astype(int):
-        own = slice(v0, v0 + level.height), slice(u0, u0 + level.width)
-        image[own] = cv2.remap(level.image[own], maps[0], maps[1], cv2.INTER_LINEAR)
-    return replace(level, image=image)
-
-
-def _fill(level: AtlasLevel, tile: int, maps: NDArray[np.int16]) -> None:
-    """Write the maps (c, h, w) of a frame from the given tile on; no point of one with fewer looks at the others' room."""
-    for own, (u0, v0) in zip(maps, level.corner[tile : tile + len(maps)].astype(int), strict=True):
-        level.image[v0 : v0 + level.height, u0 : u0 + level.width] = own

@@ -1,5 +1,5 @@
 """What a score is worth by chance: the scores of extrinsics so far off that edges match by chance only, and the probability that
-the best optimum of chance reaches it."""
+the best optimum of chance reaches it. They are spread evenly, as the starts of a search are."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.starts import EvenPoints
 
 NEIGHBOURS = 128
 HALF_WIDTH = np.array([np.deg2rad(6.0)] * 3 + [0.5] * 3)  # rad, m; edges move by tens of pixels: nothing matches but by chance
@@ -27,6 +26,25 @@ GUMBEL_SCALE = 0.65  # of the distribution of the best of many optima of chance:
 OUTLIER_SHARE = 0.35
 MIN_MEDIAN_Z = 2.5  # median z-score below which no frame matches, and none can judge the others
 MIN_JUDGING_FRAMES = 4  # frames needed to tell which of them is an outlier
+
+
+class EvenPoints:
+    """A sequence that fills [-1, 1]^dimensions evenly, wherever it is cut: multiples of the powers of a root, modulo 1 (Roberts,
+    The unreasonable effectiveness of quasirandom sequences, 2018), from where the seed says. scipy.stats takes half a second to
+    import for as much."""
+
+    def __init__(self, dimensions: int, seed: int) -> None:
+        root = 2.0
+        for _ in range(64):  # of x^(d + 1) = x + 1
+            root = (1 + root) ** (1 / (dimensions + 1))
+        self._step = root ** -np.arange(1.0, dimensions + 1)
+        self._at, self._taken = np.random.default_rng(seed).random(dimensions), 0
+
+    def next(self, count: int) -> NDArray[np.float64]:
+        """The next points (count, dimensions)."""
+        k = np.arange(self._taken, self._taken + count)[:, None]
+        self._taken += count
+        return np.asarray((self._at + k * self._step) % 1 * 2 - 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,13 +113,9 @@ class PointScore(Sampler):
         """The same points on the maps mirrored left to right about the principal point: a decoy without any true alignment."""
         return self._with(atlas=self.atlas.mirrored())
 
-    def with_intrinsics(self, focal: float, u: float, v: float) -> PointScore:
-        """The same points seen by a camera with other intrinsics; see Atlas.with_intrinsics."""
-        return self._with(atlas=self.atlas.with_intrinsics(focal, u, v))
-
-    def with_distortion(self, barrel: float) -> PointScore:
-        """The same points seen through a lens; see Atlas.with_distortion."""
-        return self._with(atlas=self.atlas.with_distortion(barrel))
+    def on(self, atlas: Atlas) -> PointScore:
+        """The same points on other maps of the same tiles."""
+        return self._with(atlas=atlas)
 
     def with_points(self, xyz: NDArray[np.float32]) -> PointScore:
         """The same with its points elsewhere (3, n), m."""

@@ -40,10 +40,6 @@ class Prior:
         xi = se3.log(T @ self._inverse)
         return 0.5 * float(self.information @ (xi * xi)), self.information * xi
 
-    def value(self, T: Transform) -> float:
-        """The cost alone."""
-        return self.cost(T)[0]
-
 
 @dataclass(frozen=True, eq=False)
 class Limits:
@@ -101,7 +97,7 @@ class PoseConstraints:
 
     def cost(self, T: Transform) -> float:
         """Cost of the prior at T (4, 4), to subtract from the score."""
-        return 0.0 if self.prior is None else self.prior.value(T)
+        return 0.0 if self.prior is None else self.prior.cost(T)[0]
 
     def active_limits(self, T: Transform, gradient: Matrix) -> NDArray[np.bool_]:
         """(6,) axes at a limit that the score, of `gradient` (6,) at T, or the prior pushes against."""

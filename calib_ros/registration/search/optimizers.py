@@ -18,6 +18,12 @@ LEVEL = 1e-9  # score per radian; a slope below is rounding, and no way up
 METRES_PER_RADIAN = 10.0  # 1 deg moves an edge at 10 m as far as 17 cm: steps along all axes then weigh alike
 AXES = np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])  # what one radian is along each axis of a twist
 
+# Of `refined`, for values of an unknown that are far off: 3 % of the focal length move the extrinsic by 3 deg and 40 cm; REACH is
+# twice as far. And for those nearby.
+POINTS, LEVELS, TOLERANCE_DEG = 6000, (1, 2, 3, 4), 0.01
+REACH = np.array([np.deg2rad(6.0)] * 3 + [0.8] * 3)  # rad, m
+NEAR_POINTS, NEAR_LEVELS, NEAR_TOLERANCE_DEG = 4000, (3, 4), 0.003
+
 
 def levenberg_marquardt(
     score: SmoothScore,
@@ -79,6 +85,16 @@ def learned_curvature(H: Matrix, moved: Matrix, fell: Matrix) -> Matrix:
     return H - np.outer(along, along) / expected + np.outer(fell, fell) / product
 
 
+def refined(
+    score: PointScore, T: Transform, limits: Limits, levels: tuple[int, ...], tolerance_deg: float
+) -> tuple[Matrix, float]:
+    """The optimum (4, 4) near T and its score, level by level."""
+    T, value = limits.clip(T), 0.0
+    for level in levels:
+        T, value = levenberg_marquardt(score.at(level), T, limits=limits, tolerance_deg=tolerance_deg, near=True)
+    return T, value
+
+
 # A score at values of n further unknowns, the extrinsic (4, 4) it is seen from, and the slopes (n, points) by the unknowns from
 # those (6, points) by a left twist.
 JointView = tuple[PointScore, Transform, Callable[[Matrix], Matrix]]
@@ -117,7 +133,7 @@ def ascend_jointly(
     n, of_x = len(x), np.ones(len(x), bool) if free is None else free
 
     def penalised(value: float, T: Transform) -> float:
-        return value - (prior.value(T) if prior else 0.0)
+        return value - (prior.cost(T)[0] if prior else 0.0)
 
     for level in levels:
         here = see(T, x)

@@ -16,12 +16,11 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import SearchConfig
 from calib_ros.registration.progress import SILENT, Progress
-from calib_ros.registration.score.chance import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.registration.score.chance import UNDOUBTED_Z, EvenPoints, null_distribution, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.search.optimizers import levenberg_marquardt, nelder_mead
 from calib_ros.registration.search.parallel import SERIAL, Workers
-from calib_ros.registration.starts import EvenPoints
 
 # What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
 # Seeding. Levels where starts are ranked and optimised first: the two coarsest find 49 of 80 KITTI frames, all three 66; in wide
@@ -187,12 +186,16 @@ class Rounds:
         self.score, self.config, self.limits, self.T_prior, self.workers = score, config, limits, T_prior, workers
         self.first = score.subset(FIRST_POINTS, rng)
         self.coarse, self.middle = score.subset(COARSE_POINTS, rng), score.subset(MIDDLE_POINTS, rng)
-        ranking = self._fewer(self.first, RANKING_POINTS)
+
+        def fewer(score: PointScore, points: int) -> PointScore:
+            return score.subset(points, np.random.default_rng(config.seed))
+
+        ranking = fewer(self.first, RANKING_POINTS)
         levels = WIDE_SEED_LEVELS if is_wide(box) else SEED_LEVELS
         self.strategies: list[Strategy] = [(ranking, self.first, level) for level in levels]
         if guide is not None:
-            guide = self._fewer(guide, GUIDE_POINTS)
-            self.strategies.append((self._fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL))
+            guide = fewer(guide, GUIDE_POINTS)
+            self.strategies.append((fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL))
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
@@ -203,16 +206,6 @@ class Rounds:
         self._polished: list[Optimum] = []
         self.nearby: tuple[Matrix, ...] = ()
         self._near: tuple[Matrix, Matrix] | None = None  # a finalist, and the best extrinsic near it
-
-    def _fewer(self, score: PointScore, points: int) -> PointScore:
-        return score.subset(points, np.random.default_rng(self.config.seed))
-
-    def _draw(self) -> Matrix:
-        """The next starts (n, 6) in units of the box, -1..1."""
-        searched = self.half > 0
-        times = float(np.sqrt(np.prod(self.half[searched] / BASE_BOX[searched])))
-        n = int(self.config.starts * np.clip(times, 1, MOST_TIMES))
-        return self._points.next(1 << (n - 1).bit_length())
 
     def penalty(self, T: Transform) -> float:
         """Of leaving the box, and the cost of the user's prior."""
@@ -225,19 +218,20 @@ class Rounds:
             own = progress.part(0.6 * k / len(self.strategies), 0.6 * (k + 1) / len(self.strategies))
             starts = self.seed_starts(strategy, self._rounds == 0, own.part(0, 0.25))
             self._optimise(starts, strategy[2], own.part(0.25, 1))
+
+        def polish(optimum: Optimum) -> None:
+            """On the middle levels, by simplex: it is robust where the slope misleads."""
+            optimum.coarse_T = optimum.T
+            for level, step in SIMPLEX_DEG.items():
+                score = self.middle.at(level)
+                optimum.T, optimum.value = nelder_mead(score, optimum.T, step, SIMPLEX_EVALUATIONS, self.penalty, self.limits)
+
         waiting = sorted((o for o in self._all if o.coarse_T is None), key=lambda o: -o.value)[:POLISHED]
-        for k, _ in enumerate(self.workers.map(self._polish, waiting)):
+        for k, _ in enumerate(self.workers.map(polish, waiting)):
             progress(0.6 + 0.3 * (k + 1) / len(waiting))
         self._polished += waiting
         self._polished.sort(key=lambda o: -o.value)
         self._rounds += 1
-
-    def _polish(self, optimum: Optimum) -> None:
-        """On the middle levels, by simplex: it is robust where the slope misleads."""
-        optimum.coarse_T = optimum.T
-        for level, step in SIMPLEX_DEG.items():
-            score = self.middle.at(level)
-            optimum.T, optimum.value = nelder_mead(score, optimum.T, step, SIMPLEX_EVALUATIONS, self.penalty, self.limits)
 
     def best(self) -> tuple[Matrix, int]:
         """The best extrinsic (4, 4) so far, and how many starts ended there."""
@@ -255,7 +249,10 @@ class Rounds:
 
     def seed_starts(self, strategy: Strategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
         """The best starts by a strategy that differ. with_prior: the centre of the box is among the candidates."""
-        (ranking, score, level), unit = strategy, self._draw()
+        (ranking, score, level), searched = strategy, self.half > 0
+        times = float(np.sqrt(np.prod(self.half[searched] / BASE_BOX[searched])))
+        n = int(self.config.starts * np.clip(times, 1, MOST_TIMES))
+        unit = self._points.next(1 << (n - 1).bit_length())  # (n, 6) of the box, -1..1
         if len(unit) > BEST_RANKED:
             ranked = self._score_starts(ranking, level, unit, progress.part(0, 0.7))
             unit = unit[np.sort(np.argsort(-ranked, kind="stable")[:BEST_RANKED])]

@@ -11,7 +11,8 @@ from scipy.special import stdtr
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
-from calib_ros.registration.judgement.evidence import EVEN, Match, convinces, freedom, log_odds, rare_odds, shows_noise
+from calib_ros.registration.covariance import freedom, shows_noise
+from calib_ros.registration.judgement.judge import EVEN, Match, convinces, log_odds, rare_odds
 from calib_ros.result import Cause
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CauseFinding, CauseState, CheckVerdict, Tolerance

@@ -219,7 +219,7 @@ def test_frames_without_clouds_are_insufficient(scene):
 
 
 def test_initial_extrinsic_facing_away_has_too_few_points(scene, monkeypatch):
-    monkeypatch.setattr("calib_ros.registration.score.fast_score.MARGIN", 0.0)
+    monkeypatch.setattr("calib_ros.registration.objective.MARGIN", 0.0)
     sky = se3.perturb(scene.truth, [90, 0, 0], [0, 0, 0])
     result = Calibrator(scene.camera).estimate(scene.features, sky)
     assert_not_used(result, sky, INSUFFICIENT)

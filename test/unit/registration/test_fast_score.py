@@ -26,10 +26,9 @@ from calib_ros.registration.covariance import (
 )
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.objective import SYSTEMATIC_ERROR
-from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.fast_score import (
+from calib_ros.registration.objective import (
     RING_SPACING_DEG,
+    SYSTEMATIC_ERROR,
     WEIGHT_FLOOR,
     WEIGHT_SIDE,
     WEIGHT_SKY_SIDE,
@@ -37,6 +36,7 @@ from calib_ros.registration.score.fast_score import (
     WEIGHT_TOP,
     FastScore,
 )
+from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import MARGIN
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, pose_constraints
@@ -183,7 +183,7 @@ def test_too_few_points_are_refused_with_their_number(monkeypatch):
         FastScore(few, nominal(), CONFIG)
     with pytest.raises(TooFewFeaturesError, match="no edge points"):
         FastScore([frame(0)], se3.from_parts(np.diag([-1.0, 1, -1]) @ nominal()[:3, :3], [0, 0, -500]), CONFIG)
-    monkeypatch.setattr("calib_ros.registration.score.fast_score.MIN_POINTS", 100)
+    monkeypatch.setattr("calib_ros.registration.objective.MIN_POINTS", 100)
     FastScore(few, nominal(), CONFIG)
 
 

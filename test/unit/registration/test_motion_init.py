@@ -79,7 +79,7 @@ def test_bends_tell_the_rotation_of_a_camera_of_any_yaw(yaw_deg: float, roll_deg
     guess = guess_from_tracks(tracks_of(run, T), [run])
     assert se3.rotation_error_deg(T, guess.hypotheses[0]) < 0.5
     assert len(guess.hypotheses) == 1
-    assert len(guess.hidden) == 0
+    assert "hardly shown" not in guess.note
     assert guess.box.rotation_deg == (LEAST_DEG,) * 3
     assert guess.box.translation_m == SEMANTIC_BOX.translation_m
     assert "4" in guess.note
@@ -91,8 +91,6 @@ def test_driving_straight_hides_the_turn_about_the_direction_of_travel(yaw_deg: 
     T, run = mounted(yaw_deg), run_of(np.tile(STRAIGHT, (16, 1)))
     guess = guess_from_tracks(tracks_of(run, T), [run])
     travel = T[:3, :3] @ [1, 0, 0]
-    assert len(guess.hidden) == 1
-    assert abs(guess.hidden[0] @ travel) > 0.99
     assert np.rad2deg(np.arccos(np.clip(guess.hypotheses[0][:3, 0] @ travel, -1, 1))) < 0.3
     assert se3.rotation_error_deg(T, guess.hypotheses[0]) < 4
     assert "direction of travel" in guess.note
@@ -110,7 +108,6 @@ def test_the_offset_of_the_clocks_where_turning_varies(late_s: float) -> None:
     T, run = mounted(0.0), run_of(winding(), late_s)
     guess = guess_from_tracks(tracks_of(run, T, late_s), [run])
     assert guess.time_offset_s is not None
-    assert guess.time_sigma_s is not None
     assert abs(guess.time_offset_s - late_s) < 0.02
     assert se3.rotation_error_deg(T, guess.hypotheses[0]) < 0.5
 
@@ -119,7 +116,6 @@ def test_a_steady_speed_tells_nothing_of_the_clocks() -> None:
     run = run_of(np.tile([0, 0, 0.2, 5.0, 0, 0], (30, 1)))
     guess = guess_from_tracks(tracks_of(run, mounted(0.0)), [run])
     assert guess.time_offset_s is None
-    assert guess.time_sigma_s is None
 
 
 def test_tracks_that_do_not_follow_the_lidar_are_refused() -> None:

@@ -10,13 +10,7 @@ import pytest
 from calib_ros.camera import Camera
 from calib_ros.errors import defect
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL
-from calib_ros.registration.acceptance.refusal import (
-    left_open,
-    low_score,
-    odd_intrinsics,
-    wrong_intrinsics,
-    wrong_times,
-)
+from calib_ros.registration.judgement.refusal import left_open, low_score, odd_intrinsics, wrong_intrinsics, wrong_times
 
 CAMERA = Camera(np.diag([700.0, 700.0, 1.0]), 1000, 500)
 LENS = {FOCAL: 0.0, ASPECT: 0.0, CENTRE[0]: 0.0, CENTRE[1]: 0.0, RADIAL: 0.0}

@@ -16,12 +16,12 @@ from calib_ros import se3
 from calib_ros.config import Config, ScoreConfig, SearchConfig, update
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import ConfigError
-from calib_ros.registration.acceptance.checks import check_uncertainty
-from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.covariance import disagreement
+from calib_ros.registration.estimate import check_uncertainty
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.chance import p_value
-from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 from calib_ros.registration.search.parallel import Workers, cpu_time

@@ -13,11 +13,11 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig, update
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as C
-from calib_ros.registration.acceptance.checks import RATIO_CONSISTENT, RATIO_INCONSISTENT, semantic_likelihood_ratio
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import FrameSemantics, consistency_score, edge_weights
+from calib_ros.registration.estimate import RATIO_CONSISTENT, RATIO_INCONSISTENT, semantic_likelihood_ratio
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import SEED_LEVELS, search
 from calib_ros.result import CONVERGED, REFUSED, Evidence, RefusalCode, Result

@@ -12,14 +12,12 @@ from scenes import QUICK, Scene, assert_not_used, driven
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.registration.acceptance.checks import Acceptance
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.estimate import check_offset
 from calib_ros.registration.features import FeatureExtractor, at_time_offset
-from calib_ros.registration.joint import Optimised
-from calib_ros.registration.nuisance.parameters import Effect
-from calib_ros.registration.nuisance.stamping import convention
-from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset, scatter_gain
-from calib_ros.registration.score.fast_score import FastScore
+from calib_ros.registration.joint import Optimised, convention
+from calib_ros.registration.judgement.clocks import Effect, TimeOffset, estimate_time_offset, scatter_gain
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode, Result, Stamping, parse
 
@@ -127,7 +125,7 @@ def test_an_offset_that_cannot_be_reached_is_never_accepted_wrong(scene):
 )
 def test_an_extrinsic_at_other_clocks_is_refused(scene, applied_s, seconds, sigma_s, gain, refused):
     offset = TimeOffset(seconds, scene.truth, sigma_s, gain, Effect(np.zeros(6), 1 / sigma_s**2), 0.3, 1.0, 0.1)
-    wrong = Acceptance(Config(), 640, None)._check_offset(Optimised([], None, scene.truth, None, offset, applied_s))
+    wrong = check_offset(Optimised([], None, scene.truth, None, offset, applied_s), Config().motion)
     assert (wrong is not None) == refused
 
 

@@ -30,8 +30,8 @@ from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import OF_CLASSES, FrameSemantics
 from calib_ros.registration.initial_guess import nominal, nominal_start
+from calib_ros.registration.objective import FastScore
 from calib_ros.registration.score.chance import UNDOUBTED_Z
-from calib_ros.registration.score.fast_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
 from calib_ros_semantics.models.segmentation import MAX_FAILURES, SegmentationModels

@@ -16,7 +16,7 @@ from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.classes import PoseHypothesis
 from calib_ros.registration.initial_guess import allowed, poses
-from calib_ros.registration.motion_guess.registration import best_registration, search_boxes
+from calib_ros.registration.motion_guess.guess import best_registration, search_boxes
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
 from calib_ros_semantics.first_guess.centroids import LEFT, RIGHT, Objects, agreed_poses, cloud_objects, find_pairs, image_objects

@@ -22,6 +22,9 @@ ONE_FRAME = "one frame only: a direction that it does not show may be wrong; use
 AS_RAW = "give --no-rectified, or image_is_rectified: false to the node"
 # And where intrinsics may be at fault, of a Camera.said_rectified.
 MAYBE_RAW = f"the images are taken for rectified, but camera_info has a distortion: if straight lines are bent in them, {AS_RAW}"
+SIGNIFICANCE = 1e-3  # largest probability of a false refusal
+GROSSLY = 0.01  # share of what is given that is plainly wrong, as the intrinsics of another image size are
+OPEN_PROBABILITY = 0.1  # of being plainly wrong: a search must reach its tolerance with 90 %
 USUAL_ASPECT, MIDDLE = 0.05, 0.25  # shares: fy and fx differ by less, and the principal point lies farther from every border
 SUSPECT_INTRINSICS = (RefusalCode.WRONG_INTRINSICS, RefusalCode.NOT_SIGNIFICANT, RefusalCode.LOW_SCORE)
 
@@ -40,8 +43,8 @@ class Refusal:
         return self.text
 
 
-def _refusal(code: RefusalCode, text: str, **figures: float) -> Refusal:
-    return Refusal(code, text, {name: float(value) for name, value in figures.items()})
+def _refusal(code: RefusalCode, text: str, cause: Cause | None = None, /, **figures: float) -> Refusal:
+    return Refusal(code, text, {name: float(value) for name, value in figures.items()}, cause)
 
 
 def worse_than_start(score: float, initial_score: float) -> Refusal:
@@ -58,9 +61,8 @@ def too_far_from_start(rotation_deg: float, translation_m: float, max_rotation_d
         f"the score still rises {rotation_deg:.1f} deg / {translation_m:.2f} m away from the start, at the limit "
         f"of {max_rotation_deg:g} deg / {max_translation_m:g} m per axis; widen the search"
     )
-    figures = {"rotation_deg": rotation_deg, "translation_m": translation_m}
     limits = {"max_rotation_deg": max_rotation_deg, "max_translation_m": max_translation_m}
-    return _refusal(RefusalCode.TOO_FAR_FROM_START, text, **figures, **limits)
+    return _refusal(RefusalCode.TOO_FAR_FROM_START, text, rotation_deg=rotation_deg, translation_m=translation_m, **limits)
 
 
 def low_score(score: float) -> Refusal:
@@ -122,17 +124,15 @@ def wrong_intrinsics(main: str, values: Mapping[str, float], camera: Camera, rem
     """Another lens matches better. main: which of the values, by their names, matters most: shares of the focal length, the
     aspect, the image width and the corner's radius. camera: as it is stated; removed: hardly any of its distortion is seen.
     deviations: how far `main` is off, in standard deviations of the scenes and of what is known in advance together."""
-    value, width, px = values[main], camera.width, camera.width * values[main]
+    value, width = values[main], camera.width
     cure = "check K and D in camera_info, the image size they are for, and image_is_rectified (--rectified)"
-    cause = Cause.PRINCIPAL_POINT if main in CENTRE else Cause.FOCAL_LENGTH
-    if main == FOCAL:
-        what = f"with a focal length about {abs(value):.1%} {'longer' if value > 0 else 'shorter'}"
-    elif main == ASPECT:
-        what = f"with fy about {abs(value):.1%} {'longer' if value > 0 else 'shorter'} against fx"
-    elif main == CENTRE[0]:
-        what = f"with the principal point about {abs(px):.3g} px further to the {'right' if value > 0 else 'left'}"
-    elif main == CENTRE[1]:
-        what = f"with the principal point about {abs(px):.3g} px further {'down' if value > 0 else 'up'}"
+    cause, plus = Cause.PRINCIPAL_POINT if main in CENTRE else Cause.FOCAL_LENGTH, value > 0
+    if main in (FOCAL, ASPECT):
+        of, than = ("a focal length", "") if main == FOCAL else ("fy", " against fx")
+        what = f"with {of} about {abs(value):.1%} {'longer' if plus else 'shorter'}{than}"
+    elif main in CENTRE:
+        where = ("to the right" if plus else "to the left") if main == CENTRE[0] else ("down" if plus else "up")
+        what = f"with the principal point about {abs(width * value):.3g} px further {where}"
     elif removed:
         what = "without the lens distortion of camera_info, as if the images were rectified already"
         cure, cause = "set image_is_rectified (--rectified), or check D", Cause.ALREADY_RECTIFIED
@@ -143,7 +143,7 @@ def wrong_intrinsics(main: str, values: Mapping[str, float], camera: Camera, rem
     text = f"wrong intrinsics: the scenes match better {what} ({deviations:.1f} standard deviations); {cure}"
     units = {FOCAL: ("focal", 1), ASPECT: ("aspect", 1), CENTRE[0]: ("u", width), CENTRE[1]: ("v", width), RADIAL: ("radial", 1)}
     figures = {units[name][0]: units[name][1] * value for name, value in values.items()}
-    return Refusal(RefusalCode.WRONG_INTRINSICS, text, {**figures, "deviations": float(deviations)}, cause)
+    return _refusal(RefusalCode.WRONG_INTRINSICS, text, cause, **figures, deviations=deviations)
 
 
 def wrong_times(seconds: float, deviations: float) -> Refusal:
@@ -158,7 +158,7 @@ def wrong_times(seconds: float, deviations: float) -> Refusal:
         f"wrong times: {match}: {late}, or the scans the other way; synchronise the clocks, or add {seconds:.3g} to "
         "motion.time_offset_s"
     )
-    return Refusal(RefusalCode.WRONG_TIMES, text, {"seconds": float(seconds), "deviations": float(deviations)}, Cause.TIME_OFFSET)
+    return _refusal(RefusalCode.WRONG_TIMES, text, Cause.TIME_OFFSET, seconds=seconds, deviations=deviations)
 
 
 def odd_intrinsics(camera: Camera) -> list[str]:
