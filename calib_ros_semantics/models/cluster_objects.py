@@ -54,7 +54,15 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     cut: (n,) points at the upper edge of the field of view. free: (n,) points without a class so far.
     """
     labels = np.full(len(xyz), UNLABELLED, np.uint8)
-    top = _column_tops(xyz)
+    # Height up to which the column of each point reaches without a gap.
+    member, n = cell_numbers(xyz * PLAN, (COLUMN_CELL, COLUMN_CELL, 1.0))
+    order = np.lexsort((xyz[:, 2], member))
+    z, column = xyz[order, 2], member[order]
+    first = np.r_[True, column[1:] != column[:-1]]
+    below = np.where(first, MAX_HIDDEN, np.r_[np.float32(0), z[:-1]])
+    gaps = np.cumsum(z - below > MAX_COLUMN_GAP + MAX_COLUMN_GAP_SHARE * np.hypot(xyz[order, 0], xyz[order, 1]))
+    before = np.r_[0, gaps[:-1]][first]
+    top = extents(np.where(gaps > before[column], 0, z).astype(np.float32), column, n)[1][member]
     low = np.nonzero((top < MAX_OBJECT_HEIGHT) & (xyz[:, 2] <= top) & free)[0]
     if len(low) == 0:
         return labels
@@ -95,9 +103,13 @@ class ClusterShape:
             return SemanticClass.VEHICLE
         if self.distance > MAX_PERSON_DISTANCE:
             return UNLABELLED
-        if self._is_rider():
+        sizes = self.length, self.width, self.top
+        rider, person = (all(low <= m <= high for m, (low, high) in zip(sizes, own, strict=True)) for own in (RIDER, PERSON))
+        calm = self.scatter < MAX_RIDER_SCATTER and self.level < MAX_RIDER_LEVEL and self.bottom < MAX_RIDER_BOTTOM
+        if rider and calm and self.head <= MAX_RIDER_HEAD * self.length:
             return SemanticClass.CYCLIST
-        return SemanticClass.PERSON if self._is_person() else UNLABELLED
+        slim = self.top > MIN_PERSON_SLIMNESS * self.length and self.head < MAX_PERSON_HEAD
+        return SemanticClass.PERSON if person and slim else UNLABELLED
 
     def _is_vehicle(self) -> bool:
         whole = self.width >= MIN_WHOLE_DEPTH
@@ -112,16 +124,6 @@ class ClusterShape:
         if self.length >= SIDE_LENGTH[0]:
             return whole or (self.length <= SIDE_LENGTH[1] and self.width >= MIN_SIDE_DEPTH)
         return self.width >= MIN_END_DEPTH
-
-    def _is_rider(self) -> bool:
-        shape = self.scatter < MAX_RIDER_SCATTER and self.level < MAX_RIDER_LEVEL and self.bottom < MAX_RIDER_BOTTOM
-        return shape and self._measures(RIDER) and self.head <= MAX_RIDER_HEAD * self.length
-
-    def _is_person(self) -> bool:
-        return self._measures(PERSON) and self.top > MIN_PERSON_SLIMNESS * self.length and self.head < MAX_PERSON_HEAD
-
-    def _measures(self, limits: tuple[tuple[float, float], ...]) -> bool:
-        return all(low <= m <= high for m, (low, high) in zip((self.length, self.width, self.top), limits, strict=True))
 
 
 def _within_car(xyz: Floats, visible: Floats) -> NDArray[np.bool_]:
@@ -139,16 +141,3 @@ def _within_car(xyz: Floats, visible: Floats) -> NDArray[np.bool_]:
     depth = max(width, CAR_SIZE[1] if length >= MIN_SIDE else CAR_SIZE[0])
     low = xyz[:, 2] <= max(float(visible[:, 2].max()), CAR_SIZE[2])
     return np.asarray(low & (np.abs(u) <= 0.5 * length) & (v >= -0.5 * width) & (v <= depth - 0.5 * width))
-
-
-def _column_tops(xyz: Floats) -> Floats:
-    """Height (n,) m up to which the column of each point (n, 3) reaches without a gap."""
-    member, n = cell_numbers(xyz * PLAN, (COLUMN_CELL, COLUMN_CELL, 1.0))
-    order = np.lexsort((xyz[:, 2], member))
-    z, column = xyz[order, 2], member[order]
-    first = np.r_[True, column[1:] != column[:-1]]
-    below = np.where(first, MAX_HIDDEN, np.r_[np.float32(0), z[:-1]])
-    gaps = np.cumsum(z - below > MAX_COLUMN_GAP + MAX_COLUMN_GAP_SHARE * np.hypot(xyz[order, 0], xyz[order, 1]))
-    before = np.r_[0, gaps[:-1]][first]
-    _, high = extents(np.where(gaps > before[column], 0, z).astype(np.float32), column, n)
-    return high[member]
