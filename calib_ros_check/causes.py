@@ -6,9 +6,11 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import ESTIMATE
+from calib_ros.intrinsics import CENTRE
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.judgement.hypotheses import MIXED_UP, Hypothesis, distorts
 from calib_ros.registration.judgement.lens import LensEstimate
@@ -22,6 +24,7 @@ AS_GIVEN = "the extrinsic matches as it is given"
 OFF = "the extrinsic is off"
 SIGNIFICANT_SIGMAS = 3.0  # of an offset of the clocks: a right extrinsic must hardly ever fail by one
 REPORTED_SIGMAS = 2.0  # of the interval in a message
+PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
 KNOW_CLOCKS = (
     "drive at changing speeds and through turns, or, if it is known, state motion.time_offset_s with motion.time_offset: fixed"
 )
@@ -100,8 +103,15 @@ def possible_causes(camera: Camera) -> tuple[Cause, ...]:
     return tuple(cause for cause in Cause if cause is not Cause.ALREADY_RECTIFIED or distorts(camera))
 
 
-def centre_finding(u_px: float, v_px: float) -> CauseFinding:
-    """A principal point so far off that explains the frames as well as a rotation does."""
+def centre_finding(lens: LensEstimate, T: Transform, tolerance: Tolerance) -> CauseFinding | None:
+    """A principal point so far off that explains the frames as well as a rotation from the extrinsic T (4, 4) does."""
+    if lens.instead is None:
+        return None
+    change, T_instead, loss = lens.instead
+    if loss > PARAMETER_PENALTY or not tolerance.covers(T, T_instead):
+        return None
+    found = {own.name: own.unit * float(value) for own, value in zip(lens.unknowns, change, strict=True)}
+    u_px, v_px = (found[name] for name in CENTRE)
     moved = ((u_px, "right", "left"), (v_px, "down", "up"))
     words = " and ".join(
         f"a principal point {abs(px):.0f} px further {more if px > 0 else less}" for px, more, less in moved if round(px)

@@ -22,7 +22,6 @@ from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
 from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.intrinsics import CENTRE
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.covariance import covariance, disagreement, freedom, inflation, noise_of, shows_lens, shows_noise
@@ -42,6 +41,7 @@ from calib_ros_check.causes import (
     AS_GIVEN,
     OFF,
     OTHER_FITS,
+    PARAMETER_PENALTY,
     centre_finding,
     clock_finding,
     complete,
@@ -57,7 +57,7 @@ Classified = Callable[[Sequence[int]], Sequence[FrameFeatures]]  # of the frames
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
-PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
+
 NOT_JUDGED = "one scene does not tell, nor do unrolled pictures of wide lenses"
 NOT_THE_CLOCKS = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
@@ -78,20 +78,6 @@ class CheckInputs:
     as_taken: AsTaken | None = None
     vehicle_frames: Mapping[str, Matrix] = field(default_factory=dict)
     progress: Callback | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Explanation(Match):
-    """What the scenes show. covariance: (6, 6) of a left twist, with the camera as it is; shared: the part of it that other
-    scenes have in common; with_intrinsics: the whole. T_corrected: the extrinsic that was checked, with what was mixed up put
-    right. result: of the estimate."""
-
-    covariance: Covariance
-    T_corrected: Transform
-    result: Result
-    causes: tuple[CauseFinding, ...] = ()
-    shared: Covariance | None = None
-    with_intrinsics: Covariance | None = None
 
 
 class Checker:
@@ -156,10 +142,8 @@ class Checker:
     def check_features(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> CheckResult:
         """The same from features; progress is called at least once for everything that is tried. Its time is for the caller to
         take."""
-        found = self._find(features, inputs) if features else None
-        if found is not None:
-            result = self._judged(found, inputs)
-        else:
+        result = self._found(features, inputs) if features else None
+        if result is None:
             why = NOTHING_MATCHES if features else "no frame can be used"
             causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
             known = {"tolerance": inputs.tolerance, "T_checked": inputs.T, "T_estimated": None, "covariance": None}
@@ -170,8 +154,8 @@ class Checker:
             data_stamp=max((f.stamp for f in features), default=0),
         )
 
-    def _find(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation | None:
-        """What the scenes show; None if nothing matches beyond chance."""
+    def _found(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> CheckResult | None:
+        """The verdict about what the scenes show; None if nothing matches beyond chance."""
         optima: list[Matrix] = []
         both = [look(self._calibrator, features, box, inputs, optima) for box in (None, NEAR)]
         near = max((own for own in both if own is not None), key=match_of, default=None)
@@ -188,7 +172,7 @@ class Checker:
             told = findings(MIXED_UP, CauseState.EXCLUDED, OFF) if off else explained(one.hypothesis, self.camera)
             known = Result(one.T, CONVERGED, frames_used=len(features), evidence=Evidence(one.z_score, None, np.nan, np.nan))
             T_corrected = inputs.T if off else one.hypothesis.T
-            return Explanation(one.score, one.T, covariance_of(one.score, one.T), T_corrected, known, told)
+            return self._judged(inputs, one, covariance_of(one.score, one.T), known, told, T_corrected)
         found = near or look(self._further, features, FAR, inputs, optima)
         if found is None and inputs.classified is not None:
             # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
@@ -196,8 +180,8 @@ class Checker:
             found = look(self._further, features, FAR, inputs, optima)
         return None if found is None else self._at_optimum(features, found, inputs)
 
-    def _at_optimum(self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs) -> Explanation:
-        """Clocks and intrinsics at the optimum of an estimate."""
+    def _at_optimum(self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs) -> CheckResult:
+        """The verdict, with clocks and intrinsics at the optimum of an estimate."""
         as_stamped = features
         features, result, clocks = self._on_right_clocks(features, result, inputs)
         if clocks.state is CauseState.FOUND:
@@ -224,14 +208,14 @@ class Checker:
                 shared = lens.left_open
                 C = whole = covariance_of(score, found) + shared
             elif clocks.state is not CauseState.FOUND:
-                own = self._possible_centre(lens, inputs)
+                own = centre_finding(lens, inputs.T, inputs.tolerance)
                 causes = tuple(own if own is not None and own.cause is finding.cause else finding for finding in causes)
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *causes)
         blamed, right = any(own.state is CauseState.FOUND for own in causes), inputs.tolerance.covers(inputs.T, found)
         why = OTHER_FITS if blamed else AS_GIVEN if right else OFF
         causes = (*causes, *findings(MIXED_UP, CauseState.EXCLUDED, why))
-        return Explanation(score, found, C, inputs.T, result, causes, shared, whole)
+        return self._judged(inputs, Match(score, found), C, result, causes, inputs.T, shared, whole)
 
     def _lens(
         self, score: PointScore, T: Matrix, result: Result, inputs: CheckInputs, turned: Matrix | None = None
@@ -255,16 +239,6 @@ class Checker:
         best = max(others, key=lambda own: own.z_score, default=None)
         better = best is not None and convinces(log_odds(best, Match(score, found)), rare_odds(len(guesses)))
         return best if better else None
-
-    def _possible_centre(self, lens: LensEstimate, inputs: CheckInputs) -> CauseFinding | None:
-        """A principal point that explains the frames as well as the rotation to the optimum does."""
-        if lens.instead is None:
-            return None
-        change, T, loss = lens.instead
-        if loss > PARAMETER_PENALTY or not inputs.tolerance.covers(inputs.T, T):
-            return None
-        found = {own.name: own.unit * float(value) for own, value in zip(lens.unknowns, change, strict=True)}
-        return centre_finding(*(found[name] for name in CENTRE))
 
     def _on_right_clocks(
         self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs
@@ -304,28 +278,37 @@ class Checker:
         better = lens is not None and fault is not None and lens.gain - PARAMETER_PENALTY * (len(lens.unknowns) - 1) > gain
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 
-    def _judged(self, found: Explanation, inputs: CheckInputs) -> CheckResult:
-        """The verdict about what was found."""
-        tolerance = inputs.tolerance
-        judgement = judge(found.T_corrected, found.T, found.covariance, tolerance, freedom(found.score), found.shared)
-        whole = found.covariance if found.with_intrinsics is None else found.with_intrinsics
+    def _judged(
+        self,
+        inputs: CheckInputs,
+        found: Match,
+        C: Covariance,
+        result: Result,
+        causes: tuple[CauseFinding, ...],
+        T: Transform,
+        shared: Covariance | None = None,
+        whole: Covariance | None = None,
+    ) -> CheckResult:
+        """The verdict about what was found. C: (6, 6) of a left twist, with the camera as it is; shared: what other scenes have
+        in common; whole: with the intrinsics. T: the extrinsic that was checked, with what was mixed up put right."""
+        tolerance, whole = inputs.tolerance, C if whole is None else whole
+        judgement = judge(T, found.T, C, tolerance, freedom(found.score), shared)
         if judgement.verdict is CheckVerdict.FAIL:  # what another lens may be to blame for is not the mount's
-            judgement = judge(found.T_corrected, found.T, whole, tolerance, freedom(found.score), found.shared)
-        told = found.covariance if found.shared is None else found.covariance - found.shared  # by the scenes themselves
-        if judgement.verdict is CheckVerdict.FAIL and not is_off(found, told, found.T_corrected, tolerance):
+            judgement = judge(T, found.T, whole, tolerance, freedom(found.score), shared)
+        told = C if shared is None else C - shared  # by the scenes themselves
+        if judgement.verdict is CheckVerdict.FAIL and not is_off(found, told, T, tolerance):
             judgement = undecided(judgement)
-        cause = next((own for own in found.causes if own.state is CauseState.FOUND), None)
-        result, evidence = found.result, found.result.evidence
+        cause, evidence = next((own for own in causes if own.state is CauseState.FOUND), None), result.evidence
         return CheckResult(
             **vars(judgement) | {"verdict": judgement.verdict if cause is None else CheckVerdict.FAIL},
-            reason=reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is CauseState.POSSIBLE]),
+            reason=reason_of(judgement, tolerance, cause, [own for own in causes if own.state is CauseState.POSSIBLE]),
             tolerance=tolerance,
             T_checked=inputs.T,
             T_estimated=found.T,
-            covariance=found.covariance,
+            covariance=C,
             covariance_with_intrinsics=whole,
-            shared_covariance=found.shared,
-            causes=complete(found.causes, self.camera),
+            shared_covariance=shared,
+            causes=complete(causes, self.camera),
             time_offset_s=result.time_offset_s,
             time_offset_sigma_s=result.time_offset_sigma_s,
             z_score=evidence.z_score if evidence else np.nan,

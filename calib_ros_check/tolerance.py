@@ -63,6 +63,11 @@ class Judgement:
     translation: Deviation
     axes: tuple[Deviation, ...]
 
+    @property
+    def sizes(self) -> str:
+        """Of rotation and translation, in words."""
+        return f"rotation {self.rotation.words}, translation {self.translation.words}"
+
 
 def unknown() -> Judgement:
     """Where the scenes show no extrinsic at all."""
@@ -100,13 +105,10 @@ def judge(
 
 def undecided(judgement: Judgement) -> Judgement:
     """The same where nothing is said to fail."""
+    opened = {own: own for own in CheckVerdict} | {CheckVerdict.FAIL: CheckVerdict.INCONCLUSIVE}
     parts = (judgement.rotation, judgement.translation, *judgement.axes)
-    rotation, translation, *axes = (replace(own, verdict=_open(own.verdict)) for own in parts)
-    return Judgement(_open(judgement.verdict), judgement.p_within, rotation, translation, tuple(axes))
-
-
-def _open(verdict: CheckVerdict) -> CheckVerdict:
-    return CheckVerdict.INCONCLUSIVE if verdict is CheckVerdict.FAIL else verdict
+    rotation, translation, *axes = (replace(own, verdict=opened[own.verdict]) for own in parts)
+    return Judgement(opened[judgement.verdict], judgement.p_within, rotation, translation, tuple(axes))
 
 
 def verdict_of(p_within: float, shown: bool = True) -> CheckVerdict:
@@ -121,23 +123,19 @@ def is_off(optimum: Match, covariance: Covariance, T_checked: Transform, toleran
     where the best of these is, but knows one top of the score only."""
     part = optimum.score.subset(POINTS, np.random.default_rng(0))
     half = np.array([np.deg2rad(tolerance.deg)] * 3 + [tolerance.m] * 3)
-    nearest = se3.exp(_nearest_within(se3.log(optimum.T @ se3.inverse(T_checked)), covariance, half)) @ T_checked
+    # The twist within both limits that is nearest by the covariance: by the limits' multipliers, found as a fixed point.
+    twist = error = se3.log(optimum.T @ se3.inverse(T_checked))
+    information, multipliers = np.linalg.inv(covariance), half**-2.0
+    for _ in range(NEAREST_ROUNDS):
+        twist = np.linalg.solve(information + np.diag(multipliers), information @ error)
+        sizes = np.repeat(np.linalg.norm(twist.reshape(2, 3), axis=1), 3)
+        multipliers = np.maximum(multipliers, 1e-12) * (sizes / half) ** 2
+    nearest = se3.exp(twist * min(1.0, float((half / np.maximum(sizes, 1e-12)).min()))) @ T_checked
     limits, ends = Limits(T_checked, half / np.sqrt(3)), [nearest]
     for start, levels in product((T_checked, limits.clip(nearest)), (LEVELS, NEAR_LEVELS)):
         ends.append(refined(part, start, limits, levels, TOLERANCE_DEG)[0])
     best = max((Match(part, T) for T in ends), key=evidence)
     return convinces(log_odds(Match(part, optimum.T), best), EVEN)
-
-
-def _nearest_within(error: Matrix, covariance: Covariance, half: Matrix) -> Matrix:
-    """The twist (6,) whose rotation and shift are within half (6,), rad and m, that is nearest to an error (6,) by its covariance
-    (6, 6): by the multipliers of both limits, found as a fixed point."""
-    information, multipliers, twist = np.linalg.inv(covariance), half**-2.0, error
-    for _ in range(NEAREST_ROUNDS):
-        twist = np.linalg.solve(information + np.diag(multipliers), information @ error)
-        sizes = np.repeat(np.linalg.norm(twist.reshape(2, 3), axis=1), 3)
-        multipliers = np.maximum(multipliers, 1e-12) * (sizes / half) ** 2
-    return twist * min(1.0, float((half / np.maximum(sizes, 1e-12)).min()))
 
 
 def deviation(T_checked: Transform, T_estimated: Transform, covariance: Covariance) -> tuple[Matrix, Matrix]:
@@ -177,33 +175,35 @@ def posterior_samples(error: Matrix, C: Matrix, tolerance: Tolerance, freedom: f
 def _deviation(name: str, samples: Matrix, limit: float, unit: float, shown: bool) -> Deviation:
     tail = (1 - INTERVAL) / 2
     low, error, high = (float(x) for x in unit * np.quantile(samples, [tail, 0.5, 1 - tail]))
-    found = Deviation(name, verdict_of(float((np.abs(samples) <= limit).mean()), shown), error, low, high)
-    is_angle = name == "rotation"
-    size = f"off by {amount(error, is_angle)} ({amount(low, is_angle)} to {amount(high, is_angle)})"
-    return replace(found, words=axis_words(found) if name in AXES else size)
-
-
-def _worst(judgement: Judgement) -> list[Deviation]:
-    """The axes that fail, or else those that are inconclusive; the largest first."""
-    for verdict in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE):
-        if found := [axis for axis in judgement.axes if axis.verdict is verdict]:
-            return sorted(found, key=lambda axis: -abs(axis.error) * (1.0 if axis.name[0] == "r" else 5.0))
-    return []
+    verdict, is_angle = verdict_of(float((np.abs(samples) <= limit).mean()), shown), name[0] == "r"
+    # Direction and size of the error along an axis; what is claimed is described, not what is true.
+    if name not in AXES:
+        words = f"off by {amount(error, is_angle)} ({amount(low, is_angle)} to {amount(high, is_angle)})"
+    elif low <= 0 <= high and verdict is CheckVerdict.PASS:
+        words = f"right within {amount(max(abs(low), abs(high)), is_angle)}"
+    elif low <= 0 <= high:
+        words = f"between {signed(low, is_angle)} and {signed(high, is_angle)}"
+    else:
+        way, spread = DIRECTIONS[name][int(error < 0)], amount(max(high - error, error - low), is_angle)
+        words = f"{way.format(amount(error, is_angle))} (+- {spread})"
+    return Deviation(name, verdict, error, low, high, words)
 
 
 def reason_of(
     judgement: Judgement, tolerance: Tolerance, cause: CauseFinding | None, possible: Sequence[CauseFinding] = ()
 ) -> str:
     """The verdict in one line, for people."""
-    sizes = f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
     if cause is not None:
-        return f"{cause.message}; {_THEN[judgement.verdict].format(limits=tolerance, sizes=sizes)}"
+        return f"{cause.message}; {_THEN[judgement.verdict].format(limits=tolerance, sizes=judgement.sizes)}"
     if judgement.verdict is CheckVerdict.PASS:
-        return f"right to within {tolerance}: {sizes}"
-    axes = [axis.words for axis in _worst(judgement)]
+        return f"right to within {tolerance}: {judgement.sizes}"
+    # The axes that fail, or else those that are inconclusive; the largest first.
+    by_verdict = ([own for own in judgement.axes if own.verdict is v] for v in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE))
+    worst = sorted(next(filter(None, by_verdict), []), key=lambda own: -abs(own.error) * (1.0 if own.name[0] == "r" else 5.0))
     if judgement.verdict is CheckVerdict.FAIL:
-        return "; ".join([f"{'; '.join(axes) or sizes}: more than {tolerance}", *(f"or else {own.message}" for own in possible)])
-    names = ", ".join(f"{axis.name} {axis.words}" for axis in _worst(judgement)) or sizes
+        axes = "; ".join(own.words for own in worst) or judgement.sizes
+        return "; ".join([f"{axes}: more than {tolerance}", *(f"or else {own.message}" for own in possible)])
+    names = ", ".join(f"{own.name} {own.words}" for own in worst) or judgement.sizes
     return f"the scenes do not tell it to within {tolerance}: {names}; {MORE_FRAMES}"
 
 
@@ -217,14 +217,3 @@ def amount(value: float, is_angle: bool) -> str:
 def signed(value: float, is_angle: bool) -> str:
     """The same with its sign."""
     return f"{'-' if value < 0 else '+'}{amount(value, is_angle)}"
-
-
-def axis_words(axis: Deviation) -> str:
-    """Direction and size of the error along an axis; what is claimed is described, not what is true."""
-    is_angle = axis.name[0] == "r"
-    spread = amount(max(axis.high - axis.error, axis.error - axis.low), is_angle)
-    if axis.low <= 0 <= axis.high and axis.verdict is CheckVerdict.PASS:
-        return f"right within {amount(max(abs(axis.low), abs(axis.high)), is_angle)}"
-    if axis.low <= 0 <= axis.high:
-        return f"between {signed(axis.low, is_angle)} and {signed(axis.high, is_angle)}"
-    return f"{DIRECTIONS[axis.name][int(axis.error < 0)].format(amount(axis.error, is_angle))} (+- {spread})"

@@ -22,7 +22,7 @@ from calib_ros.datasets.open import is_single
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare
 from calib_ros_evaluation.evaluate import Experiments, Study, evaluate
-from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
+from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, labels
 from calib_ros_evaluation.methods.own import NAMES
 from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, PROTOCOLS, TRIALS
@@ -39,14 +39,27 @@ def run_evaluation(args: argparse.Namespace) -> str:
     workers = (os.cpu_count() or 1) if args.workers is None else int(args.workers)
     if workers < 1:
         raise BadInputError(f"--workers {workers}: give at least 1")
+    paths = [path for text in args.source for path in sources_in(text)]
+    # Absolute, since workers may start elsewhere; a source that is given twice is one.
+    paths = list(dict.fromkeys(str(Path(path).resolve()) if Path(path).exists() else path for path in paths))
+    reference = () if args.reference is None else tuple(map(tuple, result.load(args.reference).T_camera_lidar.tolist()))
+    chosen = tuple(bag_options(args).items())
+    scenes = (SourceSpec(label, path, args.camera, chosen, reference) for label, path in zip(labels(paths), paths, strict=True))
+    setup = Setup(tuple(scenes), configuration(args.config, preset_name=args.preset))
     with progress_bar("evaluating") as step:
 
         def progress(stage: str, done: int, total: int) -> None:
             """Reading the sources takes seconds, all else minutes."""
             step(done if stage == "trials" else 0.0, max(total, 1))
 
+        libraries = f"numpy {np.__version__}, scipy {scipy.__version__}, OpenCV {cv2.__version__}"
+        facts = {
+            "Command": shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode(),
+            "Version": f"calib-ros {__version__}; Python {platform.python_version()}, {libraries}",
+            "Machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        }
         of_run = {"frames": args.frames, "workers": workers, "scheduler": args.scheduler or "", "fresh": args.fresh}
-        said, files, notes = evaluate(setup_of(args), study, Path(args.out), _facts(args), progress, **of_run)
+        said, files, notes = evaluate(setup, study, Path(args.out), facts, progress, **of_run)
     for line in notes:
         note(line)
     page = files[0].resolve()
@@ -70,7 +83,15 @@ def study_of(args: argparse.Namespace) -> Study:
         methods, experiments = args.methods or NAMES, args.experiments or EXPERIMENTS
         _check_names("method", methods, NAMES)
         _check_names("experiment", experiments, EXPERIMENTS)
-        return Experiments(plan_of(args), methods, experiments)
+        plan = QUICK if args.quick else FULL
+        deg, m = (own if new is None else new for own, new in zip(plan.start, (args.start_deg, args.start_m), strict=True))
+        if not (0 < deg <= 45 and 0 < m <= 3):  # NaN, too
+            raise BadInputError(f"--start-deg {deg:g} --start-m {m:g}: give more than 0, at most 45 deg and 3 m")
+        repeats = plan.repeats if args.repeats is None else args.repeats
+        if not 1 <= repeats <= 1000:
+            raise BadInputError(f"--repeats {repeats}: give 1 to 1000")
+        seed = plan.seed if args.seed is None else args.seed
+        return Experiments(replace(plan, start=(deg, m), repeats=repeats, seed=seed), methods, experiments)
     _check_names("protocol", [name], PROTOCOL_NAMES)
     if not 1 <= trials <= 100_000:
         raise BadInputError(f"--trials {trials}: give 1 to 100000")
@@ -91,29 +112,6 @@ def _check_names(kind: str, given: Sequence[str], known: Sequence[str]) -> None:
             raise BadInputError(f"there is no {kind} '{name}'; choose among {', '.join(known)}")
 
 
-def _facts(args: argparse.Namespace) -> dict[str, str]:
-    """For the head of a report."""
-    libraries = f"numpy {np.__version__}, scipy {scipy.__version__}, OpenCV {cv2.__version__}"
-    return {
-        "Command": shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode(),
-        "Version": f"calib-ros {__version__}; Python {platform.python_version()}, {libraries}",
-        "Machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-    }
-
-
-def setup_of(args: argparse.Namespace) -> Setup:
-    """Sources under their names, and the configuration. BadInputError where there are none."""
-    paths = [path for text in args.source for path in sources_in(text)]
-    # Absolute, since workers may start elsewhere; a source that is given twice is one.
-    paths = list(dict.fromkeys(str(Path(path).resolve()) if Path(path).exists() else path for path in paths))
-    reference: tuple[tuple[float, ...], ...] = ()
-    if args.reference is not None:
-        reference = tuple(map(tuple, result.load(args.reference).T_camera_lidar.tolist()))
-    chosen = tuple(bag_options(args).items())
-    scenes = (SourceSpec(label, path, args.camera, chosen, reference) for label, path in zip(labels(paths), paths, strict=True))
-    return Setup(tuple(scenes), configuration(args.config, preset_name=args.preset))
-
-
 def sources_in(text: str) -> list[str]:
     """What `open_dataset` opens at a path: itself (also a synthetic drive), or the KITTI drives, bags or plain folders below.
 
@@ -126,15 +124,3 @@ def sources_in(text: str) -> list[str]:
     if not found:
         raise BadInputError(f"{text} holds no KITTI drives, ROS 2 bags or plain folders; give their folders one by one")
     return [str(one) for one in found]
-
-
-def plan_of(args: argparse.Namespace) -> Plan:
-    """The full or the quick plan with what the options change. BadInputError for a value out of range."""
-    plan = QUICK if args.quick else FULL
-    deg, m = (own if given is None else given for own, given in zip(plan.start, (args.start_deg, args.start_m), strict=True))
-    if not (0 < deg <= 45 and 0 < m <= 3):  # NaN, too
-        raise BadInputError(f"--start-deg {deg:g} --start-m {m:g}: give more than 0, at most 45 deg and 3 m")
-    repeats = plan.repeats if args.repeats is None else args.repeats
-    if not 1 <= repeats <= 1000:
-        raise BadInputError(f"--repeats {repeats}: give 1 to 1000")
-    return replace(plan, start=(deg, m), repeats=repeats, seed=plan.seed if args.seed is None else args.seed)

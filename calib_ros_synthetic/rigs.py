@@ -58,15 +58,12 @@ class Lens:
             width = self.width if height is None else round(self.width * height / self.height)
         if height is None:
             height = round(self.height * width / self.width)
-        f = width / 2 / self._radius()
+        # Distance from the principal point, in focal lengths, at which the lens images half of its field.
+        D = np.array(self.D) if self.D else np.zeros(4)
+        f = width / 2 / float(lens.LensProjection(self.model, D).radius(np.deg2rad([self.field / 2]))[0])
         # Principal points are not in the middle, as they never are.
         K = np.array([[f, 0, 0.493 * width], [0, f * height / width * self.width / self.height, 0.512 * height], [0, 0, 1]])
         return Camera(K, width, height, self.model, np.array(self.D))
-
-    def _radius(self) -> float:
-        """Distance from the principal point, in focal lengths, at which the lens images half of its field."""
-        D = np.array(self.D) if self.D else np.zeros(4)
-        return float(lens.LensProjection(self.model, D).radius(np.deg2rad([self.field / 2]))[0])
 
 
 class PlainLens(Lens):

@@ -176,7 +176,16 @@ class RosetteScanner(SpinningScanner):
     def jobs(self, solids: Solids, beams: Float32, pose: Floats, shift: float, turn: float) -> Jobs:
         """Windows for `cast` in one row of rays."""
         azimuth = np.arctan2(beams[1, 0], beams[0, 0]).astype(float)
-        return row_windows(solids.corners() @ pose[:3, :3], azimuth, shift, turn)
+        middle, left, right, *_, near = _bounds(solids.corners() @ pose[:3, :3], shift, turn)
+        windows = []
+        for around in (-2 * np.pi, 0.0, 2 * np.pi):
+            first = np.searchsorted(azimuth, middle + left + around)
+            past = np.searchsorted(azimuth, middle + right + around, side="right")
+            keep = np.flatnonzero(past > first)
+            zero = np.zeros(len(keep), np.int64)
+            windows.append(np.stack([keep, zero, zero + 1, first[keep], past[keep]], axis=1))
+        window = np.concatenate(windows).astype(np.int32)
+        return nearest_first(window, near[window[:, 0]])
 
     def describe(self) -> str:
         """For people."""
@@ -326,20 +335,6 @@ def grid_windows(
         first, past = np.maximum(c0[keep] + k, 0), np.minimum(c1[keep] + k, firings)
         some = past > first
         windows.append(np.stack([keep[some], r0[keep][some], r1[keep][some], first[some], past[some]], axis=1))
-    window = np.concatenate(windows).astype(np.int32)
-    return nearest_first(window, near[window[:, 0]])
-
-
-def row_windows(corners: Floats, azimuth: Floats, shift: float, turn: float) -> Jobs:
-    """Windows for `cast` in one row of rays whose azimuth (m,) rises. corners: (n, 8, 3) in the scanner's frame."""
-    middle, left, right, *_, near = _bounds(corners, shift, turn)
-    windows = []
-    for around in (-2 * np.pi, 0.0, 2 * np.pi):
-        first = np.searchsorted(azimuth, middle + left + around)
-        past = np.searchsorted(azimuth, middle + right + around, side="right")
-        keep = np.flatnonzero(past > first)
-        zero = np.zeros(len(keep), np.int64)
-        windows.append(np.stack([keep, zero, zero + 1, first[keep], past[keep]], axis=1))
     window = np.concatenate(windows).astype(np.int32)
     return nearest_first(window, near[window[:, 0]])
 

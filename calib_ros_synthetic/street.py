@@ -88,9 +88,26 @@ class Street:
         """Adds what stands between the stations start and start + BLOCK."""
         for side in (-1, 1):
             self._houses(b, rng, start, side)
-            self._parked(b, rng, start, side)
+            s = start + rng.uniform(2.5, 4)
+            while s < start + BLOCK - 3:  # what is parked
+                if rng.random() < self._parking:
+                    turn = (0.0 if rng.random() < 0.8 else np.pi) + (0 if side < 0 else np.pi) + np.deg2rad(rng.normal(0, 1.5))
+                    self._at(b, s, side * (self.road - 1.05 + rng.normal(0, 0.06)), turn, z=0.0)
+                    (objects.truck if rng.random() < 0.06 else objects.car)(b, rng)
+                    s += 1.2
+                s += rng.uniform(4.8, 6.5)
             self._furniture(b, rng, start, side)
-        self._crowd(b, rng, start)
+        # People on the pavements, now and then one in the opposite lane, and cyclists.
+        for _ in range(rng.poisson(2.5 * self._walkers)):
+            side = rng.choice([-1, 1])
+            self._at(b, start + rng.uniform(0, BLOCK), side * (self.road + rng.uniform(1.2, self.pavement - 0.4)),
+                     rng.uniform(0, 2 * np.pi))  # fmt: skip
+            objects.person(b, rng)
+        if rng.random() < 0.3:
+            self._at(b, start + rng.uniform(0, BLOCK), rng.uniform(1.0, self.road - 2.6), rng.uniform(0, 2 * np.pi), z=0.0)
+            objects.person(b, rng)
+        if rng.random() < 0.5:
+            objects.cyclist(self._at(b, start + rng.uniform(0, BLOCK), self.road - 2.5, np.pi, z=0.0), rng)
 
     def _at(self, b: Builder, s: float, d: float, turn: float = 0.0, z: float | None = None) -> Builder:
         """The Builder, with its frame at a station and an offset; z: m, beside the road's level the kerb's."""
@@ -120,16 +137,6 @@ class Street:
                 objects.border(self._at(b, middle, side * (front + 0.3)), rng, length - rng.uniform(1, 4))
             s += length + rng.choice([0.0, 0.0, 1.2, 3.5])
 
-    def _parked(self, b: Builder, rng: np.random.Generator, start: float, side: int) -> None:
-        s = start + rng.uniform(2.5, 4)
-        while s < start + BLOCK - 3:
-            if rng.random() < self._parking:
-                turn = (0.0 if rng.random() < 0.8 else np.pi) + (0 if side < 0 else np.pi) + np.deg2rad(rng.normal(0, 1.5))
-                self._at(b, s, side * (self.road - 1.05 + rng.normal(0, 0.06)), turn, z=0.0)
-                (objects.truck if rng.random() < 0.06 else objects.car)(b, rng)
-                s += 1.2
-            s += rng.uniform(4.8, 6.5)
-
     def _furniture(self, b: Builder, rng: np.random.Generator, start: float, side: int) -> None:
         """Everything upright near the kerb, and bins at the inner edge of the pavement."""
         inward = 0.0 if side < 0 else np.pi  # poles turn their arms over the road
@@ -149,19 +156,6 @@ class Street:
                 self._at(b, s, side * (self.road + self.pavement - 0.1), rng.uniform(-0.4, 0.4) + np.pi / 2)
                 objects.billboard(b, rng)
             s += rng.uniform(3.5, 8)
-
-    def _crowd(self, b: Builder, rng: np.random.Generator, start: float) -> None:
-        """People on the pavements, now and then one in the opposite lane, and cyclists."""
-        for _ in range(rng.poisson(2.5 * self._walkers)):
-            side = rng.choice([-1, 1])
-            self._at(b, start + rng.uniform(0, BLOCK), side * (self.road + rng.uniform(1.2, self.pavement - 0.4)),
-                     rng.uniform(0, 2 * np.pi))  # fmt: skip
-            objects.person(b, rng)
-        if rng.random() < 0.3:
-            self._at(b, start + rng.uniform(0, BLOCK), rng.uniform(1.0, self.road - 2.6), rng.uniform(0, 2 * np.pi), z=0.0)
-            objects.person(b, rng)
-        if rng.random() < 0.5:
-            objects.cyclist(self._at(b, start + rng.uniform(0, BLOCK), self.road - 2.5, np.pi, z=0.0), rng)
 
 
 class Path:

@@ -171,11 +171,6 @@ class _Sums:
         C = np.linalg.inv(self._W[end] - self._W[start])
         return C @ (self._v[end] - self._v[start]), C
 
-    def gain(self, start: int, division: int, end: int) -> float:
-        """By which a division explains a segment better."""
-        whole, second = self.cost(np.array([start, division]), end)
-        return float(whole - second - self.cost(np.array([start]), division)[0])
-
     def distance(self, k: int, start: int, end: int) -> float:
         """Squared distance of element k to the mean of the others in its segment."""
         whole = self.cost(np.array([start]), end)[0]
@@ -207,18 +202,14 @@ def _outlier(sums: _Sums, starts: list[int], penalty: float, outlier_penalty: fl
     found: dict[int, float] = {}
     for s, (start, end) in enumerate(zip(starts, ends, strict=True)):
         if end - start == 1 and 0 < s < len(starts) - 1:
-            before, after = (starts[s - 1], start), (end, ends[s + 1])
-            if _apart(sums.mean(*before), sums.mean(*after)) < penalty:
-                found[start] = penalty + sums.gain(before[0], start, end)
+            first, (a, A), (b, B) = starts[s - 1], sums.mean(starts[s - 1], start), sums.mean(end, ends[s + 1])
+            if float((a - b) @ np.linalg.solve(A + B, a - b)) < penalty:
+                whole, alone = sums.cost(np.array([first, start]), end)
+                found[start] = penalty + float(whole - alone - sums.cost(np.array([first]), start)[0])
         if end - start > 2:
             inner = {k: sums.distance(k, start, end) for k in range(start + 1, end - 1)}
             found |= {k: square for k, square in inner.items() if square > outlier_penalty}
     return max(found, key=lambda k: found[k], default=None)
-
-
-def _apart(a: tuple[Matrix, Matrix], b: tuple[Matrix, Matrix]) -> float:
-    difference = a[0] - b[0]
-    return float(difference @ np.linalg.solve(a[1] + b[1], difference))
 
 
 def change_penalty(covariances: Matrix, false_alarms: float, seed: int = 0) -> float:
@@ -233,11 +224,23 @@ def change_penalty(covariances: Matrix, false_alarms: float, seed: int = 0) -> f
         return float(chi2.isf(false_alarms, 6))
     probability = -np.expm1(-false_alarms * n)
     count = int(np.clip(EXCEEDING / probability, FEWEST, MOST))
-    largest = np.concatenate([_largest_gains(covariances, sums) for sums in _simulated(covariances, count, seed)])
+    W = np.linalg.inv(covariances)
+    before, total = np.cumsum(W, axis=0)[:-1], W.sum(axis=0)
+    share = before @ np.linalg.inv(total)
+    G = np.linalg.inv(before) + np.linalg.inv(total - before)
+    half = np.linalg.cholesky((G + np.swapaxes(G, 1, 2)) / 2)
+    gains = []  # of the best division of each sequence
+    for sums in _simulated(covariances, count, seed):
+        off = (sums[:-1] - sums[-1] @ np.swapaxes(share, 1, 2)) @ half
+        gains.append(np.einsum("nsi,nsi->ns", off, off).max(axis=0))
+    largest = np.concatenate(gains)
     penalty = float(np.quantile(largest, 1 - probability))
-    chosen = np.flatnonzero(largest > penalty)[:EXCEEDING]
-    alarming = np.concatenate(list(_chosen(_simulated(covariances, count, seed), chosen)), axis=1)
-    per_alarm = float(_number_of_changes(covariances, alarming, penalty).mean())
+    chosen, first, alarming = np.flatnonzero(largest > penalty)[:EXCEEDING], 0, []
+    for sums in _simulated(covariances, count, seed):
+        own = chosen - first
+        alarming.append(sums[:, own[(own >= 0) & (own < sums.shape[1])]])
+        first += sums.shape[1]
+    per_alarm = float(_number_of_changes(covariances, np.concatenate(alarming, axis=1), penalty).mean())
     return float(np.quantile(largest, 1 - min(probability, false_alarms * n / per_alarm)))
 
 
@@ -249,26 +252,6 @@ def _simulated(covariances: Matrix, count: int, seed: int) -> Iterator[Matrix]:
     for first in range(0, count, batch):
         noise = rng.standard_normal((n, min(batch, count - first), 6))
         yield np.cumsum(noise @ np.swapaxes(roots, 1, 2), axis=0)
-
-
-def _chosen(batches: Iterator[Matrix], chosen: NDArray[np.intp]) -> Iterator[Matrix]:
-    """The sequences at some positions, ascending, of all batches together."""
-    first = 0
-    for batch in batches:
-        stop = first + batch.shape[1]
-        yield batch[:, chosen[(first <= chosen) & (chosen < stop)] - first]
-        first = stop
-
-
-def _largest_gains(covariances: Matrix, sums: Matrix) -> Matrix:
-    """Gain (m,) of the best division of each sequence. sums: (n, m, 6), see `_simulated`."""
-    W = np.linalg.inv(covariances)
-    before, total = np.cumsum(W, axis=0)[:-1], W.sum(axis=0)
-    share = before @ np.linalg.inv(total)
-    G = np.linalg.inv(before) + np.linalg.inv(total - before)
-    half = np.linalg.cholesky((G + np.swapaxes(G, 1, 2)) / 2)
-    off = (sums[:-1] - sums[-1] @ np.swapaxes(share, 1, 2)) @ half
-    return np.asarray(np.einsum("nsi,nsi->ns", off, off).max(axis=0))
 
 
 def _number_of_changes(covariances: Matrix, sums: Matrix, penalty: float) -> Matrix:

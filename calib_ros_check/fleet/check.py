@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from calib_ros.config import SemanticsConfig
 from calib_ros.datasets.nuscenes import split_scene
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
@@ -35,24 +34,19 @@ Progress = Callable[[int, int], None]
 ABOUT = {"format": "calib-ros fleet 1"}  # of the journal: options and versions belong to its jobs
 
 
-def _weights(config: SemanticsConfig) -> list[str | None]:
-    """Fingerprints of the models' weights; none where no package brings models."""
-    try:
-        from calib_ros_semantics.models.segmentation import SegmentationModels
-        from calib_ros_semantics.models.weight_sets import weights_of
-    except ImportError:
-        return []
-    found = [model.weights for model in SegmentationModels(config).models]
-    found.append(weights_of(Path(config.segment_anything_decoder)))
-    return [None if own is None else own.sha256 for own in found]
-
-
 def options_key(options: CheckOptions) -> str:
     """The same for options, and files that they name, that give the same answers. BadInputError if the extrinsic is a file that
     cannot be read."""
-    content = asdict(options)
-    semantics = options.config.semantics
-    content["weights"] = _weights(semantics)
+    content, semantics = {**asdict(options), "weights": list[str | None]()}, options.config.semantics
+    try:
+        from calib_ros_semantics.models.segmentation import SegmentationModels
+        from calib_ros_semantics.models.weight_sets import weights_of
+    except ImportError:  # no package brings models
+        pass
+    else:
+        found = [model.weights for model in SegmentationModels(semantics).models]
+        found.append(weights_of(Path(semantics.segment_anything_decoder)))
+        content["weights"] = [None if own is None else own.sha256 for own in found]
     if options.rig:
         description = as_given(read_rig(options.rig), options.extrinsic)
         content["rig"] = repr((description.sensors, description.reference, description.pairs))
@@ -75,7 +69,19 @@ def run_checks(options: CheckOptions, jobs: Sequence[Recording]) -> list[Answer]
         with contextlib.suppress(OSError):  # no Linux, or forbidden: the peak is then that of all jobs until now
             Path("/proc/self/clear_refs").write_text("5")
         cpu, read = time.process_time(), _bytes_read()
-        answer = _answer_of(job, replace(options, camera=job.camera or options.camera, frames=job.frames or options.frames))
+        own = replace(options, camera=job.camera or options.camera, frames=job.frames or options.frames)
+        try:
+            found = as_row(check_recording(job.path, own)) if own.rig else check_source(job.path, own).result.to_dict()
+            answer: Answer = {"result": found}
+        except (MissingDependencyError, ImportError):
+            raise
+        except CalibrationError as error:
+            answer = {"error": str(error), "from": INPUT}
+            if job.fingerprint and not Path(split_scene(job.path)[0]).exists():
+                nowhere = f"{job.path} is not there on {socket.gethostname()}; mount it on all workers"
+                answer = {"error": nowhere, "from": OTHER}
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}", "from": OTHER}
         used = {"cpu_s": round(time.process_time() - cpu, 3), "bytes_read": _bytes_read() - read, "peak_bytes": _peak()}
         answers.append(answer | used)
     return answers
@@ -85,21 +91,6 @@ def lost(jobs: Sequence[Recording], how: str) -> list[Answer]:
     """Answers of recordings whose workers ended."""
     advice = "out of memory? use fewer --workers, or give them more"
     return [{"error": f"the check of {job.path} did not end: {how}; {advice}", "from": OTHER} for job in jobs]
-
-
-def _answer_of(job: Recording, options: CheckOptions) -> Answer:
-    try:
-        if options.rig:
-            return {"result": as_row(check_recording(job.path, options))}
-        return {"result": check_source(job.path, options).result.to_dict()}
-    except (MissingDependencyError, ImportError):
-        raise
-    except CalibrationError as error:
-        if job.fingerprint and not Path(split_scene(job.path)[0]).exists():
-            return {"error": f"{job.path} is not there on {socket.gethostname()}; mount it on all workers", "from": OTHER}
-        return {"error": str(error), "from": INPUT}
-    except Exception as error:
-        return {"error": f"{type(error).__name__}: {' '.join(str(error).split())}", "from": OTHER}
 
 
 def _bytes_read() -> int:
@@ -159,23 +150,20 @@ def check_fleet(
 
 def _checked(options: FleetOptions, progress: Progress) -> tuple[list[Row], list[str]]:
     """All recordings with their answers, those of earlier runs out of the journal, and notes for people."""
-    settings = options_key(options.options)
+    asked = options.options
+    settings = options_key(asked)
     if options.certified is None:
         found, what = find_recordings(options.sources, options.vehicle_pattern), "fleet check"
     else:
-        found, what = find_claims(options.sources, options.options, options.certified), "certification"
+        found, what = find_claims(options.sources, asked, options.certified), "certification"
     jobs = [replace(one, options=settings) for one in found]
     with Journal(options.out, ABOUT, options.fresh, what) as journal:
         # What failed for another reason than the recording may succeed now.
         for key in [key for key, answer in journal.done.items() if answer.get("from") == OTHER]:
             del journal.done[key]
-        work, workers = partial(run_checks, _portable(options.options)), options.workers or os.cpu_count() or 1
+        # With absolute paths, since workers may have started elsewhere.
+        files = {"rig": asked.rig, "extrinsic": "" if asked.extrinsic in (REFERENCE, TF) else asked.extrinsic}
+        absolute: dict[str, Any] = {name: str(Path(file).expanduser().resolve()) for name, file in files.items() if file}
+        work, workers = partial(run_checks, replace(asked, **absolute)), options.workers or os.cpu_count() or 1
         run([[job] for job in jobs], work, journal, progress, workers, options.scheduler, lost)
         return [row_of(job, journal.done[job.key]) for job in jobs], list(journal.notes)
-
-
-def _portable(options: CheckOptions) -> CheckOptions:
-    """With absolute paths, since workers may have started elsewhere."""
-    files = {"rig": options.rig, "extrinsic": "" if options.extrinsic in (REFERENCE, TF) else options.extrinsic}
-    absolute: dict[str, Any] = {name: str(Path(file).expanduser().resolve()) for name, file in files.items() if file}
-    return replace(options, **absolute)

@@ -260,8 +260,25 @@ def certificate_of(own: Vehicle, tolerance: Tolerance) -> Certificate:
     T = np.array(result["T_checked"])
     if len(own.known) <= 1:
         T_found = None if result["T_estimated"] is None else np.array(result["T_estimated"])
-        return Certificate(own, best.verdict, best.message, _judged_before(result), T, T_found, best.cause, best)
-    judged = [(judge(T, T_found, C, tolerance), T_found) for T_found, C in _pooled(own)]
+        # What the check has found, out of its JSON.
+        parts = []
+        for told in (result["rotation"], result["translation"], *result["axes"]):
+            numbers: dict[str, Any] = {name: np.nan if value is None else value for name, value in told.items()}
+            parts.append(Deviation(**numbers | {"verdict": CheckVerdict(told["verdict"])}))
+        p_within = np.nan if result["p_within"] is None else result["p_within"]
+        judgement = Judgement(CheckVerdict(result["verdict"]), p_within, parts[0], parts[1], tuple(parts[2:]))
+        return Certificate(own, best.verdict, best.message, judgement, T, T_found, best.cause, best)
+    # Each segment between changes. What intrinsics and clocks leave open is common to all recordings, and no more certain for
+    # their number.
+    first, base = np.array(own.known[0].result["T_estimated"]), own.sequence.values[0]
+    R, t = Rotation.from_rotvec(base[:3]).as_matrix().T @ first[:3, :3], first[:3, 3] - base[3:]
+    open_parts = [row.result["shared_covariance"] for row in own.known]
+    shared = np.mean([np.zeros((6, 6)) if C is None else np.array(C) for C in open_parts], axis=0)
+    judged = []
+    for mean, C in zip(own.segments.means, own.segments.covariances, strict=True):
+        T_found = se3.from_parts(Rotation.from_rotvec(mean[:3]).as_matrix() @ R, t + mean[3:])
+        back = np.linalg.inv(se3.parts_jacobian(T_found))
+        judged.append((judge(T, T_found, back @ C @ back.T + shared, tolerance), T_found))
     judgement, T_found = max(judged, key=lambda pair: (WORST_FIRST[pair[0].verdict], pair[0].rotation.error))
     verdict, reason = judgement.verdict.value, reason_of(judgement, tolerance, None)
     cause, count = Counter(row.cause for row in checked).most_common(1)[0]
@@ -271,31 +288,3 @@ def certificate_of(own: Vehicle, tolerance: Tolerance) -> Certificate:
     if own.changes:
         reason = f"the sensors moved {len(own.changes)} times while the calibration stayed; at worst: {reason}"
     return Certificate(own, verdict, reason, judgement, T, T_found, cause, best)
-
-
-def _pooled(own: Vehicle) -> list[tuple[Transform, Matrix]]:
-    """T_camera_lidar (4, 4) of each segment between changes, and the covariance (6, 6) of its left twist. What intrinsics and
-    clocks leave open is common to all recordings, and no more certain for their number."""
-    first = np.array(own.known[0].result["T_estimated"])
-    R = Rotation.from_rotvec(own.sequence.values[0, :3]).as_matrix().T @ first[:3, :3]
-    t = first[:3, 3] - own.sequence.values[0, 3:]
-    open_parts = [row.result["shared_covariance"] for row in own.known]
-    shared = np.mean([np.zeros((6, 6)) if C is None else np.array(C) for C in open_parts], axis=0)
-    out = []
-    for mean, C in zip(own.segments.means, own.segments.covariances, strict=True):
-        T = se3.from_parts(Rotation.from_rotvec(mean[:3]).as_matrix() @ R, t + mean[3:])
-        back = np.linalg.inv(se3.parts_jacobian(T))
-        out.append((T, back @ C @ back.T + shared))
-    return out
-
-
-def _judged_before(result: Mapping[str, Any]) -> Judgement:
-    """What a check has found, out of its JSON."""
-
-    def read(own: Mapping[str, Any]) -> Deviation:
-        numbers = {name: np.nan if own[name] is None else own[name] for name in ("error", "low", "high")}
-        return Deviation(own["name"], CheckVerdict(own["verdict"]), **numbers, words=own["words"])
-
-    rotation, translation, *axes = map(read, (result["rotation"], result["translation"], *result["axes"]))
-    p = np.nan if result["p_within"] is None else result["p_within"]
-    return Judgement(CheckVerdict(result["verdict"]), p, rotation, translation, tuple(axes))

@@ -21,7 +21,7 @@ from calib_ros.datasets.kitti import drives_in, layout_name
 from calib_ros.datasets.nuscenes import NuScenesSource
 from calib_ros.datasets.once import is_once
 from calib_ros.datasets.open import is_nuscenes, is_single
-from calib_ros.datasets.source import Source, spread_positions
+from calib_ros.datasets.source import spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.recording import FRAMES, CheckOptions, opened
 
@@ -71,12 +71,27 @@ def find_recordings(sources: Sequence[str], vehicle_pattern: str | None = None) 
     """
     paths: dict[str, None] = {}
     for source in sources:
-        found = _found_in(source)
-        if not found:
-            raise BadInputError(f"{source} holds no recordings; give a folder of ROS 2 bags, KITTI drives or plain folders")
-        paths |= dict.fromkeys(found)
-    vehicles = _by_folder(list(paths)) if vehicle_pattern is None else _by_pattern(list(paths), vehicle_pattern)
-    return [replace(_with_files(path), vehicle=vehicle) for path, vehicle in zip(paths, vehicles, strict=True)]
+        path, found = Path(source).expanduser(), list[Path]()
+        if path.is_dir() and not is_nuscenes(path):
+            _look(path.resolve(), found, set())
+            if not found:
+                raise BadInputError(f"{source} holds no recordings; give a folder of ROS 2 bags, KITTI drives or plain folders")
+            paths |= dict.fromkeys(map(str, sorted(found)))
+        else:
+            paths[str(path.resolve()) if path.exists() and "#" not in source else source] = None
+    if vehicle_pattern is None:
+        return list(map(_recording, paths, _by_folder(list(paths))))
+    try:
+        expression = re.compile(vehicle_pattern)
+    except re.error as error:
+        raise BadInputError(f"--vehicle-pattern {vehicle_pattern!r} is no regular expression ({error})") from None
+    if VEHICLE not in expression.groupindex:
+        advice = f"has no group (?P<{VEHICLE}>...); put it around the vehicle's name"
+        raise BadInputError(f"--vehicle-pattern {vehicle_pattern!r} {advice}")
+    matches = [expression.search(path) for path in paths]
+    if not any(matches):
+        raise BadInputError(f"--vehicle-pattern {vehicle_pattern!r} matches none of the recordings, such as {next(iter(paths))}")
+    return [_recording(path, (own and own.group(VEHICLE)) or UNKNOWN) for path, own in zip(paths, matches, strict=True)]
 
 
 def is_fleet(sources: Sequence[str]) -> bool:
@@ -90,15 +105,6 @@ def is_fleet(sources: Sequence[str]) -> bool:
     except OSError:  # said when it is opened
         return False
     return len(drives_in(path)) != 1
-
-
-def _found_in(source: str) -> list[str]:
-    path = Path(source).expanduser()
-    if not path.is_dir() or is_nuscenes(path):
-        return [str(path.resolve()) if path.exists() and "#" not in source else source]
-    found: list[Path] = []
-    _look(path.resolve(), found, set())
-    return [str(one) for one in sorted(found)]
 
 
 def _look(folder: Path, found: list[Path], seen: set[str]) -> None:
@@ -126,8 +132,8 @@ def _look(folder: Path, found: list[Path], seen: set[str]) -> None:
         _look(child, found, seen)
 
 
-def _with_files(path: str) -> Recording:
-    """A recording with what its files tell without being read."""
+def _recording(path: str, vehicle: str) -> Recording:
+    """With what its files tell without being read."""
     newest, digest = 0, hashlib.sha256()
     try:
         files = [Path(path)] if Path(path).is_file() else sorted(one for one in Path(path).rglob("*") if one.is_file())
@@ -138,21 +144,8 @@ def _with_files(path: str) -> Recording:
         if not files and Path(path).exists():
             newest = Path(path).stat().st_mtime_ns
     except (OSError, ValueError):  # reported when it is opened
-        return Recording(path)
-    return Recording(path, modified_ns=newest, fingerprint=digest.hexdigest()[:16] if files else "")
-
-
-def _by_pattern(paths: list[str], pattern: str) -> list[str]:
-    try:
-        expression = re.compile(pattern)
-    except re.error as error:
-        raise BadInputError(f"--vehicle-pattern {pattern!r} is no regular expression ({error})") from None
-    if VEHICLE not in expression.groupindex:
-        raise BadInputError(f"--vehicle-pattern {pattern!r} has no group (?P<{VEHICLE}>...); put it around the vehicle's name")
-    matches = [expression.search(path) for path in paths]
-    if not any(matches):
-        raise BadInputError(f"--vehicle-pattern {pattern!r} matches none of the recordings, such as {paths[0]}")
-    return [(match and match.group(VEHICLE)) or UNKNOWN for match in matches]
+        return Recording(path, vehicle)
+    return Recording(path, vehicle, newest, digest.hexdigest()[:16] if files else "")
 
 
 def _by_folder(paths: list[str]) -> list[str]:
@@ -179,7 +172,11 @@ def find_claims(sources: Sequence[str], options: CheckOptions, count: int = FRAM
     """
     found: dict[bytes, list[Recording]] = {}
     for recording in find_recordings(sources):
-        for scene in _scenes(recording):
+        scenes: Sequence[str] = ()
+        if "#" not in recording.path and is_nuscenes(Path(recording.path)):
+            with suppress(CalibrationError):  # the check says why
+                scenes = NuScenesSource(recording.path).scenes
+        for scene in [replace(recording, path=f"{recording.path}#{name}") for name in scenes] or [recording]:
             try:
                 claims = list(_claims_of(scene, options, count))
             except CalibrationError:
@@ -187,15 +184,6 @@ def find_claims(sources: Sequence[str], options: CheckOptions, count: int = FRAM
             for key, claim in claims:
                 found.setdefault(key, []).append(claim)
     return _named(list(found.values()))
-
-
-def _scenes(recording: Recording) -> list[Recording]:
-    """Scenes of nuScenes as recordings."""
-    scenes: Sequence[str] = ()
-    if "#" not in recording.path and is_nuscenes(Path(recording.path)):
-        with suppress(CalibrationError):  # the check says why
-            scenes = NuScenesSource(recording.path).scenes
-    return [replace(recording, path=f"{recording.path}#{name}") for name in scenes] or [recording]
 
 
 def _claims_of(recording: Recording, options: CheckOptions, count: int) -> Iterator[tuple[bytes, Recording]]:
@@ -209,23 +197,18 @@ def _claims_of(recording: Recording, options: CheckOptions, count: int) -> Itera
         except CalibrationError:
             yield os.fsencode(f"{recording.path} {camera}"), claim
             continue
-        groups = _groups(source)
+        # Positions of the frames by their calibration.
+        groups: dict[bytes, list[int]] = {}
+        own: Any = getattr(source, "calibration_at", None)
+        if own is None:
+            D = np.r_[source.camera.D, np.zeros(14)][:14]
+            groups[_key(source.camera.K, D, source.reference)] = list(range(len(source)))
+        for k in range(0 if own is None else len(source)):
+            groups.setdefault(_key(*own(k)), []).append(k)
         for key, positions in groups.items():
             chosen = [positions[k] for k in spread_positions(count, len(positions))]
             frames = "" if len(groups) == 1 and count == FRAMES else ",".join(map(str, chosen))
             yield source.camera_frame.encode() + key, replace(claim, frames=frames)
-
-
-def _groups(source: Source) -> dict[bytes, list[int]]:
-    """Positions of the frames by their calibration. BadInputError for a file of calibrations that cannot be read."""
-    own: Any = getattr(source, "calibration_at", None)
-    if own is None:
-        D = np.r_[source.camera.D, np.zeros(14)][:14]
-        return {_key(source.camera.K, D, source.reference): list(range(len(source)))}
-    groups: dict[bytes, list[int]] = {}
-    for k in range(len(source)):
-        groups.setdefault(_key(*own(k)), []).append(k)
-    return groups
 
 
 def _key(*numbers: Any) -> bytes:

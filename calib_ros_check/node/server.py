@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future
-from typing import Any
 
 import numpy as np
 from calib_ros_msgs.msg import CauseFinding as CauseFindingMsg
@@ -21,7 +20,7 @@ from calib_ros.ros.conversions import covariance_for_ros, matrix_from_transform,
 from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
 from calib_ros.ros.parts import after_answers, done
 from calib_ros_check.node.requests import CheckOutcome, CheckRequest, request_check
-from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Deviation, Tolerance
+from calib_ros_check.outcome import CauseState, CheckVerdict, Deviation, Tolerance
 from calib_ros_check.tolerance import unknown
 
 VERDICTS = {verdict: getattr(Check.Response, verdict.name) for verdict in CheckVerdict}
@@ -54,7 +53,11 @@ class CheckServer(NodeService):
         values = {"checks so far": str(self._made), "verdict": "none", "age of the last check, s": "none", "cause": "none"}
         last = self._last
         if last is not None:
-            result, holds = last.result, self._is_of_current(last.result)
+            # One that failed and was mended since has moved by more than the tolerance; one that passed and goes on has not.
+            result, recalibrator = last.result, self._pipeline.recalibrator
+            holds = recalibrator is not None and result.tolerance.covers(
+                result.T_checked, recalibrator.current.result.T_camera_lidar
+            )
             status.message = f"{result.verdict.value}: {result.reason}"
             if holds:
                 status.level = LEVELS[result.verdict]
@@ -78,14 +81,6 @@ class CheckServer(NodeService):
     def destroy(self) -> None:
         """To be called when no check is under way; answers that are made already are sent before."""
         after_answers(self._node, lambda: self._node.destroy_service(self._service))
-
-    def _is_of_current(self, result: CheckResult) -> bool:
-        """Whether the extrinsic that was checked is the current one, to within the tolerance: one that failed and was mended
-        since has moved by more, one that passed and is estimated on has not."""
-        recalibrator = self._pipeline.recalibrator
-        if recalibrator is None:
-            return False
-        return result.tolerance.covers(result.T_checked, recalibrator.current.result.T_camera_lidar)
 
     async def _answer(self, request: Check.Request, response: Check.Response) -> Check.Response:
         nothing = unknown()
@@ -112,17 +107,13 @@ def check_request(request: Check.Request) -> CheckRequest:
         usual.m if request.tolerance_m == 0 else request.tolerance_m,
     )
     T = matrix_from_transform(request.extrinsic) if request.extrinsic_given else None
-    if T is None and is_filled(request.extrinsic):
+    t, q = request.extrinsic.translation, request.extrinsic.rotation
+    # Where nobody has set it, it is the identity, or all zero.
+    if T is None and (any((t.x, t.y, t.z, q.x, q.y, q.z)) or q.w not in (0.0, 1.0)):
         raise BadInputError(
             "the request has an extrinsic, but extrinsic_given is false; set it to true, or leave the extrinsic out"
         )
     return CheckRequest(tolerance, T, int(request.max_keyframes))
-
-
-def is_filled(transform: Any) -> bool:
-    """Whether a geometry_msgs/Transform is neither the identity nor all zero, as it is where nobody has set it."""
-    t, q = transform.translation, transform.rotation
-    return any((t.x, t.y, t.z, q.x, q.y, q.z)) or q.w not in (0.0, 1.0)
 
 
 def fill_response(response: Check.Response, outcome: CheckOutcome) -> None:
@@ -137,7 +128,9 @@ def fill_response(response: Check.Response, outcome: CheckOutcome) -> None:
     response.p_within = float(result.p_within)
     response.rotation, response.translation = deviation_message(result.rotation), deviation_message(result.translation)
     response.axes = [deviation_message(axis) for axis in result.axes]
-    response.causes = [cause_message(finding) for finding in result.causes]
+    for own in result.causes:
+        values = {"value_names": list(own.values), "values": np.array(list(own.values.values()), float)}
+        response.causes.append(CauseFindingMsg(cause=own.cause.value, state=STATES[own.state], message=own.message, **values))
     response.checked = transform_message(result.T_checked, *frames)
     response.tolerance_deg, response.tolerance_m = result.tolerance.deg, result.tolerance.m
     if result.T_estimated is not None:
@@ -151,22 +144,5 @@ def fill_response(response: Check.Response, outcome: CheckOutcome) -> None:
 
 def deviation_message(deviation: Deviation) -> DeviationMsg:
     """Deviation -> calib_ros_msgs/Deviation."""
-    return DeviationMsg(
-        name=deviation.name,
-        verdict=VERDICTS[deviation.verdict],
-        error=float(deviation.error),
-        low=float(deviation.low),
-        high=float(deviation.high),
-        words=deviation.words,
-    )
-
-
-def cause_message(finding: CauseFinding) -> CauseFindingMsg:
-    """CauseFinding -> calib_ros_msgs/CauseFinding."""
-    return CauseFindingMsg(
-        cause=finding.cause.value,
-        state=STATES[finding.state],
-        message=finding.message,
-        value_names=list(finding.values),
-        values=np.array(list(finding.values.values()), float),
-    )
+    numbers = {name: float(getattr(deviation, name)) for name in ("error", "low", "high")}
+    return DeviationMsg(name=deviation.name, verdict=VERDICTS[deviation.verdict], words=deviation.words, **numbers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -110,8 +110,8 @@ def _after(before: RigSolution, found: RigHypothesis) -> RigSolution:
 
 @dataclass(frozen=True, eq=False)
 class PairCheck:
-    """The check of a pair: T_target_source as given, by a measured edge, None where there is none. check: of a camera with a
-    LiDAR; frame: one of its frames, to be drawn."""
+    """The check of a pair: T_target_source as given, by a measured edge, None where there is none; or of a sensor's pose against
+    the sensor `source`, in its own axes, by all edges. check: of a camera with a LiDAR; frame: one of its frames, to be drawn."""
 
     target: str
     source: str
@@ -140,29 +140,19 @@ class PairCheck:
 
 
 @dataclass(frozen=True, eq=False)
-class SensorCheck:
-    """The verdict about a sensor's pose, and its error against the sensor `against`, in its own axes; not known of that sensor
-    itself."""
-
-    verdict: CheckVerdict
-    reason: str
-    judgement: Judgement
-    against: str
-
-
-@dataclass(frozen=True, eq=False)
 class RigCheck(AsJson):
     """Whether the extrinsics of a rig are right to within a tolerance.
 
-    verdict: fail where any sensor fails, pass where all pass. given: T_reference_sensor (4, 4) as checked. solution: by the
-    pairs' edges alone, with loops, rejected and doubted edges. blame: which sensors explain what is off.
+    verdict: fail where any sensor fails, pass where all pass. given: T_reference_sensor (4, 4) as checked. sensors: by name; of
+    one against itself no error is known. solution: by the pairs' edges alone, with loops, rejected and doubted edges. blame:
+    which sensors explain what is off.
     """
 
     verdict: CheckVerdict
     reason: str
     tolerance: Tolerance
     given: Mapping[str, Transform]
-    sensors: Mapping[str, SensorCheck]
+    sensors: Mapping[str, PairCheck]
     pairs: Sequence[PairCheck]
     solution: RigSolution
     blame: Blame
@@ -180,13 +170,13 @@ class RigCheck(AsJson):
             "reference": s.reference,
             "tolerance": plain(self.tolerance),
             "sensors": {
-                name: {**_told(own.verdict, own.reason, own.judgement), "against": own.against,
+                name: {**_told(own), "against": own.source,
                        "T_checked": plain(self.given[name]), "T_estimated": plain(s.poses[name]),
                        "covariance": plain(s.marginal(name))}
                 for name, own in self.sensors.items()
             },
             "pairs": [
-                {"target": p.target, "source": p.source, "kind": p.kind, **_told(p.verdict, p.reason, p.judgement),
+                {"target": p.target, "source": p.source, "kind": p.kind, **_told(p),
                  "check": None if p.check is None else p.check.to_dict()}
                 for p in self.pairs
             ],
@@ -199,9 +189,9 @@ class RigCheck(AsJson):
         }  # fmt: skip
 
 
-def _told(verdict: CheckVerdict, reason: str, judgement: Judgement) -> dict[str, Any]:
-    parts = {name: plain(getattr(judgement, name)) for name in ("p_within", "rotation", "translation", "axes")}
-    return {"verdict": verdict.value, "reason": reason, **parts}
+def _told(own: PairCheck) -> dict[str, Any]:
+    parts = {name: plain(getattr(own.judgement, name)) for name in ("p_within", "rotation", "translation", "axes")}
+    return {"verdict": own.verdict.value, "reason": own.reason, **parts}
 
 
 def as_given(description: RigDescription, extrinsic: str = REFERENCE) -> RigDescription:
@@ -252,7 +242,19 @@ def check_rig(measurer: RigMeasurer, tolerance: Tolerance) -> RigCheck:
     listed = measurer.camera_pairs(known)
     for k, (camera, lidar) in enumerate(listed):
         measurer.progress(f"{camera} with {lidar}", k / len(listed))
-        pairs.append(_check_pair(measurer, camera, lidar, known, tolerance))
+        edge, kind = None, "check"
+        try:
+            frames = measurer.frames_of(camera, lidar)
+            checker = Checker(frames[0].camera, measurer.config_of(camera), scans=measurer.shared[lidar])
+            found = checker.check(frames, known.between(camera, lidar)[0], tolerance)
+        except CalibrationError as error:
+            pairs.append(PairCheck(camera, lidar, kind, unknown(), str(error)))
+            continue
+        if found.T_estimated is not None and found.covariance_with_intrinsics is not None:
+            offset, samples = (found.time_offset_s, found.time_offset_sigma_s), found.frames_used
+            edge = Edge(camera, lidar, found.T_estimated, found.covariance_with_intrinsics, kind, *offset, samples=samples)
+        judgement = Judgement(*(getattr(found, part.name) for part in fields(Judgement)))
+        pairs.append(PairCheck(camera, lidar, kind, judgement, found.reason, edge, found, frames[len(frames) // 2]))
     joined = {pair.target for pair in pairs if pair.edge is not None}
     for camera in (name for name in measurer.description.cameras if name not in joined):
         pairs += [_by_edge(known, m, tolerance) for m in measurer.by_motion(camera, known)]
@@ -290,7 +292,8 @@ def judged(
     told = f"and {', '.join(agree)} agree with it" if agree else "and none agrees with it"
     wrong = causes.get(anchor) or found.off.get(anchor, "")
     stands = FAIL if wrong else PASS if agree else INCONCLUSIVE
-    sensors[anchor] = SensorCheck(stands, wrong or f"the others are judged against it, {told}", unknown(), anchor)
+    told = wrong or f"the others are judged against it, {told}"
+    sensors[anchor] = PairCheck(anchor, anchor, "", replace(unknown(), verdict=stands), told)
     notes = [f"the loop {', '.join(loop.sensors)} does not close: {loop.size[0]:.2f} deg, {100 * loop.size[1]:.1f} cm"
              for loop in solution.loops if not loop.closes]  # fmt: skip
     notes += [f"{e.name} contradicts the other pairs and is left out" for e in solution.rejected]
@@ -300,31 +303,11 @@ def judged(
     return RigCheck(verdict, reason, tolerance, known.poses, ordered, pairs, solution, found, source, notes, description.cameras)
 
 
-def _check_pair(measurer: RigMeasurer, camera: str, lidar: str, known: RigSolution, tolerance: Tolerance) -> PairCheck:
-    T, kind = known.between(camera, lidar)[0], "check"
-    try:
-        frames = measurer.frames_of(camera, lidar)
-        checker = Checker(frames[0].camera, measurer.config_of(camera), scans=measurer.shared[lidar])
-        found = checker.check(frames, T, tolerance)
-    except CalibrationError as error:
-        return PairCheck(camera, lidar, kind, unknown(), str(error))
-    judgement = Judgement(*(getattr(found, name) for name in ("verdict", "p_within", "rotation", "translation", "axes")))
-    frame, edge = frames[len(frames) // 2], None
-    if found.T_estimated is not None and found.covariance_with_intrinsics is not None:
-        offset = found.time_offset_s, found.time_offset_sigma_s
-        edge = Edge(camera, lidar, found.T_estimated, found.covariance_with_intrinsics, kind, *offset, samples=found.frames_used)
-    return PairCheck(camera, lidar, kind, judgement, found.reason, edge, found, frame)
-
-
 def _by_edge(known: RigSolution, m: Measurement, tolerance: Tolerance) -> PairCheck:
     if m.edge is None:
         return PairCheck(m.target, m.source, m.kind, unknown(), m.reason)
     judgement = judge(known.between(m.target, m.source)[0], m.edge.T, m.edge.covariance, tolerance)
-    return PairCheck(m.target, m.source, m.kind, judgement, _sizes(judgement), m.edge)
-
-
-def _sizes(judgement: Judgement) -> str:
-    return f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
+    return PairCheck(m.target, m.source, m.kind, judgement, judgement.sizes, m.edge)
 
 
 def _causes(pairs: Sequence[PairCheck], found: Blame) -> dict[str, str]:
@@ -347,21 +330,21 @@ def _sensor(
     pairs: Sequence[PairCheck],
     tolerance: Tolerance,
     wrong: str,
-) -> SensorCheck:
+) -> PairCheck:
     """A sensor against the anchor. wrong: what it is known to be, "" = nothing."""
     own = [pair for pair in pairs if name in (pair.target, pair.source)]
     if len(own) == 1 and anchor in (own[0].target, own[0].source):
         judgement, reason = own[0].judgement, own[0].reason
     elif any(pair.trusted is not None for pair in own):
         judgement = judge(known.between(name, anchor)[0], *solution.between(name, anchor), tolerance)
-        reason = _sizes(judgement)
+        reason = judgement.sizes
     else:
         judgement, reason = unknown(), "; ".join(pair.reason for pair in own) or f"no pair joins it to the others; {MORE_FRAMES}"
-    return SensorCheck(FAIL if wrong else judgement.verdict, wrong or reason, judgement, anchor)
+    return PairCheck(name, anchor, "", replace(judgement, verdict=FAIL) if wrong else judgement, wrong or reason)
 
 
 def _verdict(
-    sensors: Mapping[str, SensorCheck], pairs: Sequence[PairCheck], found: Blame, tolerance: Tolerance
+    sensors: Mapping[str, PairCheck], pairs: Sequence[PairCheck], found: Blame, tolerance: Tolerance
 ) -> tuple[CheckVerdict, str]:
     failed = {name: own for name, own in sensors.items() if own.verdict is FAIL}
     if failed:

@@ -220,26 +220,23 @@ def graph_svg(rig: RigShown) -> str:
         for k, own in enumerate(column)
     }
     drawn = [_line(edge, at) for edge in rig.edges if edge.target in at and edge.source in at]
-    drawn += [_box(own, *at[own.name], own.name == rig.reference) for column in columns for own in column]
+    for own in (own for column in columns for own in column):
+        (x, y), is_reference, is_camera = at[own.name], own.name == rig.reference, own.kind == CAMERA
+        usable = ", not usable" if own.usable is False and not is_reference else ""
+        radius, inset, border = 4 if is_camera else HIGH / 2, 8 if is_camera else 14, 2.5 if is_reference else 1.2
+        drawn.append(
+            f'<g class="{own.level}"><title>{escape(f"{own.name}: {own.status}. {own.reason}")}</title>'
+            f'<rect x="{x}" y="{y - HIGH / 2:.1f}" width="{BOX}" height="{HIGH}" rx="{radius}" stroke-width="{border}"/>'
+            f'<text class="sign" x="{x + inset}" y="{y - 2:.1f}">{SIGNS[own.level]}</text>'
+            f'<text x="{x + inset + 16}" y="{y - 2:.1f}">{_cut(own.name)}</text>'
+            f'<text class="less" x="{x + inset + 16}" y="{y + 13:.1f}">{escape(own.status + usable)}</text></g>'
+        )
     label = f"graph of {len(rig.sensors)} sensors and {len(rig.edges)} edges, which the table of edges lists"
     return f'<svg class="graph" viewBox="-2 0 {WIDTH + 4} {ROW * rows}" role="img" aria-label="{label}">{"".join(drawn)}</svg>'
 
 
 def _cut(name: str) -> str:
     return escape(name if len(name) <= LETTERS else name[: LETTERS - 1] + "…")
-
-
-def _box(own: SensorShown, x: float, y: float, is_reference: bool) -> str:
-    usable = ", not usable" if own.usable is False and not is_reference else ""
-    radius = 4 if own.kind == CAMERA else HIGH / 2
-    inset, border = 8 if own.kind == CAMERA else 14, 2.5 if is_reference else 1.2
-    return (
-        f'<g class="{own.level}"><title>{escape(f"{own.name}: {own.status}. {own.reason}")}</title>'
-        f'<rect x="{x}" y="{y - HIGH / 2:.1f}" width="{BOX}" height="{HIGH}" rx="{radius}" stroke-width="{border}"/>'
-        f'<text class="sign" x="{x + inset}" y="{y - 2:.1f}">{SIGNS[own.level]}</text>'
-        f'<text x="{x + inset + 16}" y="{y - 2:.1f}">{_cut(own.name)}</text>'
-        f'<text class="less" x="{x + inset + 16}" y="{y + 13:.1f}">{escape(own.status + usable)}</text></g>'
-    )
 
 
 def _line(edge: EdgeShown, at: dict[str, tuple[float, float]]) -> str:
@@ -329,10 +326,8 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Of cells that are HTML, without columns that have none; on a narrow screen each has its name before it, but for the first
     two."""
     kept = [k for k in range(len(header)) if k < 2 or any(row[k] for row in rows)]
-    head = "".join(f'<th scope="col">{header[k]}</th>' for k in kept)
-    body = "".join(f"<tr>{''.join(_cell(k, header[k], row[k]) for k in kept)}</tr>" for row in rows)
+    head, body = "".join(f'<th scope="col">{header[k]}</th>' for k in kept), ""
+    for row in rows:
+        cells = (f'<td data-name="{header[k]}">{row[k]}</td>' if k > 1 and row[k] else f"<td>{row[k]}</td>" for k in kept)
+        body += f"<tr>{''.join(cells)}</tr>"
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _cell(k: int, name: str, content: str) -> str:
-    return f'<td data-name="{name}">{content}</td>' if k > 1 and content else f"<td>{content}</td>"

@@ -68,7 +68,7 @@ def trial(cache: WorkerCache, job: EvaluationJob) -> Answer:
     reference = cache.reference(job.scene, job.frames[0])
     start = wrong_start(reference, job)
     answer: Answer = {"status": "done", "reason": "", "start": off(start, reference)}
-    answer["start_rotation_deg"], answer["start_translation_m"] = _error(start, reference)
+    answer["start_rotation_deg"], answer["start_translation_m"] = se3.error(reference, start)
     answer |= _end(start, reference)
     answer |= dict.fromkeys(("score_start", "score_end", "score_reference"))
     answer |= {"evaluations": 0, "cpu_s": 0.0, "features_cpu_s": 0.0}
@@ -94,12 +94,8 @@ def trial(cache: WorkerCache, job: EvaluationJob) -> Answer:
     return answer
 
 
-def _error(T: Matrix, reference: Matrix) -> tuple[float, float]:
-    return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
-
-
 def _end(T: Matrix, reference: Matrix) -> Answer:
-    deg, m = _error(T, reference)
+    deg, m = se3.error(reference, T)
     return {"end": off(T, reference), "rotation_deg": deg, "translation_m": m}
 
 
@@ -113,7 +109,7 @@ def checked(cache: WorkerCache, job: EvaluationJob) -> Answer:
     """The verdict of the check on a row of the published perturbations; where it cannot use its frames, it does not tell."""
     reference = cache.reference(job.scene, job.frames[0])
     T = reference @ displacement(dict(job.options))
-    answer: Answer = {"error_deg": se3.rotation_error_deg(reference, T), "error_m": se3.translation_error_m(reference, T)}
+    answer: Answer = dict(zip(("error_deg", "error_m"), se3.error(reference, T), strict=True))
     try:
         result = cache.checker(job.scene).check([cache.frame(job.scene, k) for k in job.frames], T, TOLERANCE)
     except NOT_THE_METHODS:
@@ -136,7 +132,13 @@ def cost(cache: WorkerCache, job: EvaluationJob) -> Answer:
         spent.append(time.process_time() - started)
     score, rng = method.score(made, T), np.random.default_rng(0)
     around = [se3.exp(rng.uniform(-1, 1, 6) * SPREAD) @ T for _ in range(EVALUATIONS)]
-    times = [_batch(score, around) for _ in range(BATCHES)]
+    times = []  # CPU s of an evaluation, mean of as many as fit into LONGEST_S
+    for _ in range(BATCHES):
+        started, used, done = time.process_time(), 0.0, 0
+        while done < len(around) and used < LONGEST_S:
+            score.value(around[done])
+            done, used = done + 1, time.process_time() - started
+        times.append(used / done)
     tracemalloc.start()
     try:
         method.score([method.features(frame) for frame in frames], T).value(T)
@@ -148,15 +150,6 @@ def cost(cache: WorkerCache, job: EvaluationJob) -> Answer:
         "evaluation_ms": 1000 * float(np.median(times)),
         "memory_mb": peak / 1e6,
     }
-
-
-def _batch(score: Score, around: list[Matrix]) -> float:
-    """CPU s of an evaluation, mean of as many as fit into LONGEST_S."""
-    started, spent, done = time.process_time(), 0.0, 0
-    while done < len(around) and spent < LONGEST_S:
-        score.value(around[done])
-        done, spent = done + 1, time.process_time() - started
-    return spent / done
 
 
 def loss_curves(cache: WorkerCache, job: EvaluationJob) -> Answer:

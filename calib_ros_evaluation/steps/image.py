@@ -57,7 +57,23 @@ def preparation_steps(scene: RegisteredFrame) -> Iterator[Step]:
     )
     equalized = {method: equalize(gray, method) for method in METHODS}
     yield from _equalized(scene, equalized)
-    yield from _filtered(scene, equalized["clahe"])
+    texts = {
+        "bilateral": f"Bilateral filter, eq. 3.5: the mean over {BILATERAL_DIAMETER} px of pixels that are near (sigma "
+        f"{BILATERAL_SPACE:g} px) and alike (sigma {BILATERAL_COLOR:g} grey levels). Texture goes, edges stay.",
+        "gaussian": f"Gaussian filter, eq. 3.6 and 3.7, sigma {GAUSSIAN_SIGMA:g} px. Texture and edges are blurred alike.",
+    }
+    pictures = {"before": equalized["clahe"]}
+    for name, text in texts.items():
+        pictures[name] = smooth(equalized["clahe"], name)
+        change = float(cv2.absdiff(pictures[name], equalized["clahe"]).mean())
+        text += f" A pixel changes by {change:.1f} grey levels on average.{USED if name == 'bilateral' else ''}"
+        yield preparation_step(f"{name.capitalize()} filter", text, pictures[name])
+    window = busiest(outlines(equalized["clahe"]), *_size(equalized["clahe"]))
+    yield wide_preparation_step(
+        "Filters, magnified",
+        "Before, bilateral and Gaussian, where the image has its strongest outlines. Compare how sharp outlines and texture are.",
+        tiles([p[window] for p in pictures.values()], list(pictures), 3, camera.width),
+    )
 
 
 def _equalized(scene: RegisteredFrame, equalized: dict[str, Image]) -> Iterator[Step]:
@@ -96,26 +112,6 @@ def _equalized(scene: RegisteredFrame, equalized: dict[str, Image]) -> Iterator[
         f"Figure 3.4: the part of the image where CLAHE strengthens outlines most, rows {window[0].start} to "
         f"{window[0].stop}, columns {window[1].start} to {window[1].stop}. Look for outlines that only the local methods show.",
         tiles([p[window] for p in equalized.values()], list(METHODS), 4, scene.frame.camera.width),
-    )
-
-
-def _filtered(scene: RegisteredFrame, equalized: Image) -> Iterator[Step]:
-    texts = {
-        "bilateral": f"Bilateral filter, eq. 3.5: the mean over {BILATERAL_DIAMETER} px of pixels that are near (sigma "
-        f"{BILATERAL_SPACE:g} px) and alike (sigma {BILATERAL_COLOR:g} grey levels). Texture goes, edges stay.",
-        "gaussian": f"Gaussian filter, eq. 3.6 and 3.7, sigma {GAUSSIAN_SIGMA:g} px. Texture and edges are blurred alike.",
-    }
-    done: dict[str, Image] = {}
-    for name, text in texts.items():
-        done[name] = smooth(equalized, name)
-        change = float(cv2.absdiff(done[name], equalized).mean())
-        text += f" A pixel changes by {change:.1f} grey levels on average.{USED if name == 'bilateral' else ''}"
-        yield preparation_step(f"{name.capitalize()} filter", text, done[name])
-    window = busiest(outlines(equalized), *_size(equalized))
-    yield wide_preparation_step(
-        "Filters, magnified",
-        "Before, bilateral and Gaussian, where the image has its strongest outlines. Compare how sharp outlines and texture are.",
-        tiles([p[window] for p in (equalized, *done.values())], ["before", *done], 3, scene.frame.camera.width),
     )
 
 

@@ -241,7 +241,19 @@ def score_steps(scene: RegisteredFrame, samples: int) -> Iterator[Step]:
     moved = f"moved {WRONG_DEG:g} deg and {100 * WRONG_M:g} cm to the side"
     yield from _met(scene, maps, fast, scene.T, high, "", "at the extrinsic of this page")
     yield from _met(scene, wrong, fast, scene.wrong, high, ", moved", f"at this extrinsic {moved}")
-    yield _score_table(maps, wrong, fast, scene)
+    rows = [("score", "at this page's extrinsic", "moved", "ratio")]
+    pairs = {"J, eq. 3.12": [own.edge_registration_score() for own in (maps, wrong)]}
+    pairs["J / LiDAR edges"] = [_normalized(own) for own in (maps, wrong)]
+    if fast is not None:
+        pairs["fast score"] = [fast.value(scene.T), fast.value(scene.wrong)]
+    for name, (a, b) in pairs.items():
+        rows.append((name, f"{a:.4g}", f"{b:.4g}", f"{a / b:.2f}" if b > 0 else "-"))
+    yield wide_score_step(
+        "Scores",
+        f"The same frame at the extrinsic of this page and {moved}. The more a score falls, the better it separates a right "
+        "extrinsic from a wrong one.",
+        table=tuple(rows),
+    )
     yield from _curve_steps(scene, fast, samples)
 
 
@@ -283,22 +295,6 @@ def _normalized(maps: RegistrationMaps) -> float:
 
 def _lidar_edges(maps: RegistrationMaps) -> NDArray[np.float32]:
     return np.asarray(maps.weight * maps.discontinuity + maps.lidar.lidar_edges, np.float32)
-
-
-def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score | None, scene: RegisteredFrame) -> Step:
-    J = [maps.edge_registration_score() for maps in (right, wrong)]
-    rows = [("score", "at this page's extrinsic", "moved", "ratio")]
-    pairs = {"J, eq. 3.12": J, "J / LiDAR edges": [_normalized(right), _normalized(wrong)]}
-    if fast is not None:
-        pairs["fast score"] = [fast.value(scene.T), fast.value(scene.wrong)]
-    for name, (a, b) in pairs.items():
-        rows.append((name, f"{a:.4g}", f"{b:.4g}", f"{a / b:.2f}" if b > 0 else "-"))
-    return wide_score_step(
-        "Scores",
-        f"The same frame at the extrinsic of this page and moved {WRONG_DEG:g} deg and {100 * WRONG_M:g} cm to the side. The "
-        "more a score falls, the better it separates a right extrinsic from a wrong one.",
-        table=tuple(rows),
-    )
 
 
 def _curve_steps(scene: RegisteredFrame, fast: Score | None, samples: int) -> Iterator[Step]:

@@ -171,11 +171,19 @@ def run_steps(args: argparse.Namespace) -> str:
     initial = args.initial or ("nominal" if reference is None else "reference")
     T = reference if initial == "reference" and reference is not None else initial_extrinsic(initial, source, args.yaw_deg)
     known = source.describe()
+    # The command without the output folder and defaults: the same input gives the same page.
+    command = ["calib-ros", "steps", args.source, "--frame", str(position)]
+    command += ["--camera", args.camera] if args.camera is not None else []
+    for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic", "clock"):
+        value = getattr(args, option)
+        command += [f"--{option.replace('_', '-')}", value] if value else []
+    command += ["--incomplete"] if args.incomplete else []
+    command += [] if args.rectified is None else ["--rectified" if args.rectified else "--no-rectified"]
     facts = {
         "Source": known.get("source", f"{source.name}, {known.get('kind', '')}"),
         "Frame": f"{position} of 0..{len(source) - 1}, {frame.name}, {len(frame.cloud)} points",
         "Extrinsic": f"{initial}: {pose(T)}",
-        "Command": _steps_command(args),
+        "Command": shlex.join(command + (["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else [])),
         "Version": f"calib-ros {__version__}",
     }
     settings = yaml.safe_dump(config.to_dict(), sort_keys=False)
@@ -184,15 +192,3 @@ def run_steps(args: argparse.Namespace) -> str:
         made = make_steps(frame, T, config)
         page = write_page(folder, title, facts, settings, made, lambda done: step(min(done, EXPECTED), EXPECTED))
     return f"{page}\nopen it in a browser: {page.resolve().as_uri()}"
-
-
-def _steps_command(args: argparse.Namespace) -> str:
-    """The command for the page, without the output folder and defaults: the same input gives the same page."""
-    command = ["calib-ros", "steps", args.source, "--frame", str(args.frame)]
-    command += ["--camera", args.camera] if args.camera is not None else []
-    for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic", "clock"):
-        value = getattr(args, option)
-        command += [f"--{option.replace('_', '-')}", value] if value else []
-    command += ["--incomplete"] if args.incomplete else []
-    command += [] if args.rectified is None else ["--rectified" if args.rectified else "--no-rectified"]
-    return shlex.join(command + (["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else []))

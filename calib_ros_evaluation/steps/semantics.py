@@ -58,7 +58,17 @@ def semantic_steps(scene: RegisteredFrame) -> Iterator[Step]:
     if semantics.classes is not None:
         yield from _image_steps(scene, semantics.classes)
     if semantics.labels is not None:
-        yield from _cloud_steps(scene, semantics.labels)
+        known, frame = float((semantics.labels != UNLABELLED).mean()), deskewed_frame(scene.source, scene.config.motion)
+        yield step(
+            "Classes of points",
+            f"Classes by the model for clouds, from above; {known:.0%} of the {len(semantics.labels)} points have a class.",
+            cloud_from_above(scene.source, semantics.labels),
+        )
+        yield step(
+            "Classes of points on the image",
+            "The same points at the extrinsic of this page. Look for colours that stray beyond the outline of their object.",
+            fitted(points_on_image(frame, frame.cloud.xyz, semantics.labels, scene.T), scene),
+        )
     if semantics.classes is not None or semantics.labels is not None:
         yield _numbers(scene, semantics.classes, semantics.labels)
 
@@ -119,21 +129,6 @@ def _image_steps(scene: RegisteredFrame, classes: Classes) -> Iterator[Step]:
         "Pixels by class",
         "Histogram of the classes' pixels (figures 4.5, 4.8 and 4.11); in orange those of eq. 3.16.",
         class_histogram({c.name.lower(): int(counts[c]) for c in C}, [c.name.lower() for c in MAIN_CLASSES]),
-    )
-
-
-def _cloud_steps(scene: RegisteredFrame, labels: Classes) -> Iterator[Step]:
-    known = float((labels != UNLABELLED).mean())
-    yield step(
-        "Classes of points",
-        f"Classes by the model for clouds, from above; {known:.0%} of the {len(labels)} points have a class.",
-        cloud_from_above(scene.source, labels),
-    )
-    frame = deskewed_frame(scene.source, scene.config.motion)
-    yield step(
-        "Classes of points on the image",
-        "The same points at the extrinsic of this page. Look for colours that stray beyond the outline of their object.",
-        fitted(points_on_image(frame, frame.cloud.xyz, labels, scene.T), scene),
     )
 
 

@@ -267,7 +267,12 @@ def agreed_poses(pairs: Consensus, seed: int) -> Matrix:
     met = len(np.unique(pairs.of_image))
     if met >= MIN_INLIERS:
         rng, most = np.random.default_rng(seed), EVALUATED // len(pairs)
-        T = np.concatenate([_upright(pairs), *_rotations(coarse, rng)])
+        # The rotation of every pair, if the camera does not roll; then those of two pairs.
+        x, y, z = pairs.point.T
+        yaw = np.arctan2(y, x) + np.arctan2(pairs.ray[:, 0], pairs.ray[:, 2])
+        pitch = np.arcsin(z / np.linalg.norm(pairs.point, axis=1)) + np.arcsin(pairs.ray[:, 1])
+        upright = poses(yaw, pitch, np.zeros(len(pairs)), np.zeros((len(pairs), 3)))
+        T = np.concatenate([upright, *_rotations(coarse, rng)])
         T = T[allowed(T)]
         T = T if len(T) <= most else T[np.sort(rng.choice(len(T), most, replace=False))]
     if met < MIN_INLIERS or not len(T):
@@ -282,14 +287,6 @@ def agreed_poses(pairs: Consensus, seed: int) -> Matrix:
     if len(solved):
         solved = solved[distinct(solved, pairs.values(solved), SAME_DEG[1])]
     return np.concatenate([solved, T[STARTS : STARTS + FURTHER]])
-
-
-def _upright(pairs: Consensus) -> Matrix:
-    """The rotation of every pair, if the camera does not roll (n, 4, 4)."""
-    x, y, z = pairs.point.T
-    yaw = np.arctan2(y, x) + np.arctan2(pairs.ray[:, 0], pairs.ray[:, 2])
-    pitch = np.arcsin(z / np.linalg.norm(pairs.point, axis=1)) + np.arcsin(pairs.ray[:, 1])
-    return poses(yaw, pitch, np.zeros(len(pairs)), np.zeros((len(pairs), 3)))
 
 
 def _rotations(pairs: Consensus, rng: np.random.Generator) -> Iterator[Matrix]:

@@ -119,7 +119,16 @@ def refine_positions(score: PointScore, transforms: Matrix, seed: int) -> tuple[
     ends, source = np.array(found), np.array(origin)
     inside = allowed(ends)
     ends, source = ends[inside], source[inside]
-    values = _ranked_scores(InViewScore(all_points, fine, least), ends) if len(ends) else np.zeros(0)
+    values = np.zeros(0)
+    if len(ends):
+        # Those of one direction, from wherever they started, are compared by their means.
+        view = InViewScore(all_points, fine, least)
+        values, share = view.values(ends), view.share(ends)
+        left = np.argsort(-values, kind="stable")
+        while len(left):
+            near = rotation_distance_deg(ends[left], ends[left[0]]) <= AROUND_DEG
+            values[left[near]] *= np.sqrt(share[left[0]])
+            left = left[~near]
     kept = distinct(ends, values, SAME_DEG, SAME_M)
     kept = kept[values[kept] > 0]  # the others see nothing of the scene
     return ends[kept], values[kept], source[kept]
@@ -175,18 +184,6 @@ class InViewScore:
         return self._last[1]
 
 
-def _ranked_scores(view: InViewScore, ends: Matrix) -> Matrix:
-    """The scores (k,) of ends (k, 4, 4), those of one direction, from wherever they started, compared by their means."""
-    values, share = view.values(ends), view.share(ends)
-    left = np.argsort(-values, kind="stable")
-    ranked: Matrix = values.copy()
-    while len(left):
-        near = rotation_distance_deg(ends[left], ends[left[0]]) <= AROUND_DEG
-        ranked[left[near]] *= np.sqrt(share[left[0]])
-        left = left[~near]
-    return ranked
-
-
 def around(T: Matrix, seed: int) -> Matrix:
     """T (4, 4), and extrinsics of about the same viewing direction from anywhere near the LiDAR (k, 4, 4)."""
     unit = EvenPoints(6, seed=seed).next(AROUND)
@@ -213,16 +210,6 @@ def centres(transforms: Matrix) -> Matrix:
     return np.asarray(-np.einsum("kji,kj->ki", transforms[:, :3, :3], transforms[:, :3, 3]))
 
 
-def confusion_matrix() -> NDArray[np.float64]:
-    """Share (10, 10) of the pixels of a class (row) that are labelled as another (column)."""
-    shares = np.zeros((len(C), len(C)))
-    for own, others in CONFUSION_PERCENT.items():
-        for other, percent in others.items():
-            shares[own, other] = percent / 100
-    np.fill_diagonal(shares, 1 - shares.sum(axis=1))
-    return shares
-
-
 def _points(view: ClassView, classes: Sequence[int], frame: int) -> tuple[NDArray[Any], ...]:
     """The points of a view as PointScore takes them; their weights sum up to 1, if there are any."""
     number = np.full(256, -1)
@@ -239,7 +226,11 @@ def _levels(view: ClassView, classes: Sequence[int]) -> list[EdgeLevel]:
     known = view.classes < len(C)
     share = np.bincount(view.classes[known], minlength=len(C)) / max(int(known.sum()), 1)
     present = np.flatnonzero(share)
-    evidence = (confusion_matrix()[:, present] / np.maximum(share[present], RAREST))[list(classes)].astype(np.float32)
+    confusion = np.zeros((len(C), len(C)))  # share of the pixels of a class (row) that are labelled as another (column)
+    for own, others in CONFUSION_PERCENT.items():
+        confusion[own, list(others)] = np.array(list(others.values())) / 100
+    np.fill_diagonal(confusion, 1 - confusion.sum(axis=1))
+    evidence = (confusion[:, present] / np.maximum(share[present], RAREST))[list(classes)].astype(np.float32)
     height, width = known.shape
     levels = []
     for blur_deg in BLUR_DEG:

@@ -58,16 +58,11 @@ def class_view(cloud: PointCloud, classes: NDArray[np.uint8], camera: Camera) ->
         scale *= 2
     height, width = camera.height // scale, camera.width // scale
     small = classes[scale // 2 :: scale, scale // 2 :: scale][:height, :width].copy()
-    keep = _thinned(cloud.xyz, cloud.label)
-    return ClassView(camera, small, cloud.xyz[keep], cloud.label[keep], scale)
-
-
-def _thinned(xyz: NDArray[np.float32], label: NDArray[np.uint8]) -> NDArray[np.intp]:
-    """Indices of the points kept of (n, 3): the nearest of every direction, if it is of a class that is matched."""
+    # Of the points the nearest of every direction are kept, if they are of a class that is matched.
     with np.errstate(invalid="ignore", over="ignore"):  # a broken scan holds any number; what overflows is far away
-        distance = np.linalg.norm(xyz, axis=1)
-        known = np.flatnonzero((distance >= MIN_RANGE) & (distance <= MAX_RANGE) & (label != UNLABELLED))
-    p, r = xyz[known], distance[known]
+        distance = np.linalg.norm(cloud.xyz, axis=1)
+        known = np.flatnonzero((distance >= MIN_RANGE) & (distance <= MAX_RANGE) & (cloud.label != UNLABELLED))
+    p, r = cloud.xyz[known], distance[known]
     row = np.floor(np.rad2deg(np.arcsin(p[:, 2] / r)) / CELL_DEG).astype(np.int64)
     column = np.floor(np.rad2deg(np.arctan2(p[:, 1], p[:, 0])) / CELL_DEG).astype(np.int64)
     nearest_first = np.argsort(r, kind="stable")
@@ -75,7 +70,8 @@ def _thinned(xyz: NDArray[np.float32], label: NDArray[np.uint8]) -> NDArray[np.i
     nearest = known[nearest_first[first]]
     rng, kept = np.random.default_rng(0), []
     for c in MATCHED:
-        own = nearest[label[nearest] == c]
+        own = nearest[cloud.label[nearest] == c]
         most = MAX_OBJECT_POINTS if c in MAIN_CLASSES else MAX_SURFACE_POINTS
         kept.append(own if len(own) <= most else np.sort(rng.choice(own, most, replace=False)))
-    return np.concatenate(kept)
+    keep = np.concatenate(kept)
+    return ClassView(camera, small, cloud.xyz[keep], cloud.label[keep], scale)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import ModelError
 from calib_ros.frame import SemanticClass
@@ -56,12 +55,23 @@ class ClassOutput:
         layouts = [layout_of(shape, size) for shape in shapes]
         maps = {k: layout for k, layout in enumerate(layouts) if layout is not None}
         is_pidnet = not model.sidecar.output and _is_pidnet(model, maps, size)
-        at = 1 if is_pidnet else _best_output(model, maps)
-        if at is None:
+        # The output of the YAML, else scores before class numbers, integers before a possible confidence.
+        scores = [k for k, layout in maps.items() if layout.classes is not None]
+        integers = [k for k in maps if np.issubdtype(model.outputs[k].dtype, np.integer)]
+        asked = [names.index(model.sidecar.output)] if model.sidecar.output else scores or integers or maps
+        at = 1 if is_pidnet else next(iter(asked), None)
+        if at is None or at not in maps:
             sizes = ", ".join(f"{name} {_text(shape)}" for name, shape in zip(names, shapes, strict=True))
             none = f"none of its outputs is a map of classes for an input of {_text(size)} ({sizes})"
             raise model.error(f"{none}; known are {self._conventions}")
-        _check_memory(model, at, shapes[at], size)
+        taken = math.prod(shapes[at]) * np.dtype(model.outputs[at].dtype).itemsize
+        if taken > MAX_OUTPUT_BYTES:
+            fitting = _text([int(n * math.sqrt(MAX_OUTPUT_BYTES / taken)) // 32 * 32 for n in size])
+            raise model.error(
+                f"its output {names[at]}, {_text(shapes[at])}, takes {taken / 1e9:.1f} GB for an input of {_text(size)}, and at "
+                f"most {MAX_OUTPUT_BYTES / 1e9:g} GB are taken; export it for {fitting} or less, without its last upsampling, or "
+                "with its argmax inside"
+            )
         self._table = table_of(model, maps[at].classes, self._by_count, self._by_number)
         if not self.known - {SemanticClass.OTHER}:
             raise model.error(
@@ -98,7 +108,16 @@ class ClassOutput:
         """Classes at a size (height, width) from `values`. ModelError for values that are not classes."""
         try:
             if self.count is not None:
-                return self._table.classes(best_classes(values, size))
+                # Of the highest score, interpolated to the size first; -1 where all are NaN.
+                highest, winner = np.full(size, -np.inf, np.float32), np.full(size, -1, np.int16)
+                for number, score in enumerate(values):
+                    plane = enlarged(score, size)  # cells cover equal parts of it, as in networks that do not align corners
+                    better = plane > highest
+                    np.copyto(highest, plane, where=better)
+                    np.copyto(winner, np.int16(number), where=better)
+                if winner.max() < 0:
+                    raise ModelError("there is no number in it; float16 may have overflowed, export it as float32")
+                return self._table.classes(winner)
             if values.dtype == np.bool_ or not np.isfinite(values).all() or (values != np.rint(values)).any():
                 raise ModelError("it has one channel, but holds no class numbers: a network for a single class cannot be used")
             return resized(self._table.classes(values.astype(np.int64)), size)  # some exports give floats
@@ -141,19 +160,6 @@ def layout_of(shape: Sequence[int], size: Size) -> ClassMapLayout | None:
     return None
 
 
-def best_classes(scores: NDArray[Any], size: Size) -> NDArray[np.int16]:
-    """Class (H, W) of the highest of scores (C, h, w), which are interpolated to the size first; -1 where all are NaN."""
-    highest, winner = np.full(size, -np.inf, np.float32), np.full(size, -1, np.int16)
-    for number, score in enumerate(scores):
-        plane = enlarged(score, size)  # cells cover equal parts of it, as in networks that do not align corners
-        better = plane > highest
-        np.copyto(highest, plane, where=better)
-        np.copyto(winner, np.int16(number), where=better)
-    if winner.max() < 0:
-        raise ModelError("there is no number in it; float16 may have overflowed, export it as float32")
-    return winner
-
-
 def _is_part(cells: Sequence[int], size: Size) -> bool:
     """Whether rows and columns are those of the input, or of a coarser or finer grid over it."""
     finer = any(n > MAX_UPSAMPLING * own for n, own in zip(cells, size, strict=True))
@@ -170,16 +176,6 @@ def _declared(model: OnnxModel, feeds: Mapping[str, Array]) -> list[tuple[int, .
     return None if any(None in shape for shape in taken) or known != given else known
 
 
-def _best_output(model: OnnxModel, maps: Mapping[int, ClassMapLayout]) -> int | None:
-    """Index of the output to use: that of the YAML, else scores before class numbers, integers before a possible confidence."""
-    if model.sidecar.output:
-        at = [t.name for t in model.outputs].index(model.sidecar.output)
-        return at if at in maps else None
-    scores = [k for k, layout in maps.items() if layout.classes is not None]
-    integers = [k for k in maps if np.issubdtype(model.outputs[k].dtype, np.integer)]
-    return next(iter(scores or integers or maps), None)
-
-
 def _is_pidnet(model: OnnxModel, maps: Mapping[int, ClassMapLayout], size: Size) -> bool:
     """Whether three outputs are those of PIDNet: two alike, at an eighth of the input unless enlarged, and boundaries."""
     if len(model.outputs) != 3 or not {0, 1} <= set(maps) or maps[0].classes is None or maps[0].shape != maps[1].shape:
@@ -188,18 +184,6 @@ def _is_pidnet(model: OnnxModel, maps: Mapping[int, ClassMapLayout], size: Size)
     in_eighths = abs(size[1] / columns - 8) < 1
     boundaries = 2 in maps and maps[2].classes is None
     return in_eighths or boundaries or model.sidecar.family.lower() == "pidnet"
-
-
-def _check_memory(model: OnnxModel, at: int, shape: Sequence[int], size: Size) -> None:
-    """ModelError for an output that takes too much memory, with the size of the input at which it would not."""
-    taken = math.prod(shape) * np.dtype(model.outputs[at].dtype).itemsize
-    if taken > MAX_OUTPUT_BYTES:
-        fitting = _text([int(n * math.sqrt(MAX_OUTPUT_BYTES / taken)) // 32 * 32 for n in size])
-        raise model.error(
-            f"its output {model.outputs[at].name}, {_text(shape)}, takes {taken / 1e9:.1f} GB for an input of {_text(size)}, and "
-            f"at most {MAX_OUTPUT_BYTES / 1e9:g} GB are taken; export it for {fitting} or less, without its last upsampling, or "
-            "with its argmax inside"
-        )
 
 
 def _text(shape: Sequence[int]) -> str:

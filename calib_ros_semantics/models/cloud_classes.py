@@ -16,7 +16,7 @@ from calib_ros.lidar.rings import azimuth_step, ring_of_points
 from calib_ros_semantics.models import labels
 from calib_ros_semantics.models.class_output import ClassOutput
 from calib_ros_semantics.models.labels import SQUEEZESEG, Classes
-from calib_ros_semantics.models.onnx_model import Array, Deadline, InputImage, OnnxModel, SegmentationModel, Tensor
+from calib_ros_semantics.models.onnx_model import Array, Deadline, InputImage, OnnxModel, SegmentationModel
 
 Statistics = Mapping[str, tuple[float, float]]  # mean and standard deviation of each channel
 CONVENTIONS = (
@@ -63,7 +63,10 @@ class CloudNetwork(SegmentationModel):
 
     def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
         self.model, self.fallback, own = model, model.fallback, model.sidecar
-        masks = [t for t in model.inputs if len(model.inputs) == 2 and _is_mask(t)]
+        masks = []  # the input of two that is the mask of the other
+        for t in model.inputs if len(model.inputs) == 2 else ():
+            channels = (t.shape[1], t.shape[3]) if len(t.shape) == 4 else ()
+            masks += [t] if "mask" in t.name.lower() or 1 in channels or len(t.shape) == 2 else []
         counts = (len(CHANNELS) - 1, len(CHANNELS)) if isinstance(own.channels, str) else (len(own.channels),)
         image = InputImage.of(model, [t for t in model.inputs if t not in masks], counts)
         if image is None:
@@ -179,12 +182,6 @@ class CloudNetwork(SegmentationModel):
         return notes
 
 
-def _is_mask(tensor: Tensor) -> bool:
-    """Whether an input of two is the mask of the other."""
-    channels = (tensor.shape[1], tensor.shape[3]) if len(tensor.shape) == 4 else ()
-    return "mask" in tensor.name.lower() or 1 in channels or len(tensor.shape) == 2
-
-
 def _nearest_width(columns: float) -> int:
     return min(WIDTHS, key=lambda width: abs(np.log(width / columns)))
 
@@ -259,28 +256,21 @@ def classes_of_points(view: RangeView, classes: Classes) -> Classes:
     ranges, near = view.ranges, np.maximum(np.float32(SAME_RANGE), np.float32(SAME_RANGE_SHARE) * view.range)
     with np.errstate(invalid="ignore"):
         hidden = np.flatnonzero(view.inside & ~(np.abs(ranges[view.row, view.column] - view.range) < near))
-    out[hidden] = _vote(view, classes, ranges, hidden, near[hidden])
-    out[~view.inside] = UNLABELLED
-    return out
-
-
-def _vote(
-    view: RangeView, classes: Classes, ranges: NDArray[np.float32], points: NDArray[np.intp], near: NDArray[np.float32]
-) -> Classes:
-    """Classes of some points by their neighbourhood."""
-    votes = np.zeros((len(points), VOTED_CLASSES), np.float32)
+    votes = np.zeros((len(hidden), VOTED_CLASSES), np.float32)
     height, width = classes.shape
-    each = np.arange(len(points))
+    each = np.arange(len(hidden))
     for down in range(-VOTE_REACH, VOTE_REACH + 1):
-        row = view.row[points] + down
+        row = view.row[hidden] + down
         for right in range(-VOTE_REACH, VOTE_REACH + 1):
-            column = view.column[points] + right
+            column = view.column[hidden] + right
             there = (row >= 0) & (row < height)
             if not view.whole_turn:
                 there &= (column >= 0) & (column < width)
             at = np.clip(row, 0, height - 1), column % width
-            weight = np.nan_to_num(1 - np.abs(ranges[at] - view.range[points]) / near, nan=0.0)
+            weight = np.nan_to_num(1 - np.abs(ranges[at] - view.range[hidden]) / near[hidden], nan=0.0)
             there &= (weight > 0) & (classes[at] < VOTED_CLASSES)
             votes[each[there], classes[at][there]] += weight[there]
     winner = votes.argmax(axis=1).astype(np.uint8)
-    return np.asarray(np.where(votes.max(axis=1, initial=0) > 0, winner, UNLABELLED), np.uint8)
+    out[hidden] = np.where(votes.max(axis=1, initial=0) > 0, winner, UNLABELLED)
+    out[~view.inside] = UNLABELLED
+    return out

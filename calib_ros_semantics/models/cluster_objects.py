@@ -54,7 +54,15 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     cut: (n,) points at the upper edge of the field of view. free: (n,) points without a class so far.
     """
     labels = np.full(len(xyz), UNLABELLED, np.uint8)
-    top = _column_tops(xyz)
+    # Height up to which the column of each point reaches without a gap.
+    member, n = cell_numbers(xyz * PLAN, (COLUMN_CELL, COLUMN_CELL, 1.0))
+    order = np.lexsort((xyz[:, 2], member))
+    z, column = xyz[order, 2], member[order]
+    first = np.r_[True, column[1:] != column[:-1]]
+    below = np.where(first, MAX_HIDDEN, np.r_[np.float32(0), z[:-1]])
+    gaps = np.cumsum(z - below > MAX_COLUMN_GAP + MAX_COLUMN_GAP_SHARE * np.hypot(xyz[order, 0], xyz[order, 1]))
+    before = np.r_[0, gaps[:-1]][first]
+    top = extents(np.where(gaps > before[column], 0, z).astype(np.float32), column, n)[1][member]
     low = np.nonzero((top < MAX_OBJECT_HEIGHT) & (xyz[:, 2] <= top) & free)[0]
     if len(low) == 0:
         return labels
@@ -63,7 +71,7 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     kinds = np.full(len(parts), UNLABELLED, np.uint8)
     for k, part in enumerate(parts):
         if len(part) >= MIN_OBJECT_POINTS:
-            kinds[k] = ClusterShape(xyz[part], Surfaces(*(values[part] for values in shape)), cut[part]).kind
+            kinds[k] = _kind(xyz[part], Surfaces(*(values[part] for values in shape)), cut[part])
     for v in np.nonzero(kinds == SemanticClass.VEHICLE)[0]:
         inside = _within_car(xyz[low], xyz[parts[v]])
         share = np.bincount(number[inside], minlength=len(parts)) / np.bincount(number)
@@ -72,56 +80,44 @@ def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDA
     return labels
 
 
-class ClusterShape:
-    """Measures of a cluster and the class they give, from points (n, 3), z = height above the ground (m), and (n,) whether they
-    are at the edge of the field of view. length, width, bottom, top, distance: m. head: length of its uppermost HEAD_HEIGHT, m.
-    scatter, level: median, as of Surfaces. cut: whether its top is outside the field of view."""
+def _kind(xyz: Floats, shape: Surfaces, at_edge: NDArray[np.bool_]) -> int:
+    """VEHICLE, CYCLIST, PERSON or UNLABELLED: what a cluster of points (n, 3), z = height above the ground (m), is. at_edge: (n,)
+    whether they are at the edge of the field of view."""
+    bottom, top = float(xyz[:, 2].min()), float(xyz[:, 2].max())
+    # With its top outside the field of view it may be anything.
+    if np.count_nonzero(at_edge) > MAX_CUT_SHARE * len(at_edge) or bottom > MAX_BOTTOM:
+        return UNLABELLED
+    length, width = bounding_rectangle(xyz[:, :2])
+    distance = float(np.hypot(*xyz[:, :2].mean(axis=0)))
+    head = bounding_rectangle(xyz[xyz[:, 2] > top - HEAD_HEIGHT, :2])[0]
+    known = shape.scatter[np.isfinite(shape.scatter)]
+    scatter, level = float(np.median(known)) if len(known) else np.inf, float(np.median(shape.level))
+    if _is_vehicle(length, width, top, head, distance, scatter, level):
+        return SemanticClass.VEHICLE
+    if distance > MAX_PERSON_DISTANCE:
+        return UNLABELLED
+    sizes = length, width, top
+    rider, person = (all(low <= m <= high for m, (low, high) in zip(sizes, own, strict=True)) for own in (RIDER, PERSON))
+    calm = scatter < MAX_RIDER_SCATTER and level < MAX_RIDER_LEVEL and bottom < MAX_RIDER_BOTTOM
+    if rider and calm and head <= MAX_RIDER_HEAD * length:
+        return SemanticClass.CYCLIST
+    slim = top > MIN_PERSON_SLIMNESS * length and head < MAX_PERSON_HEAD
+    return SemanticClass.PERSON if person and slim else UNLABELLED
 
-    def __init__(self, xyz: Floats, shape: Surfaces, at_edge: NDArray[np.bool_]) -> None:
-        self.length, self.width = bounding_rectangle(xyz[:, :2])
-        self.bottom, self.top = float(xyz[:, 2].min()), float(xyz[:, 2].max())
-        self.distance = float(np.hypot(*xyz[:, :2].mean(axis=0)))
-        self.head = bounding_rectangle(xyz[xyz[:, 2] > self.top - HEAD_HEIGHT, :2])[0]
-        known = shape.scatter[np.isfinite(shape.scatter)]
-        self.scatter, self.level = float(np.median(known)) if len(known) else np.inf, float(np.median(shape.level))
-        self.cut = np.count_nonzero(at_edge) > MAX_CUT_SHARE * len(at_edge)
 
-    @property
-    def kind(self) -> int:
-        """VEHICLE, CYCLIST, PERSON or UNLABELLED."""
-        if self.cut or self.bottom > MAX_BOTTOM:
-            return UNLABELLED
-        if self._is_vehicle():
-            return SemanticClass.VEHICLE
-        if self.distance > MAX_PERSON_DISTANCE:
-            return UNLABELLED
-        if self._is_rider():
-            return SemanticClass.CYCLIST
-        return SemanticClass.PERSON if self._is_person() else UNLABELLED
-
-    def _is_vehicle(self) -> bool:
-        whole = self.width >= MIN_WHOLE_DEPTH
-        boxy = self.head > MAX_HEAD_RATIO * self.length and not (whole and self.length >= SIDE_LENGTH[0])
-        sized = MIN_END <= self.length <= MAX_VEHICLE_LENGTH and self.width <= MAX_VEHICLE_WIDTH
-        if boxy or self.level > MAX_VEHICLE_LEVEL or not sized:
-            return False
-        if whole and self.top <= CAR_TOP and self.scatter < min(MAX_SCATTER + SCATTER_PER_M * self.distance, MAX_FAR_SCATTER):
-            return self.top >= (MIN_BONNET if self.length >= SIDE_LENGTH[0] else MIN_ROOF)
-        if self.scatter >= MAX_SCATTER or not MIN_ROOF <= self.top <= (VAN_TOP if whole else CAR_TOP) or self.head < MIN_CABIN:
-            return False
-        if self.length >= SIDE_LENGTH[0]:
-            return whole or (self.length <= SIDE_LENGTH[1] and self.width >= MIN_SIDE_DEPTH)
-        return self.width >= MIN_END_DEPTH
-
-    def _is_rider(self) -> bool:
-        shape = self.scatter < MAX_RIDER_SCATTER and self.level < MAX_RIDER_LEVEL and self.bottom < MAX_RIDER_BOTTOM
-        return shape and self._measures(RIDER) and self.head <= MAX_RIDER_HEAD * self.length
-
-    def _is_person(self) -> bool:
-        return self._measures(PERSON) and self.top > MIN_PERSON_SLIMNESS * self.length and self.head < MAX_PERSON_HEAD
-
-    def _measures(self, limits: tuple[tuple[float, float], ...]) -> bool:
-        return all(low <= m <= high for m, (low, high) in zip((self.length, self.width, self.top), limits, strict=True))
+def _is_vehicle(length: float, width: float, top: float, head: float, distance: float, scatter: float, level: float) -> bool:
+    whole = width >= MIN_WHOLE_DEPTH
+    boxy = head > MAX_HEAD_RATIO * length and not (whole and length >= SIDE_LENGTH[0])
+    sized = MIN_END <= length <= MAX_VEHICLE_LENGTH and width <= MAX_VEHICLE_WIDTH
+    if boxy or level > MAX_VEHICLE_LEVEL or not sized:
+        return False
+    if whole and top <= CAR_TOP and scatter < min(MAX_SCATTER + SCATTER_PER_M * distance, MAX_FAR_SCATTER):
+        return top >= (MIN_BONNET if length >= SIDE_LENGTH[0] else MIN_ROOF)
+    if scatter >= MAX_SCATTER or not MIN_ROOF <= top <= (VAN_TOP if whole else CAR_TOP) or head < MIN_CABIN:
+        return False
+    if length >= SIDE_LENGTH[0]:
+        return whole or (length <= SIDE_LENGTH[1] and width >= MIN_SIDE_DEPTH)
+    return width >= MIN_END_DEPTH
 
 
 def _within_car(xyz: Floats, visible: Floats) -> NDArray[np.bool_]:
@@ -139,16 +135,3 @@ def _within_car(xyz: Floats, visible: Floats) -> NDArray[np.bool_]:
     depth = max(width, CAR_SIZE[1] if length >= MIN_SIDE else CAR_SIZE[0])
     low = xyz[:, 2] <= max(float(visible[:, 2].max()), CAR_SIZE[2])
     return np.asarray(low & (np.abs(u) <= 0.5 * length) & (v >= -0.5 * width) & (v <= depth - 0.5 * width))
-
-
-def _column_tops(xyz: Floats) -> Floats:
-    """Height (n,) m up to which the column of each point (n, 3) reaches without a gap."""
-    member, n = cell_numbers(xyz * PLAN, (COLUMN_CELL, COLUMN_CELL, 1.0))
-    order = np.lexsort((xyz[:, 2], member))
-    z, column = xyz[order, 2], member[order]
-    first = np.r_[True, column[1:] != column[:-1]]
-    below = np.where(first, MAX_HIDDEN, np.r_[np.float32(0), z[:-1]])
-    gaps = np.cumsum(z - below > MAX_COLUMN_GAP + MAX_COLUMN_GAP_SHARE * np.hypot(xyz[order, 0], xyz[order, 1]))
-    before = np.r_[0, gaps[:-1]][first]
-    _, high = extents(np.where(gaps > before[column], 0, z).astype(np.float32), column, n)
-    return high[member]

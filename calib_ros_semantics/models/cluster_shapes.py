@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -96,7 +96,9 @@ def find_poles(xyz: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArr
     plate = ~thin & (width >= PLATE_WIDTH[0]) & (width <= PLATE_WIDTH[1]) & (depth <= MAX_PLATE_DEPTH)
     plate &= slabs.slice * SLICE >= MIN_PLATE_HEIGHT
     alone = np.nonzero(thin | plate)[0]
-    alone = alone[_is_isolated(slabs, alone, tree, np.bincount(part))]
+    around = 0.5 * slabs.size[alone, 0] + CLEARANCE + CLEARANCE_SHARE * slabs.distance[alone]
+    centre = np.column_stack([slabs.middle[alone], slabs.slice[alone] * SLICE_SEPARATION])
+    alone = alone[np.asarray(tree.query_ball_point(centre, around, return_length=True) <= np.bincount(part)[alone])]
     stack = _stack_numbers(slabs, alone)
     good, trunk = _poles_and_trunks(slabs, alone, thin, stack, at, part)
     good &= ~_is_wall_column(slabs, alone[thin[alone]], alone, stack, good)
@@ -131,13 +133,6 @@ def _slabs(xyz: Floats, part: Numbers, layer: Numbers, part_of_cell: Numbers) ->
     slices = np.zeros(n, np.intp)
     slices[part_of_cell] = layer
     return Slabs(middle, np.hypot(middle[:, 0], middle[:, 1]), slices, np.sort(np.stack(sides, 1), axis=1)[:, ::-1])
-
-
-def _is_isolated(slabs: Slabs, chosen: Numbers, tree: Any, cells: Numbers) -> NDArray[np.bool_]:
-    """Whether the surroundings of each of the chosen slabs are empty in its slice."""
-    around = 0.5 * slabs.size[chosen, 0] + CLEARANCE + CLEARANCE_SHARE * slabs.distance[chosen]
-    centre = np.column_stack([slabs.middle[chosen], slabs.slice[chosen] * SLICE_SEPARATION])
-    return np.asarray(tree.query_ball_point(centre, around, return_length=True) <= cells[chosen])
 
 
 def _stack_numbers(slabs: Slabs, chosen: Numbers) -> Numbers:

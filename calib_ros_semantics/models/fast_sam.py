@@ -54,8 +54,7 @@ class FastSam(MaskModel):
         size = frame.image.shape[0], frame.image.shape[1]
         tensor, factor, corner = self._letterboxed(frame.image)
         found, *maps = (array[0] for array in self.model.run({self._input.tensor.name: tensor}, deadline, self._outputs))
-        prototypes = self._prototypes(found, maps)
-        boxes, score, coefficients = self._detections(found.astype(np.float32), len(prototypes))
+        boxes, score, coefficients, prototypes = self._detections(found, maps)
         boxes -= np.tile(corner, 2)
         boxes /= np.tile(factor, 2)  # in pixels of the image from here
         step = np.array(prototypes.shape[:0:-1]) / np.array(self._size[::-1])
@@ -80,26 +79,24 @@ class FastSam(MaskModel):
         scale = np.array([width / size[1], height / size[0]], np.float32)
         return self._input.arranged(self._normalised(picture)), scale, np.array([left, top], np.float32)
 
-    def _prototypes(self, found: Array, maps: Sequence[Array]) -> Floats:
-        """Prototypes (p, h, w) among the maps: the last for which the detections have enough coefficients."""
+    def _detections(self, found: Array, maps: Sequence[Array]) -> tuple[Floats, Floats, Floats, Floats]:
+        """Boxes (n, 4) left, top, right, bottom in pixels of the input, confidence (n,), coefficients (n, p), and prototypes
+        (p, h, w) among the maps: the last for which the detections have enough coefficients."""
         # Few rows of corners, confidence, class number and coefficients.
         if found.shape[0] <= MAX_NMS_ROWS and any(found.shape[1] == 6 + len(m) for m in maps):
             raise self.model.error(NMS_INSIDE)
         fitting = [m for m in maps if len(m) <= min(found.shape) - MIN_OTHER_COLUMNS]  # other exports also give feature maps
         if not fitting:
             raise self.model.error(f"it gave detections {found.shape}, which do not fit prototypes {[m.shape for m in maps]}")
-        return fitting[-1].astype(np.float32, copy=False)
-
-    def _detections(self, found: Array, prototypes: int) -> tuple[Floats, Floats, Floats]:
-        """Boxes (n, 4) left, top, right, bottom in pixels of the input, confidence (n,), coefficients (n, p)."""
-        rows = found.T if found.shape[0] < found.shape[1] else found
-        classes = rows.shape[1] - 4 - prototypes
+        prototypes, rows = fitting[-1].astype(np.float32, copy=False), found.astype(np.float32)
+        rows = rows.T if rows.shape[0] < rows.shape[1] else rows
+        classes = rows.shape[1] - 4 - len(prototypes)
         rows = rows[np.isfinite(rows).all(axis=1)]
         score = rows[:, 4 : 4 + classes].max(axis=1)
         sure = score >= MIN_CONFIDENCE
         rows, score = rows[sure], score[sure]
         half = rows[:, 2:4] / 2
-        return np.hstack([rows[:, :2] - half, rows[:, :2] + half]), score, rows[:, 4 + classes :]
+        return np.hstack([rows[:, :2] - half, rows[:, :2] + half]), score, rows[:, 4 + classes :], prototypes
 
 
 def is_fast_sam(model: OnnxModel, alone: bool) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib_ros.frame import UNLABELLED, Frame, PointCloud, SemanticClass
 from calib_ros.lidar.range_image import MIN_POINTS, reflectivity
-from calib_ros.lidar.segmentation import Plane, fit_ground
+from calib_ros.lidar.segmentation import fit_ground
 from calib_ros_semantics.models.cluster_objects import find_objects
 from calib_ros_semantics.models.cluster_shapes import Surfaces, find_poles, find_signs, surface_shape
 from calib_ros_semantics.models.onnx_model import Deadline, SegmentationModel
@@ -61,40 +61,34 @@ class ClusterClasses(SegmentationModel):
         return "shapes of clusters: ground, vehicles, people, cyclists, poles, signs, buildings, vegetation"
 
 
-def cluster_classes(cloud: PointCloud, seed: int = 0) -> Classes:
+def cluster_classes(cloud: PointCloud) -> Classes:
     """SemanticClass of each point, (n,) uint8; UNLABELLED where the shape is ambiguous, beyond MAX_RANGE, and without a return.
 
     The cloud may come from any LiDAR that measures the ground and is upright to 15 deg; only xyz and, for signs, the intensity
-    are used. Without ground nothing is labelled. seed: of the RANSAC for the ground.
+    are used. Without ground nothing is labelled.
     """
     labels = np.full(len(cloud), UNLABELLED, np.uint8)
     returns = np.nonzero(cloud.finite_mask())[0]
     if len(returns) < MIN_POINTS:
         return labels
-    xyz = heights(cloud.xyz[returns], seed)
+    xyz = heights(cloud.xyz[returns])
     if xyz is None:
         return labels
     near = np.hypot(xyz[:, 0], xyz[:, 1]) < MAX_RANGE
     labels[returns[near & (xyz[:, 2] < MAX_GROUND_HEIGHT)]] = SemanticClass.GROUND
     standing = near & (xyz[:, 2] >= MAX_GROUND_HEIGHT) & (xyz[:, 2] < MAX_HEIGHT)
     if standing.any():
-        light = reflectivity(cloud.intensity)
-        of_standing = None if light is None else light[returns[standing]]
-        labels[returns[standing]] = _classes_above_ground(xyz[standing], of_standing, _cut_off(cloud.xyz[returns])[standing])
+        light, cut, xyz = reflectivity(cloud.intensity), _cut_off(cloud.xyz[returns])[standing], xyz[standing]
+        shape = surface_shape(xyz)
+        pole, plate, trunk = find_poles(xyz)
+        signs = find_signs(xyz, None if light is None else light[returns[standing]]) | plate
+        own = buildings_and_vegetation(xyz, shape, cut)
+        own[trunk] = SemanticClass.VEGETATION
+        own[pole] = SemanticClass.POLE
+        own[signs] = SemanticClass.SIGN
+        objects = find_objects(xyz, shape, cut, ~(pole | trunk | signs))
+        labels[returns[standing]] = np.where(objects == UNLABELLED, own, objects)
     return labels
-
-
-def _classes_above_ground(xyz: Floats, light: Floats | None, cut: NDArray[np.bool_]) -> Classes:
-    """Classes (n,) of points (n, 3) above the ground, z = height (m). light: (n,) reflectivity. cut: (n,) as of `_cut_off`."""
-    shape = surface_shape(xyz)
-    pole, plate, trunk = find_poles(xyz)
-    signs = find_signs(xyz, light) | plate
-    labels = buildings_and_vegetation(xyz, shape, cut)
-    labels[trunk] = SemanticClass.VEGETATION
-    labels[pole] = SemanticClass.POLE
-    labels[signs] = SemanticClass.SIGN
-    objects = find_objects(xyz, shape, cut, ~(pole | trunk | signs))
-    return np.where(objects == UNLABELLED, labels, objects)
 
 
 def _cut_off(xyz: Floats) -> NDArray[np.bool_]:
@@ -136,16 +130,21 @@ def buildings_and_vegetation(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_
     return labels
 
 
-def heights(xyz: Floats, seed: int = 0) -> Floats | None:
+def heights(xyz: Floats) -> Floats | None:
     """Points (n, 3) m in the LiDAR frame -> (n, 3): x and y horizontal, z the height above the local ground; None without ground.
 
     The ground is the plane of algorithm 1, corrected by the lowest points of cells, averaged over ever smaller neighbourhoods.
     """
     few = xyz[:: (len(xyz) // GROUND_SAMPLE) | 1]
-    plane = fit_ground(few, GROUND_THRESHOLD, GROUND_ITERATIONS, MAX_TILT_DEG, MIN_GROUND_SHARE, seed)
+    plane = fit_ground(few, GROUND_THRESHOLD, GROUND_ITERATIONS, MAX_TILT_DEG, MIN_GROUND_SHARE, 0)
     if plane is None:
         return None
-    flat = np.asarray(xyz @ _levelling_rotation(plane).T.astype(np.float32), np.float32)
+    # The smallest rotation that maps its normal to the z axis: about n x z, as long as the sine of the angle.
+    n = plane.normal
+    v = np.array([n[1], -n[0], 0.0])
+    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    R = np.asarray(np.eye(3) + K + K @ K / (1 + n[2]))
+    flat = np.asarray(xyz @ R.T.astype(np.float32), np.float32)
     flat[:, 2] -= np.float32(plane.offset)
     ground = _ground(flat)  # bilinear between the centres of its cells
     place = np.clip((flat[:, :2] + GROUND_REACH) / GROUND_CELL - 0.5, 0, len(ground) - 1.001)
@@ -155,14 +154,6 @@ def heights(xyz: Floats, seed: int = 0) -> Floats | None:
     lower = (1 - u) * ground[row + 1, column] + u * ground[row + 1, column + 1]
     flat[:, 2] -= np.asarray((1 - v) * upper + v * lower, np.float32)
     return flat
-
-
-def _levelling_rotation(plane: Plane) -> NDArray[np.float64]:
-    """The smallest rotation (3, 3) that maps the plane's normal to the z axis."""
-    n = plane.normal
-    v = np.array([n[1], -n[0], 0.0])  # the axis, n x z, as long as the sine of the angle
-    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.asarray(np.eye(3) + K + K @ K / (1 + n[2]))
 
 
 def _ground(flat: Floats) -> Floats:

@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import cv2
@@ -202,8 +202,15 @@ def mask_edges(masks: Sequence[Mask], size: Size) -> Floats:
     """
     total, xx, yy, xy = (np.zeros(size, np.float32) for _ in range(4))
     for mask in masks:
-        place, gx, gy = _gradients(mask, size)
-        gx, gy = gx * np.float32(mask.score), gy * np.float32(mask.score)
+        left, top, right, bottom = mask.box
+        x, y = max(left - BLUR_MARGIN, 0), max(top - BLUR_MARGIN, 0)
+        place = slice(y, min(bottom + BLUR_MARGIN, size[0])), slice(x, min(right + BLUR_MARGIN, size[1]))
+        soft = np.zeros(total[place].shape, np.float32)
+        soft[top - y : bottom - y, left - x : right - x] = mask.inside
+        # A mask that touches the border of the image continues beyond it.
+        soft = np.asarray(cv2.GaussianBlur(soft, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE), np.float32)
+        sobel = partial(cv2.Sobel, soft, cv2.CV_32F, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE)
+        gx, gy = (np.asarray(sobel(dx=dx, dy=1 - dx), np.float32) * np.float32(mask.score) for dx in (1, 0))
         squares = gx * gx, gy * gy
         total[place] += np.sqrt(squares[0] + squares[1])
         xx[place] += squares[0]
@@ -216,22 +223,6 @@ def mask_edges(masks: Sequence[Mask], size: Size) -> Floats:
     clear_border(strength)
     horizontal = strength * (1 + cosine) / 2
     return np.stack([horizontal, strength - horizontal]).astype(np.float32, copy=False)
-
-
-def _gradients(mask: Mask, size: Size) -> tuple[tuple[slice, slice], Floats, Floats]:
-    """Rows and columns around a mask, and the gradients of the blurred mask there."""
-    left, top, right, bottom = mask.box
-    x, y = max(left - BLUR_MARGIN, 0), max(top - BLUR_MARGIN, 0)
-    x2, y2 = min(right + BLUR_MARGIN, size[1]), min(bottom + BLUR_MARGIN, size[0])
-    soft = np.zeros((y2 - y, x2 - x), np.float32)
-    soft[top - y : bottom - y, left - x : right - x] = mask.inside
-    # A mask that touches the border of the image continues beyond it.
-    soft = np.asarray(cv2.GaussianBlur(soft, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE), np.float32)
-    gx, gy = (
-        np.asarray(cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE), np.float32)
-        for dx in (1, 0)
-    )
-    return (slice(y, y2), slice(x, x2)), gx, gy
 
 
 def _is_ridge(strength: Floats, cosine: Floats, xy: Floats) -> NDArray[np.bool_]:

@@ -74,13 +74,28 @@ class ReadyClasses(SegmentationModel):
         path = folder / f"{frame.name}{self._suffix}"
         if not frame.name or Path(frame.name).name != frame.name:
             raise ModelError(f"frame name '{frame.name}' is no plain file name: {self._files} in {folder} are found by it")
-        data = _data(path, self._files[:-1])
-        numbers = _of_picture(path, data, frame) if self._kind == IMAGE else _of_scan(path, data, frame)
+        data, (height, width) = _data(path, self._files[:-1]), frame.image.shape[:2]
+        if self._kind == CLOUD:
+            if len(data) != BYTES_OF_LABEL * len(frame.cloud):
+                raise ModelError(
+                    f"label file {path} has {len(data)} bytes, but the cloud {len(frame.cloud)} points of {BYTES_OF_LABEL} bytes "
+                    "each; use the file of this scan"
+                )
+            numbers: NDArray[Any] = data.view("<u4") & 0xFFFF
+        else:
+            numbers = _pixels(path, _numbers(data), "label picture")
+            if numbers.ndim != 2:
+                raise ModelError(
+                    f"label picture {path} has colours; it must hold class numbers, as grey levels or with a palette"
+                )
+            if abs(numbers.shape[1] * height / (numbers.shape[0] * width) - 1) > SAME_SHAPE:
+                found = f"{numbers.shape[1]}x{numbers.shape[0]}"
+                raise ModelError(f"label picture {path} is {found}, but the image {width}x{height}; it must show the same")
         try:
             classes = self._table.classes(numbers.astype(np.int32))
         except ModelError as error:
             raise ModelError(f"{path}: {error}") from None
-        return classes if self._kind == CLOUD else resized(classes, (frame.image.shape[0], frame.image.shape[1]))
+        return classes if self._kind == CLOUD else resized(classes, (height, width))
 
 
 def _data(path: Path, what: str) -> NDArray[np.uint8]:
@@ -96,45 +111,23 @@ def _pixels(path: Path, decoded: NDArray[Any] | None, what: str) -> NDArray[Any]
     return decoded
 
 
-def _of_picture(path: Path, data: NDArray[np.uint8], frame: Frame) -> NDArray[Any]:
-    numbers, (height, width) = _pixels(path, _numbers(data), "label picture"), frame.image.shape[:2]
-    if numbers.ndim != 2:
-        raise ModelError(f"label picture {path} has colours; it must hold class numbers, as grey levels or with a palette")
-    if abs(numbers.shape[1] * height / (numbers.shape[0] * width) - 1) > SAME_SHAPE:
-        found = f"{numbers.shape[1]}x{numbers.shape[0]}"
-        raise ModelError(f"label picture {path} is {found}, but the image {width}x{height}; it must show the same")
-    return numbers
-
-
-def _of_scan(path: Path, data: NDArray[np.uint8], frame: Frame) -> NDArray[Any]:
-    if len(data) != BYTES_OF_LABEL * len(frame.cloud):
-        raise ModelError(
-            f"label file {path} has {len(data)} bytes, but the cloud {len(frame.cloud)} points of {BYTES_OF_LABEL} bytes each; "
-            "use the file of this scan"
-        )
-    return data.view("<u4") & 0xFFFF
-
-
 def _numbers(data: NDArray[np.uint8]) -> NDArray[Any] | None:
     """The numbers stored in a PNG of grey levels or with a palette, the pixels of others; None if it is not complete."""
     # OpenCV returns the colours of a palette, and stretches grey levels of fewer than 8 bits to 0..255.
     file = data.tobytes()
     if file[:8] != PNG or len(file) < 33 or file[25] not in (PALETTE_TYPE, GREY_TYPE):
         return decode_picture(data)
-    pixels, bits = decode_picture(_without_palette(file) if file[25] == PALETTE_TYPE else data), file[24]
+    if file[25] == PALETTE_TYPE:  # rewritten as one whose grey levels are the indices of the palette
+        header = b"IHDR" + file[16:25] + bytes([GREY_TYPE]) + file[26:29]
+        kept, at = [PNG, file[8:12], header, struct.pack(">I", zlib.crc32(header))], 33
+        while at + 12 <= len(file):
+            end = at + 12 + struct.unpack_from(">I", file, at)[0]
+            if file[at + 4 : at + 8] not in (b"PLTE", b"tRNS"):
+                kept.append(file[at:end])
+            at = end
+        data = np.frombuffer(b"".join(kept), np.uint8)
+    pixels, bits = decode_picture(data), file[24]
     return pixels if pixels is None or bits not in (1, 2, 4) else pixels // (255 // (2**bits - 1))
-
-
-def _without_palette(file: bytes) -> NDArray[np.uint8]:
-    """A PNG with a palette rewritten as one whose grey levels are the indices of the palette."""
-    header = b"IHDR" + file[16:25] + bytes([GREY_TYPE]) + file[26:29]
-    kept, at = [PNG, file[8:12], header, struct.pack(">I", zlib.crc32(header))], 33
-    while at + 12 <= len(file):
-        end = at + 12 + struct.unpack_from(">I", file, at)[0]
-        if file[at + 4 : at + 8] not in (b"PLTE", b"tRNS"):
-            kept.append(file[at:end])
-        at = end
-    return np.frombuffer(b"".join(kept), np.uint8)
 
 
 class MaskFolder(MaskModel):

@@ -131,7 +131,13 @@ class Decoder:
             score = score.max(axis=1, keepdims=True)
         logits, soft = _as_logits(masks)
         flat = logits.reshape(-1, *logits.shape[-2:])
-        return Proposals(flat, score.ravel(), embedded.size, _content(embedded, flat.shape[-2:]), soft)
+        # The part of masks that covers the image: all of it, unless they have the shape of the padded frame.
+        height, width = content = float(flat.shape[-2]), float(flat.shape[-1])
+        padded, own = (abs(np.log(height / width) - np.log(s[0] / s[1])) for s in (embedded.frame, embedded.size))
+        if own > padded and content != embedded.size:
+            inner, frame = embedded.content, embedded.frame
+            content = height * inner[0] / frame[0], width * inner[1] / frame[1]
+        return Proposals(flat, score.ravel(), embedded.size, content, soft)
 
     def _feeds(self, embedded: Embedded, points: Points) -> dict[str, Array]:
         n, (height, width) = len(points), embedded.size
@@ -197,7 +203,12 @@ class SegmentAnything(MaskModel):
     def embedded(self, image: NDArray[np.uint8], deadline: Deadline) -> Embedded:
         """Embedding of an image (H, W) or (H, W, 3) BGR uint8 of any size. Raises ModelError, BudgetError."""
         height, width = image.shape[:2]
-        size = self._input_size(height, width)
+        rows, columns = self._input.size
+        size = rows or DEFAULT_SIDE, columns or DEFAULT_SIDE
+        if not (rows and columns) and self._own_pixels:
+            size = height, width
+        elif not (rows and columns) and self._channels_last:  # the graph pads by itself
+            size = _scaled((height, width), DEFAULT_SIDE / max(height, width))
         inner = _scaled((height, width), min(size[0] / height, size[1] / width)) if self._padded else size
         whole = np.zeros((*size, 3), np.float32)
         whole[: inner[0], : inner[1]] = self._normalised(to_rgb(image, inner, self.model.sidecar.channels == "bgr"))
@@ -208,17 +219,6 @@ class SegmentAnything(MaskModel):
         factor = max(frame) / max(size)
         content = (inner[0] * factor, inner[1] * factor) if self._padded else frame
         return Embedded(features, (height, width), frame, content, self._own_pixels)
-
-    def _input_size(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width of the input for an image of this size."""
-        rows, columns = self._input.size
-        if rows and columns:
-            return rows, columns
-        if self._own_pixels:
-            return height, width
-        if self._channels_last:  # the graph pads by itself
-            return _scaled((height, width), DEFAULT_SIDE / max(height, width))
-        return rows or DEFAULT_SIDE, columns or DEFAULT_SIDE
 
 
 def everything(
@@ -238,7 +238,13 @@ def everything(
         prompts: list[Points] = []
         while waiting and len(prompts) < batch():
             point = waiting.pop(0)
-            if not _is_redundant(point, prompted, found, spacing):
+            # Would a prompt there hardly find a new mask?
+            own = _innermost(point, found)
+            beside = (other for other in prompted if np.hypot(*(other - point)) <= NEIGHBOUR_SPACINGS * spacing)
+            if own is None or (
+                own.area >= SMALL_CELLS * spacing**2
+                and sum(_innermost(other, found) is own for other in beside) < SAME_MASK_NEIGHBOURS
+            ):
                 prompts.append(point)
         if prompts:
             found = without_duplicates(found + accepted_masks(propose(np.array(prompts))), NMS_IOU)
@@ -262,17 +268,6 @@ def prompt_points(size: tuple[int, int], along: int) -> Points:
     return points[order] - 0.5
 
 
-def _is_redundant(point: Points, prompted: Sequence[Points], found: Sequence[Mask], spacing: float) -> bool:
-    """Whether a prompt at the point (2,) would hardly find a new mask. prompted: prompts so far. found: their masks."""
-    own = _innermost(point, found)
-    if own is None:
-        return False
-    if own.area < SMALL_CELLS * spacing**2:
-        return True
-    beside = (other for other in prompted if np.hypot(*(other - point)) <= NEIGHBOUR_SPACINGS * spacing)
-    return sum(_innermost(other, found) is own for other in beside) >= SAME_MASK_NEIGHBOURS
-
-
 def _innermost(point: Points, masks: Iterable[Mask]) -> Mask | None:
     """The smallest mask that covers the point (2,)."""
     return min((mask for mask in masks if mask.covers(*(point + 0.5))), key=lambda mask: mask.area, default=None)
@@ -293,7 +288,7 @@ def _features(inputs: Iterable[Tensor], decoder: OnnxModel, encoder: OnnxModel) 
     found = []
     for tensor in sorted(inputs, key=lambda t: t.name not in given):
         fitting = [tensor.name] if tensor.name in given else list(given)
-        source = next((name for name in fitting if _compatible(given[name], tensor)), None)
+        source = next((name for name in fitting if _compatible(given[name].shape, tensor.shape)), None)
         if source is None and tensor.name in given:
             raise _mismatch(decoder, encoder, f"the encoder gives {given[tensor.name]}, but the decoder takes {tensor}")
         if source is None:
@@ -305,9 +300,8 @@ def _features(inputs: Iterable[Tensor], decoder: OnnxModel, encoder: OnnxModel) 
     return tuple(found)
 
 
-def _compatible(given: Tensor, taken: Tensor) -> bool:
-    sizes = zip(given.shape, taken.shape, strict=False)
-    return len(given.shape) == len(taken.shape) and all(None in (a, b) or a == b for a, b in sizes)
+def _compatible(given: Sequence[int | None], taken: Sequence[int | None]) -> bool:
+    return len(given) == len(taken) and all(None in (a, b) or a == b for a, b in zip(given, taken, strict=True))
 
 
 def _mismatch(decoder: OnnxModel, encoder: OnnxModel, problem: str) -> ModelError:
@@ -343,13 +337,3 @@ def _as_logits(masks: Array) -> tuple[NDArray[np.float32], bool]:
     soft = bool(((masks > 0) & (masks < 1)).any())
     p = np.clip(masks, 1e-6, 1 - 1e-6)  # probabilities
     return np.log(p / (1 - p)), soft
-
-
-def _content(embedded: Embedded, shape: tuple[int, ...]) -> tuple[float, float]:
-    """Part (h, w) of masks of this shape that covers the image: all of it, unless they have the shape of the padded frame."""
-    height, width = shape
-    aspect = np.log(height / width)
-    padded, own = (abs(aspect - np.log(s[0] / s[1])) for s in (embedded.frame, embedded.size))
-    if own <= padded or (height, width) == embedded.size:
-        return float(height), float(width)
-    return height * embedded.content[0] / embedded.frame[0], width * embedded.content[1] / embedded.frame[1]

@@ -153,9 +153,27 @@ class Watch(NodeClient):
     # ---- the thread, of a rig -----------------------------------------------------------------------------------------
 
     def _on_rig(self, message: Rig) -> None:
+        """Put together what was heard."""
         self._heard, self._message = time.monotonic(), message
         self._find_pairs()
-        self._show(message)
+        cameras = {camera for camera, _ in self._pairs}
+        sensors = []
+        for own in message.sensors:
+            T, C = matrix_from_transform(own.transform.transform), covariance_from_ros(own.covariance)
+            kind, moved = CAMERA if own.name in cameras else LIDAR, (own.moved_deg, own.moved_m)
+            sigma = None if C is None else worst_sigmas(at_sensor(T, C))
+            sensors.append(
+                SensorShown(own.name, kind, T, own.status, own.reason, own.usable, sigma, moved if any(moved) else None)
+            )
+        loops = tuple((own.sensors, (own.rotation_deg, own.translation_m), own.p_value, own.closes) for own in message.loops)
+        rig = RigShown(message.reference, tuple(sensors), (), loops, message.text)
+        edges = [self._edge(pair, told, rig, message) for pair, told in self._pairs.items()]
+        for own in message.edges:
+            if own.kind != KIND:
+                edge = EdgeShown(own.target, own.source, own.kind, own.status, LEVELS.get(own.status, BAD), own.reason)
+                C = covariance_from_ros(own.covariance)
+                edges.append(edge if C is None else compared(edge, matrix_from_transform(own.transform), C, rig.poses))
+        self.rig, self.version = replace(rig, edges=tuple(edges)), self.version + 1
 
     def _find_pairs(self) -> None:
         own = re.compile(re.escape(self.name) + r"/(\w+)/(\w+)/extrinsic")
@@ -234,27 +252,6 @@ class Watch(NodeClient):
                 self.version += 1
         except CalibrationError:
             return  # the node says so
-
-    def _show(self, message: Rig) -> None:
-        """Put together what was heard."""
-        cameras = {camera for camera, _ in self._pairs}
-        sensors = []
-        for own in message.sensors:
-            T, C = matrix_from_transform(own.transform.transform), covariance_from_ros(own.covariance)
-            kind, moved = CAMERA if own.name in cameras else LIDAR, (own.moved_deg, own.moved_m)
-            sigma = None if C is None else worst_sigmas(at_sensor(T, C))
-            sensors.append(
-                SensorShown(own.name, kind, T, own.status, own.reason, own.usable, sigma, moved if any(moved) else None)
-            )
-        loops = tuple((own.sensors, (own.rotation_deg, own.translation_m), own.p_value, own.closes) for own in message.loops)
-        rig = RigShown(message.reference, tuple(sensors), (), loops, message.text)
-        edges = [self._edge(pair, told, rig, message) for pair, told in self._pairs.items()]
-        for own in message.edges:
-            if own.kind != KIND:
-                edge = EdgeShown(own.target, own.source, own.kind, own.status, LEVELS.get(own.status, BAD), own.reason)
-                C = covariance_from_ros(own.covariance)
-                edges.append(edge if C is None else compared(edge, matrix_from_transform(own.transform), C, rig.poses))
-        self.rig, self.version = replace(rig, edges=tuple(edges)), self.version + 1
 
     def _edge(self, pair: Pair, told: tuple[Result, bool] | None, rig: RigShown, message: Rig) -> EdgeShown:
         if told is None:

@@ -209,13 +209,47 @@ def ellipse(covariance: Matrix, pair: tuple[int, int]) -> Matrix:
 
 def curve_plots(numbers: Numbers) -> str:
     """Six curves of the score, each about the present extrinsic in the middle, with a mark at its highest place."""
-    low, high = float(numbers.curves.min()), float(numbers.curves.max())
-    return "".join(_curve(k, numbers, low, max(high - low, FLAT)) for k in range(6))
+    low, high, made = float(numbers.curves.min()), float(numbers.curves.max()), []
+    span = max(high - low, FLAT)
+    for axis, x, y in zip(AXES, numbers.offsets, numbers.curves, strict=True):
+        u = MARGIN + (x - x[0]) / (x[-1] - x[0]) * (WIDTH - 2 * MARGIN)
+        v = HEIGHT - MARGIN - (y - low) / span * (HEIGHT - 2.2 * MARGIN)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(u, v, strict=True))
+        peak, middle = int(np.argmax(y)), WIDTH / 2
+        made.append(
+            f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="score over {axis.title}, highest at '
+            f'{x[peak]:+.2f} {axis.unit}"><line class="now" x1="{middle}" x2="{middle}" y1="{MARGIN}" y2="{HEIGHT - MARGIN}" '
+            f'stroke-dasharray="3 3"/><polyline class="curve" points="{points}"/>'
+            f'<circle cx="{u[peak]:.1f}" cy="{v[peak]:.1f}" r="3" fill="var(--accent)"/>'
+            f'<text x="{MARGIN}" y="11">{axis.title}</text><text x="{WIDTH - MARGIN}" y="11" '
+            f'text-anchor="end">best {x[peak]:+.2f} {axis.unit}</text><text x="{MARGIN}" y="{HEIGHT - 3}">{x[0]:g}</text>'
+            f'<text x="{WIDTH - MARGIN}" y="{HEIGHT - 3}" text-anchor="end">{x[-1]:+g} {axis.unit}</text></svg>'
+        )
+    return "".join(made)
 
 
 def ellipse_plots(known: Known) -> str:
     """Where the scenes put the extrinsic from here, with 95 %, for the pairs of axes that compensate each other."""
-    return "".join(_ellipse(known, pair) for pair in PAIRS)
+    made = []
+    for pair in PAIRS:
+        scale = np.array([180 / np.pi if k < 3 else 100.0 for k in pair])
+        centre = known.offset[list(pair)] * scale
+        border = ellipse(known.covariance, pair) + centre
+        least = np.array([LEAST_DEG if k < 3 else LEAST_CM for k in pair])
+        half = np.maximum(AROUND * np.abs(border).max(axis=0), least)
+        at = SIDE / 2 + border / half * (SIDE / 2 - MARGIN) * [1, -1]
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in at)
+        one, other = (AXES[k] for k in pair)
+        middle = SIDE / 2
+        made.append(
+            f'<svg class="plot" viewBox="0 0 {SIDE} {SIDE}" role="img" aria-label="{one.title} and {other.title} with 95 %">'
+            f'<line class="now" x1="{middle}" x2="{middle}" y1="{MARGIN}" y2="{SIDE - MARGIN}" stroke-dasharray="3 3"/>'
+            f'<line class="now" y1="{middle}" y2="{middle}" x1="{MARGIN}" x2="{SIDE - MARGIN}" stroke-dasharray="3 3"/>'
+            f'<polygon class="curve" points="{points}"/><text x="{middle}" y="{SIDE - 2}" text-anchor="middle">{one.title} '
+            f'±{half[0]:.2g} {one.unit}</text><text x="{middle}" y="10" text-anchor="middle">{other.title} ±{half[1]:.2g} '
+            f"{other.unit}</text></svg>"
+        )
+    return "".join(made)
 
 
 def frame_bars(scores: Matrix, shown: int) -> str:
@@ -235,39 +269,3 @@ def frame_bars(scores: Matrix, shown: int) -> str:
     line = f'<line x1="0" x2="{BAR_WIDTH}" y1="{zero:.1f}" y2="{zero:.1f}" stroke="currentColor" stroke-width=".6"/>'
     label = 'role="img" aria-label="score of each frame"'
     return f'<svg class="plot" viewBox="0 0 {BAR_WIDTH} {BARS}" {label}>{"".join(bars)}{line}</svg>'
-
-
-def _curve(k: int, numbers: Numbers, low: float, span: float) -> str:
-    axis, x, y = AXES[k], numbers.offsets[k], numbers.curves[k]
-    u = MARGIN + (x - x[0]) / (x[-1] - x[0]) * (WIDTH - 2 * MARGIN)
-    v = HEIGHT - MARGIN - (y - low) / span * (HEIGHT - 2.2 * MARGIN)
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(u, v, strict=True))
-    peak, middle = int(np.argmax(y)), WIDTH / 2
-    return (
-        f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="score over {axis.title}, highest at '
-        f'{x[peak]:+.2f} {axis.unit}"><line class="now" x1="{middle}" x2="{middle}" y1="{MARGIN}" y2="{HEIGHT - MARGIN}" '
-        f'stroke-dasharray="3 3"/><polyline class="curve" points="{points}"/><circle cx="{u[peak]:.1f}" cy="{v[peak]:.1f}" r="3" '
-        f'fill="var(--accent)"/><text x="{MARGIN}" y="11">{axis.title}</text><text x="{WIDTH - MARGIN}" y="11" '
-        f'text-anchor="end">best {x[peak]:+.2f} {axis.unit}</text><text x="{MARGIN}" y="{HEIGHT - 3}">{x[0]:g}</text>'
-        f'<text x="{WIDTH - MARGIN}" y="{HEIGHT - 3}" text-anchor="end">{x[-1]:+g} {axis.unit}</text></svg>'
-    )
-
-
-def _ellipse(known: Known, pair: tuple[int, int]) -> str:
-    scale = np.array([180 / np.pi if k < 3 else 100.0 for k in pair])
-    centre = known.offset[list(pair)] * scale
-    border = ellipse(known.covariance, pair) + centre
-    least = np.array([LEAST_DEG if k < 3 else LEAST_CM for k in pair])
-    half = np.maximum(AROUND * np.abs(border).max(axis=0), least)
-    at = SIDE / 2 + border / half * (SIDE / 2 - MARGIN) * [1, -1]
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in at)
-    one, other = (AXES[k] for k in pair)
-    middle = SIDE / 2
-    return (
-        f'<svg class="plot" viewBox="0 0 {SIDE} {SIDE}" role="img" aria-label="{one.title} and {other.title} with 95 %">'
-        f'<line class="now" x1="{middle}" x2="{middle}" y1="{MARGIN}" y2="{SIDE - MARGIN}" stroke-dasharray="3 3"/>'
-        f'<line class="now" y1="{middle}" y2="{middle}" x1="{MARGIN}" x2="{SIDE - MARGIN}" stroke-dasharray="3 3"/>'
-        f'<polygon class="curve" points="{points}"/><text x="{middle}" y="{SIDE - 2}" text-anchor="middle">{one.title} '
-        f'±{half[0]:.2g} {one.unit}</text><text x="{middle}" y="10" text-anchor="middle">{other.title} ±{half[1]:.2g} '
-        f"{other.unit}</text></svg>"
-    )

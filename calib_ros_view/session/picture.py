@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
-from calib_ros.camera import MIN_DEPTH, Camera
+from calib_ros.camera import MIN_DEPTH
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import to_gray
@@ -150,11 +149,30 @@ class FramePicture:
         self, xyz: NDArray[np.float32], T: Matrix, look: Look
     ) -> tuple[NDArray[np.int32], NDArray[np.intp], NDArray[np.float32]]:
         """Pixels (m, 2) of those points (3, n) that are drawn, their indices (m,), and depths (m,), m; far ones first."""
-        place = _Window(self.frame.camera, look.window, self.size(look))
-        uv, index, depth = place.pixels(xyz, T)
-        kept = np.flatnonzero((depth >= look.near) & (depth <= look.far))
+        P = T[:3, :3].astype(np.float32) @ xyz + T[:3, 3:].astype(np.float32)
+        camera, (scale, left, top), (width, height) = self.frame.camera, self._place(look), self.size(look)
+        if camera.is_pinhole:
+            index = np.flatnonzero(P[2] > MIN_DEPTH)
+            K, P = camera.K.astype(np.float32), P[:, index]
+            depth = P[2]
+            u, v = K[0, 0] * P[0] / depth + K[0, 2], K[1, 1] * P[1] / depth + K[1, 2]
+            inside = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
+        else:
+            index = np.arange(P.shape[1])
+            depth = np.sqrt(np.einsum("in,in->n", P, P))  # a fisheye sees to its sides
+            uv, inside = camera.project(P.T)
+            u, v = uv.T
+        with np.errstate(invalid="ignore"):
+            u, v = (u - left) * scale, (v - top) * scale
+            inside &= (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+        kept = np.flatnonzero(inside & (depth >= look.near) & (depth <= look.far))
         kept = kept[np.argsort(-depth[kept], kind="stable")]  # near points over far ones
-        return uv[kept], index[kept], depth[kept]
+        return np.rint(np.stack([u[kept], v[kept]], axis=1)).astype(np.int32), index[kept], depth[kept]
+
+    def _place(self, look: Look) -> tuple[float, float, float]:
+        """Where pixels of the image lie in the picture of its window: px of that for one, and the first column and row."""
+        (left, top, right, _), camera = look.window, self.frame.camera
+        return look.width / ((right - left) * camera.width), left * camera.width, top * camera.height
 
     def _colors(self, index: NDArray[np.intp], depth: NDArray[np.float32], look: Look) -> Image:
         """BGR (n, 3) of points."""
@@ -176,63 +194,29 @@ class FramePicture:
     def _background(self, look: Look) -> Image:
         """The image below the points, of which the window is cut out, at the size of the picture; the caller's to draw on."""
         if look.background not in self._backgrounds:
-            self._backgrounds[look.background] = _background(self.frame.image, look.background)
-        image = self._backgrounds[look.background]
-        place = _Window(self.frame.camera, look.window, self.size(look))
-        M = np.array([[1 / place.scale, 0, place.left], [0, 1 / place.scale, place.top]])
-        if place.scale == 1:
-            left, top = round(place.left), round(place.top)
-            return np.array(image[top : top + place.size[1], left : left + place.size[0]])
-        between = cv2.INTER_NEAREST if place.scale > 2 else cv2.INTER_AREA if place.scale < 0.7 else cv2.INTER_LINEAR
+            gray, own = to_gray(self.frame.image), self.frame.image
+            if look.background == "edges":
+                lines = np.maximum(cv2.Canny(gray, *CANNY), (0.25 * gray).astype(np.uint8))
+                own = np.asarray(cv2.cvtColor(lines, cv2.COLOR_GRAY2BGR), np.uint8)
+            else:
+                own = own if look.background == "colour" and own.ndim == 3 else cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+                own = np.asarray(cv2.convertScaleAbs(own, alpha=DIM), np.uint8)
+            self._backgrounds[look.background] = own
+        image, size, (scale, left, top) = self._backgrounds[look.background], self.size(look), self._place(look)
+        if scale == 1:
+            row, column = round(top), round(left)
+            return np.array(image[row : row + size[1], column : column + size[0]])
+        between = cv2.INTER_NEAREST if scale > 2 else cv2.INTER_AREA if scale < 0.7 else cv2.INTER_LINEAR
         if between == cv2.INTER_AREA and look.window == Look().window:
-            return np.asarray(cv2.resize(image, place.size, interpolation=between), np.uint8)
-        between = cv2.INTER_LINEAR if between == cv2.INTER_AREA else between
-        flags = between | cv2.WARP_INVERSE_MAP
-        return np.asarray(cv2.warpAffine(image, M, place.size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-
-
-class _Window:
-    """Where pixels of the image lie in the picture of a part of it. size: (width, height) of the picture, px."""
-
-    def __init__(self, camera: Camera, window: Sequence[float], size: tuple[int, int]) -> None:
-        left, top, right, _ = window
-        self.camera, self.size = camera, size
-        self.left, self.top = left * camera.width, top * camera.height
-        self.scale = size[0] / ((right - left) * camera.width)
-
-    def pixels(self, xyz: NDArray[np.float32], T: Matrix) -> tuple[NDArray[np.int32], NDArray[np.intp], NDArray[np.float32]]:
-        """Points (3, n) at T (4, 4) that are in the picture: pixels (m, 2), indices (m,) and depths (m,), m."""
-        P = T[:3, :3].astype(np.float32) @ xyz + T[:3, 3:].astype(np.float32)
-        camera = self.camera
-        if camera.is_pinhole:
-            index = np.flatnonzero(P[2] > MIN_DEPTH)
-            K, P = camera.K.astype(np.float32), P[:, index]
-            depth = P[2]
-            u, v = K[0, 0] * P[0] / depth + K[0, 2], K[1, 1] * P[1] / depth + K[1, 2]
-            inside = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
-        else:
-            index = np.arange(P.shape[1])
-            depth = np.sqrt(np.einsum("in,in->n", P, P))  # a fisheye sees to its sides
-            uv, inside = camera.project(P.T)
-            u, v = uv.T
-        with np.errstate(invalid="ignore"):
-            u, v = (u - self.left) * self.scale, (v - self.top) * self.scale
-            shown = np.flatnonzero(inside & (u >= 0) & (v >= 0) & (u <= self.size[0] - 1) & (v <= self.size[1] - 1))
-        return np.rint(np.stack([u[shown], v[shown]], axis=1)).astype(np.int32), index[shown], depth[shown]
+            return np.asarray(cv2.resize(image, size, interpolation=between), np.uint8)
+        flags = (cv2.INTER_LINEAR if between == cv2.INTER_AREA else between) | cv2.WARP_INVERSE_MAP
+        M = np.array([[1 / scale, 0, left], [0, 1 / scale, top]])
+        return np.asarray(cv2.warpAffine(image, M, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def encoded(picture: Image) -> bytes:
     """A picture (h, w, 3) as JPEG."""
     return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
-
-
-def _background(image: Image, kind: str) -> Image:
-    gray = to_gray(image)
-    if kind == "edges":
-        lines = cv2.Canny(gray, *CANNY)
-        return np.asarray(cv2.cvtColor(np.maximum(lines, (0.25 * gray).astype(np.uint8)), cv2.COLOR_GRAY2BGR), np.uint8)
-    shown = image if kind == "colour" and image.ndim == 3 else cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
-    return np.asarray(cv2.convertScaleAbs(shown, alpha=DIM), np.uint8)
 
 
 def _draw(picture: Image, uv: NDArray[np.int32], colors: Image, size: int, opacity: float) -> None:
@@ -263,7 +247,12 @@ def colored_cloud(
     P = se3.transform(T, xyz)
     uv, inside = frame.camera.project(P)
     visible = np.flatnonzero(inside)
-    visible = visible[~_hidden(uv[visible], np.linalg.norm(P[visible], axis=1), frame.camera.width)]
+    # Those that lie behind nearer ones of the same cell of the image are hidden.
+    depth, cell = np.linalg.norm(P[visible], axis=1), np.floor(uv[visible] * CELLS_ACROSS / frame.camera.width).astype(np.intp)
+    flat = cell[:, 1] * (CELLS_ACROSS + 1) + cell[:, 0]
+    nearest = np.full(int(flat.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(nearest, flat, depth)
+    visible = visible[depth <= BEHIND * nearest[flat] + BEHIND_M]
     rgb = np.full((len(xyz), 3), UNSEEN, np.uint8)
     u, v = np.rint(uv[visible]).astype(np.intp).T
     image = frame.image if frame.image.ndim == 3 else np.repeat(frame.image[..., None], 3, axis=2)
@@ -272,17 +261,6 @@ def colored_cloud(
     seen[visible] = True
     kept = _drawn(seen, most, np.random.default_rng(0))
     return np.ascontiguousarray(xyz[kept]), rgb[kept], seen[kept]
-
-
-def _hidden(uv: Matrix, depth: Matrix, width: int) -> NDArray[np.bool_]:
-    """Points (n,) that lie behind nearer ones of the same cell of the image."""
-    if not len(uv):
-        return np.zeros(0, bool)
-    cell = np.floor(uv * CELLS_ACROSS / width).astype(np.intp)
-    flat = cell[:, 1] * (CELLS_ACROSS + 1) + cell[:, 0]
-    nearest = np.full(int(flat.max()) + 1, np.inf)
-    np.minimum.at(nearest, flat, depth)
-    return np.asarray(depth > BEHIND * nearest[flat] + BEHIND_M)
 
 
 def _drawn(seen: NDArray[np.bool_], most: int, rng: np.random.Generator) -> NDArray[np.intp]:

@@ -105,26 +105,22 @@ class SourcePage:
                 ui.tab(name, title).on("keydown.enter", js_handler=KEEP)  # it opens the tab, and refines nothing
         with ui.tab_panels(tabs, value="move", animated=False, keep_alive=True).classes("w-full card"):
             with ui.tab_panel("move").classes("p-2"):
-                self._sliders()
+                for k, axis in enumerate(AXES):
+                    half, step = (SLIDER_DEG, 0.01) if axis.unit == "deg" else (SLIDER_CM, 0.1)
+                    self._slider(axis.title, f"{_shown(axis.keys[1])} {_shown(axis.keys[0])}", half, step, axis.unit, k)
+                    with ui.row().classes("w-full justify-between text-xs soft no-wrap"):
+                        ui.label(f"← {axis.less.removeprefix('camera ')}")
+                        ui.label(f"{axis.more.removeprefix('camera ')} →").classes("text-right")
+                if any(frame.twist is not None for frame in self._session.frames):
+                    ui.separator()
+                    self._slider("time offset", "", 1000 * MOST_TIME_OFFSET_S, 1.0, "ms", 6)
+                    ui.label("positive: points are measured later than they are stamped").classes("text-xs soft")
             with ui.tab_panel("numbers").classes("p-2"):
                 self._numbers = NumberPanel(self._session)
             with ui.tab_panel("frames").classes("p-2"):
                 self._sheet = Sheet(self._session, self._pictures, self._id, self._go_to, self._leave)
             with ui.tab_panel("scene").classes("p-0"):
                 self._scene = ScenePanel(self._session)
-
-    def _sliders(self) -> None:
-        for k, axis in enumerate(AXES):
-            half = SLIDER_DEG if axis.unit == "deg" else SLIDER_CM
-            step = 0.01 if axis.unit == "deg" else 0.1
-            self._slider(axis.title, f"{_shown(axis.keys[1])} {_shown(axis.keys[0])}", half, step, axis.unit, k)
-            with ui.row().classes("w-full justify-between text-xs soft no-wrap"):
-                ui.label(f"← {axis.less.removeprefix('camera ')}")
-                ui.label(f"{axis.more.removeprefix('camera ')} →").classes("text-right")
-        if any(frame.twist is not None for frame in self._session.frames):
-            ui.separator()
-            self._slider("time offset", "", 1000 * MOST_TIME_OFFSET_S, 1.0, "ms", 6)
-            ui.label("positive: points are measured later than they are stamped").classes("text-xs soft")
 
     def _slider(self, title: str, keys: str, half: float, step: float, unit: str, k: int) -> None:
         with ui.row().classes("w-full items-center gap-2 no-wrap"):
