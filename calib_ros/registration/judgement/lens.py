@@ -263,16 +263,17 @@ class LensEstimate:
         beyond = [_beyond(part @ best.mean, part @ best.covariance @ part.T) for part in parts]
         ratio = 0.5 * (self.freedom + 1) * float(np.log1p(max(beyond) / self.freedom))  # Student's distribution
         part = parts[int(np.argmax(beyond))]
-        # What the score hardly gains by accuses nothing: its top may be narrower than the way to it is high.
-        gains, k = self._exceeds(2 * self.gain, ACCUSED), int(np.linalg.norm(part * best.mean, axis=0).argmax())
-        # Nor does what is not shown, and only expected to be as it may be usually.
-        if gains and abs(self.change[k]) > ACCUSING * self.sigma[k] and ratio > np.log(1 / doubt - 1):
+        k = int(np.linalg.norm(part * best.mean, axis=0).argmax())
+        # What is not shown, and only expected to be as it may be usually, accuses nothing.
+        shown = abs(self.change[k]) > ACCUSING * self.sigma[k] and ratio > np.log(1 / doubt - 1)
+        # Nor does what the score hardly gains by: its top may be narrower than the way to it is high.
+        if shown and self._exceeds(2 * self.gain, ACCUSED):
             return self._wrong(k, best.mean, camera)
         if sum(off) <= OPEN_PROBABILITY:
             return None
         most = self.explanations[int(np.argmax(off))]
         k = int(np.linalg.norm(moves * most.mean, axis=0).argmax())
-        if gains and sum(off) >= 1 - doubt:
+        if sum(off) >= 1 - doubt and self._exceeds(2 * self.gain, ACCUSED):
             return self._wrong(k, most.mean, camera)
         own = self.unknowns[k]
         return left_open(own.name, own.unit * self.change[k], own.unit * self.sigma[k], min(sum(off), 1 - 1e-9), deg, m)

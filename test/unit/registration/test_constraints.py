@@ -124,7 +124,7 @@ def test_a_prior_and_a_score_are_weighed_as_two_measurements(optimizer, n):
     of_score = n / SCORE_NOISE * CURVATURE
     expected = np.linalg.solve(of_score + of_prior, of_score @ twist(OPTIMUM))
     if optimizer == "nelder_mead":
-        T, _ = nelder_mead(Bowl(), ANCHOR, 0.8, 2000, prior.value)
+        T, _ = nelder_mead(Bowl(), ANCHOR, 0.8, 2000, lambda T: prior.cost(T)[0])
     else:
         T, _ = levenberg_marquardt(Bowl(), ANCHOR, 60, prior)
     assert_twist(T, expected, 1e-3)
