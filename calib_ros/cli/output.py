@@ -99,7 +99,7 @@ def refined_words(refined: RefinedCamera) -> str:
         elif name == ASPECT:
             parts.append(f"fy against fx {change.value:+.2%}, 1 sigma {change.sigma:.2%}")
         elif name == RADIAL:
-            parts.append(f"k1 {refined.camera.D[0]:.4f} ({change.value:+.4f}, 1 sigma {change.sigma:.4f})")
+            parts.append(f"k1 {next(iter(refined.camera.D), 0.0):.4f} ({change.value:+.4f}, 1 sigma {change.sigma:.4f})")
         else:
             axis = CENTRE.index(name)
             parts.append(f"c{'xy'[axis]} {K[axis, 2]:.1f} px ({change.value:+.1f}, 1 sigma {change.sigma:.1f})")

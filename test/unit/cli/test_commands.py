@@ -399,6 +399,9 @@ def test_refined_intrinsics_are_written_as_camera_info(
     # What reads such files understands it, down to the last bit.
     shutil.copy(out, folder / "calibration.yaml")
     assert open_dataset(folder).camera == refined.camera
+    exact = vehicle(tmp_path / "exact", street[:4], camera)  # without any distortion
+    code, text, _ = run(capsys, "calibrate", str(exact), *quick, *options[:-2], "--intrinsics", "refine")
+    assert (code, "k1 0.0000 (+0.0000" in text) == (0, True), text
 
 
 @pytest.mark.parametrize(

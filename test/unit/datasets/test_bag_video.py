@@ -21,8 +21,6 @@ from calib_ros.datasets.bag_video import BagVideo
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.messages.video import FORMER_DEFINITION
 
-KEYS = 10
-
 
 @pytest.fixture(scope="module")
 def pictures() -> list[np.ndarray]:

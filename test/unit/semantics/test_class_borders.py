@@ -29,7 +29,6 @@ from calib_ros_thesis.features import CLASS_EDGE_SHARE, semantic_share
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
 
 SIZE = (60, 80)
-TWO = np.array([C.BUILDING, C.SKY], np.uint8)
 
 
 def split(left: int, right: int, at: int = 40, size: tuple[int, int] = SIZE) -> np.ndarray:
