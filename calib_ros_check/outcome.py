@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import datetime, timezone
@@ -38,9 +39,7 @@ class CauseState(Enum):
 @dataclass(frozen=True)
 class Tolerance:
     """The error up to which an extrinsic is right: of its rotation, deg, and of its translation, m (eq. 2.19).
-
-    Raises BadInputError for values that are not positive.
-    """
+    Raises BadInputError for values that are not positive."""
 
     deg: float = 0.5
     m: float = 0.1
@@ -89,12 +88,12 @@ class CauseFinding:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
-class AsJson:
+class AsJson(ABC):
     """What is written as JSON."""
 
+    @abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
-        raise NotImplementedError
 
     def dumps(self) -> str:
         """JSON."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -39,7 +40,7 @@ class StudyReport:
     facts: Mapping[str, str] = field(default_factory=dict)
 
 
-class Study:
+class Study(ABC):
     """What is done with the sources of an evaluation."""
 
     @property
@@ -47,13 +48,13 @@ class Study:
         """What the answers depend on beside sources, configuration and code."""
         return {}
 
+    @abstractmethod
     def jobs(self, setup: Setup, summaries: Sequence[SourceSummary]) -> list[EvaluationJob]:
         """All there is to do, in the order of the report. BadInputError for sources that do not fit the study."""
-        raise NotImplementedError
 
+    @abstractmethod
     def report(self, setup: Setup, planned: Sequence[EvaluationJob], answers: Answers) -> StudyReport:
         """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any, Protocol
@@ -140,7 +141,7 @@ def prior_covariance(T: Transform, sigma_deg: float, sigma_m: float) -> Covarian
     return np.asarray(to_twist * variances @ to_twist.T)
 
 
-class DescribedRig:
+class DescribedRig(ABC):
     """A recording by a description of its sensors, as of `RigSource`; of one LiDAR, unless it is said otherwise."""
 
     def __init__(self, name: str, description: RigDescription) -> None:
@@ -150,9 +151,9 @@ class DescribedRig:
         self._recent = Recent(KEPT_CLOUDS)
         self._pairs: dict[tuple[str, str], Any] = {}
 
+    @abstractmethod
     def open_pair(self, camera: Sensor, lidar: Sensor) -> Any:
         """The source of a pair, when it is asked for first."""
-        raise NotImplementedError
 
     def lidar_of(self, name: str) -> str | None:
         """The LiDAR that the reference of a sensor's source is to; None if that is not said."""

@@ -61,7 +61,6 @@ OUTLIER_ROUNDS = 3  # an outlier frame may hide another
 # Causes that a corrected camera may mend; of others, it would only be another wrong one.
 OF_LENSES = (Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.NOT_RECTIFIED, Cause.ALREADY_RECTIFIED)
 CAMERA_ROUNDS = 3  # after two, changes are those by which pictures differ that are rectified a fraction of a pixel apart
-
 WITH_90_PERCENT = 1.645  # standard deviations that a normal error exceeds in one of ten cases
 
 # Semantic consistency: share of the null distribution that meets the classes better, and standard deviations above its mean. Of

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -38,7 +39,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Method:
+class Method(ABC):
     """A method as it was published: a score of the extrinsic and how it is maximised.
 
     All get the same frames, rectified and with the points moved to the image's moment, and know how far off the start may be.
@@ -64,20 +65,18 @@ class Method:
             self._last[:] = [FeatureExtractor(camera, self.own_config)]
         return self._last[0]
 
+    @abstractmethod
     def features(self, frame: Frame) -> Any:
         """What the method keeps of a frame; does not depend on the extrinsic. CalibrationError if there is nothing to keep."""
-        raise NotImplementedError
 
+    @abstractmethod
     def score(self, features: Sequence[Any], T_prior: Matrix) -> Score:
         """What is maximised over these frames of one camera. T_prior: (4, 4), near; points far outside its image may be left out.
+        CalibrationError if too little falls into the image."""
 
-        CalibrationError if too little falls into the image.
-        """
-        raise NotImplementedError
-
+    @abstractmethod
     def optimise(self, features: Sequence[Any], T: Matrix, reach: SearchBox) -> Outcome:
         """Calibrate from T_camera_lidar (4, 4). reach: how far off that may be, per axis."""
-        raise NotImplementedError
 
 
 @dataclass(eq=False)

@@ -63,10 +63,8 @@ def learnt(spinner: Spinner, T: np.ndarray = FORWARD, config: MotionConfig | Non
 @dataclass
 class Drive:
     """Streams of a scanner and a camera, 30 s, and the pairs that a synchronizer makes of them. Times in ms after T0.
-
     phase: of the camera, s after the scan's start; None: when the scanner faces its view. jitter: half width of the images'
-    moments, ms.
-    """
+    moments, ms."""
 
     spinner: Spinner
     camera_period: float = 0.1

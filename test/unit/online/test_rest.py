@@ -36,9 +36,7 @@ CONFIG = Config.from_dict(
 
 class Parade:
     """The frames of a drive over and over again, as seen by a camera that may be turned a little.
-
-    estimates: data times, s, at which one was made. keyframes: the same of keyframes.
-    """
+    estimates: data times, s, at which one was made. keyframes: the same of keyframes."""
 
     def __init__(self, frames: list[Frame], start: np.ndarray, **changes: object) -> None:
         self.frames = frames

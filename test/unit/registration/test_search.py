@@ -25,7 +25,7 @@ from calib_ros.registration.score.chance import p_value
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 from calib_ros.registration.search.parallel import Workers, cpu_time
-from calib_ros.registration.search.search import FRUITLESS_ROUNDS, SearchResult, search
+from calib_ros.registration.search.search import FRUITLESS_ROUNDS, HOPELESS_ROUNDS, SearchResult, search
 
 SMALL = SearchConfig(starts=32, rounds=8)
 RANKED, LARGE = SearchConfig(starts=1024, rounds=2), SearchBox(6, 0.4)  # so large that starts are ranked first
@@ -65,7 +65,7 @@ def test_starts_that_agree_end_the_search_and_are_counted(scene, monkeypatch, fe
     assert rounds[0] < rounds[1] < rounds[2] < 50
 
 
-def test_starts_that_agree_on_what_may_be_chance_end_the_search_after_some_rounds(scene, monkeypatch, few_followed):
+def test_a_search_ends_where_starts_agree_on_what_may_be_chance_or_the_decoy_is_as_good(scene, monkeypatch, few_followed):
     monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", 1)
     clear = found(scene, FAR, SearchBox(5, 0.3))
     assert clear.rounds < FRUITLESS_ROUNDS
@@ -73,6 +73,8 @@ def test_starts_that_agree_on_what_may_be_chance_end_the_search_after_some_round
     assert unclear.rounds == FRUITLESS_ROUNDS
     monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", 1000)
     assert found(scene, FAR, SearchBox(5, 0.3)).rounds == SMALL.rounds
+    mirrored = FastScore(scene.features[:2], start := scene.off(FAR), ScoreConfig(), 0.9).mirrored()
+    assert search(mirrored, start, SearchBox(5, 0.3), SMALL, unlimited(start), ACCEPTED).rounds == HOPELESS_ROUNDS
 
 
 def test_the_decoy_is_searched_only_in_doubt(scene):
