@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +51,22 @@ def write_atomically(path: str | Path, data: bytes) -> None:
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+class AsJson(ABC):
+    """What is written as JSON."""
+
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+
+    def dumps(self) -> str:
+        """JSON."""
+        return json.dumps(self.to_dict(), indent=1) + "\n"
+
+    def save(self, path: str | Path) -> None:
+        """Write JSON atomically. BadInputError if the folder cannot be written."""
+        write_atomically(path, self.dumps().encode())
 
 
 def check_output(path: str | Path, option: str) -> None:

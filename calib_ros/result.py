@@ -19,7 +19,7 @@ from calib_ros import io, se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
-from calib_ros.io import write_atomically
+from calib_ros.io import AsJson, write_atomically
 from calib_ros.version import __version__
 
 VERSION = __version__
@@ -33,57 +33,63 @@ MOVED = "moved"  # the calibration has moved; it is searched anew
 BLINDED = "blinded"  # a sensor shows nothing: covered lens, frozen image, empty cloud
 
 CONSUMERS_SIGMAS = 2.0  # an error is within so many standard deviations with 95 %
+# What several troubles have in common, see Trouble.
+INTRINSICS = "calibrate the camera's intrinsics, or have them refined"
+FRAMES, WIDER = "--frames {frames}", "--search-deg {deg:g} --search-m {m:g}"
+CLOCKS, LOOK = "--time-offset {seconds:.3g}", "check exposure, topics and stamps"
 
 
-class RefusalCode(Enum):
-    """Why an estimate is refused or insufficient; ``Result.reason`` says it in words."""
+class Trouble(Enum):
+    """What may be wrong: the one table of what terminal, pages and messages say of it.
 
-    TOO_FEW_FEATURES = "too_few_features"  # status insufficient: too few points or edges, or no classes for a first guess
-    WORSE_THAN_START = "worse_than_start"
-    TOO_FAR_FROM_START = "too_far_from_start"
-    LOW_SCORE = "low_score"
-    NOT_SIGNIFICANT = "not_significant"
-    TOO_UNCERTAIN = "too_uncertain"
-    OBJECTIVES_DISAGREE = "objectives_disagree"
-    WRONG_INTRINSICS = "wrong_intrinsics"
-    WRONG_TIMES = "wrong_times"
+    words: what it is. advice: what to do. options: of `calib-ros` that do it, with fields for figures; "" where none do.
+    """
 
+    words: str
+    advice: str
+    options: str
 
-_INTRINSICS = "calibrate the camera's intrinsics anew, or have them refined"
-
-
-class Cause(Enum):
-    """What is wrong besides the mount, where the frames show it; the simplest first."""
-
-    TIME_OFFSET = "time_offset", "clocks apart", "mend the time stamps of the drivers"
-    FOCAL_LENGTH = "focal_length", "wrong focal length", _INTRINSICS  # or fx against fy
-    PRINCIPAL_POINT = "principal_point", "wrong principal point", _INTRINSICS
-    OTHER_CAMERA = "other_camera", "another camera's CameraInfo", "give K and D of this camera for this image size"
-    NOT_RECTIFIED = (
-        "not_rectified",
-        "distorted image called rectified",
-        "take the rectified topic, or the CameraInfo of the raw one",
-    )
-    ALREADY_RECTIFIED = "already_rectified", "rectified image called distorted", "set image_is_rectified: true"
-    MIRRORED_IMAGE = "mirrored_image", "mirrored image", "switch the mirroring of the images off in the driver"
-    ROTATED_IMAGE = "rotated_image", "turned image", "turn the images back, or mend the driver's rotation"
-    INVERSE_TRANSFORM = "inverse_transform", "transform the wrong way round", "invert the transform"
-    BODY_FRAME = (
-        "body_frame",
-        "camera_link instead of the optical frame",
-        "give the transform of the optical frame",
-    )  # or vice versa
-    QUATERNION_ORDER = "quaternion_order", "quaternion in another order", "give the quaternion as (x, y, z, w)"
-    CLOUD_FRAME = "cloud_frame", "points in another frame", "publish the points in the scanner's frame"
-
-    words: str  # for people
-    advice: str  # what to do
-
-    def __new__(cls, value: str, words: str, advice: str) -> Cause:
+    def __new__(cls, value: str, words: str, advice: str, options: str = "") -> Trouble:
         """A member by its value in files and messages."""
         own = object.__new__(cls)
-        own._value_, own.words, own.advice = value, words, advice
+        own._value_, own.words, own.advice, own.options = value, words, advice, options
         return own
+
+    def __str__(self) -> str:
+        """The first part of a reason; figures follow."""
+        return f"{self.words}: {self.advice}"
+
+
+class RefusalCode(Trouble):
+    """Why an estimate is refused or insufficient. ``Result.reason`` begins with its words, or with those of the cause."""
+
+    # status insufficient: too few points or edges, or no classes for a first guess
+    TOO_FEW_FEATURES = "too_few_features", "too little to see", "give frames with objects in view of both sensors", FRAMES
+    WORSE_THAN_START = "worse_than_start", "no better extrinsic found", "check the start: it may be right as it is"
+    TOO_FAR_FROM_START = "too_far_from_start", "the search is too narrow", "widen the search", WIDER
+    LOW_SCORE = "low_score", "nothing in the image where the LiDAR sees edges", LOOK, WIDER
+    NOT_SIGNIFICANT = "not_significant", "the optimum may be chance", "use more scenes, or widen the search", WIDER
+    TOO_UNCERTAIN = "too_uncertain", "these scenes leave the extrinsic open", "add frames of other scenes", FRAMES
+    OBJECTIVES_DISAGREE = "objectives_disagree", "two forms of the score disagree", "start nearer", "--objective fast"
+    WRONG_INTRINSICS = "wrong_intrinsics", "wrong intrinsics", "check K and D in camera_info"
+    WRONG_TIMES = "wrong_times", "wrong times", "synchronise the clocks"
+
+
+class Cause(Trouble):
+    """What is wrong besides the mount, where the frames show it; the simplest first."""
+
+    TIME_OFFSET = "time_offset", "clocks apart", "mend the time stamps, or set motion.time_offset_s", CLOCKS
+    FOCAL_LENGTH = "focal_length", "wrong focal length", INTRINSICS, "--intrinsics refine"  # or fx against fy
+    PRINCIPAL_POINT = "principal_point", "wrong principal point", INTRINSICS, "--intrinsics refine"
+    OTHER_CAMERA = "other_camera", "another camera's CameraInfo", "give K and D of this camera for this image size"
+    NOT_RECTIFIED = "not_rectified", "distorted image called rectified", "take the rectified topic, or the raw CameraInfo"
+    ALREADY_RECTIFIED = "already_rectified", "rectified image called distorted", "set image_is_rectified: true", "--rectified"
+    MIRRORED_IMAGE = "mirrored_image", "mirrored image", "flip it, or switch the driver's mirroring off"
+    ROTATED_IMAGE = "rotated_image", "turned image", "turn it back, or mend the driver's rotation"
+    INVERSE_TRANSFORM = "inverse_transform", "transform the wrong way round", "invert it"
+    BODY_FRAME = "body_frame", "camera_link taken for the optical frame", "give the transform of the optical frame"
+    QUATERNION_ORDER = "quaternion_order", "quaternion in another order", "give it as (x, y, z, w)"
+    CLOUD_FRAME = "cloud_frame", "points in another frame", "publish them in the scanner's frame"
 
 
 class InitialSource(Enum):
@@ -126,7 +132,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
+class Result(AsJson):
     """An estimate of the extrinsic, or an initial extrinsic in the same form.
 
     What is None, NaN or empty is unknown or does not apply. * : not part of the file format.
@@ -136,7 +142,8 @@ class Result:
     T_camera_lidar : (4, 4), from the LiDAR's into the camera's optical frame. Where the estimate is not to be used, the start.
     status : ``converged``, ``refused`` (the optimum is not to be used), ``insufficient`` (too little seen to estimate anything),
         ``initial``, or one of the online recalibrator's: ``tentative``, ``suspect``, ``moved``, ``blinded``.
-    reason : for people, one line: why it is refused, and what else there is to know.
+    reason : for people, one line of parts between semicolons: what is wrong and what to do, at most 100 characters; then figures,
+        and what else there is to know.
     score : value of the objective at the optimum, also of a refused one. initial_score : at the start.
     covariance : (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m, for who projects with the camera as it is
         stated: a principal point that is off looks like a rotation, and together with it projects alike.
@@ -215,6 +222,11 @@ class Result:
         """True if the estimate is to be used."""
         return self.status == CONVERGED
 
+    @property
+    def trouble(self) -> Trouble | None:
+        """What a refused or insufficient one suffers from, if it is known."""
+        return self.cause or self.refusal
+
     def to_dict(self) -> dict[str, Any]:
         """The result format of docs/result.md: plain numbers, lists and strings; NaN becomes null."""
         T, error = self.T_camera_lidar, self.reference_error
@@ -255,7 +267,7 @@ class Result:
         """JSON, or YAML on request."""
         if yaml_format:
             return str(yaml.safe_dump(self.to_dict(), sort_keys=False))
-        return json.dumps(self.to_dict(), indent=1) + "\n"
+        return super().dumps()
 
     def save(self, path: str | Path) -> None:
         """Write atomically; YAML if the name ends so, else JSON. BadInputError if the folder cannot be written."""

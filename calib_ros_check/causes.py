@@ -14,7 +14,7 @@ from calib_ros.intrinsics import CENTRE
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.judgement.hypotheses import MIXED_UP, Hypothesis, distorts
 from calib_ros.registration.judgement.lens import LensEstimate
-from calib_ros.registration.judgement.refusal import Refusal
+from calib_ros.registration.judgement.refusal import Refusal, stamped
 from calib_ros.result import Cause, RefusalCode, Result
 from calib_ros_check.outcome import CauseFinding, CauseState, Tolerance
 
@@ -25,9 +25,7 @@ OFF = "the extrinsic is off"
 SIGNIFICANT_SIGMAS = 3.0  # of an offset of the clocks: a right extrinsic must hardly ever fail by one
 REPORTED_SIGMAS = 2.0  # of the interval in a message
 PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
-KNOW_CLOCKS = (
-    "drive at changing speeds and through turns, or, if it is known, state motion.time_offset_s with motion.time_offset: fixed"
-)
+KNOW_CLOCKS = "drive at changing speeds and through turns, or state motion.time_offset_s with motion.time_offset: fixed"
 
 
 def clock_finding(
@@ -38,11 +36,10 @@ def clock_finding(
     seconds: offset that was found, as a change of motion.time_offset_s.
     """
     cause = Cause.TIME_OFFSET
-    late = "images are stamped late, or scans early" if seconds > 0 else "images are stamped early, or scans late"
-    advice = f"synchronise the clocks, or set motion.time_offset_s to {config.time_offset_s + seconds:.4g}"
+    mended = f"{stamped(seconds)}; motion.time_offset_s would be {config.time_offset_s + seconds:.4g}"
     ms = f"{1000 * abs(seconds):.0f} ms"
     if result.refusal is RefusalCode.WRONG_TIMES:
-        return CauseFinding(cause, CauseState.FOUND, f"the clocks are about {ms} apart: {late}; {advice}", {"seconds": seconds})
+        return CauseFinding(cause, CauseState.FOUND, f"{cause}; by about {ms}: {mended}", {"seconds": seconds})
     if result.time_offset_s is None or result.time_offset_sigma_s is None:
         if config.time_offset != ESTIMATE:
             return CauseFinding(cause, CauseState.NOT_JUDGED, "the clocks are taken as stated (motion.time_offset: fixed)")
@@ -56,7 +53,7 @@ def clock_finding(
     shift = float(np.linalg.norm(twists[:, 3:], axis=1).max()) * abs(seconds)
     if abs(seconds) > SIGNIFICANT_SIGMAS * sigma and (np.rad2deg(turn) > tolerance.deg or shift > tolerance.m):
         moves = f"points are off by up to {np.rad2deg(turn):.1f} deg and {100 * shift:.0f} cm"
-        message = f"the clocks are {ms} apart (+- {1000 * REPORTED_SIGMAS * sigma:.0f} ms), so that {moves}: {late}; {advice}"
+        message = f"{cause}; by {ms} (+- {1000 * REPORTED_SIGMAS * sigma:.0f} ms), so that {moves}: {mended}"
         return CauseFinding(cause, CauseState.FOUND, message, values)
     message = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * REPORTED_SIGMAS * sigma:.1f} ms"
     return CauseFinding(cause, CauseState.EXCLUDED, message, values)

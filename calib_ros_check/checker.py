@@ -59,7 +59,7 @@ FAR = SearchBox(25.0, 0.75)
 CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
 NOT_JUDGED = "one scene does not tell, nor do unrolled pictures of wide lenses"
 NOT_THE_CLOCKS = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
-NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
+NOTHING_MATCHES = "nothing matches beyond chance, near or far"
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class Checker:
             why = NOTHING_MATCHES if features else "no frame can be used"
             causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
             known = {"tolerance": inputs.tolerance, "T_checked": inputs.T, "T_estimated": None, "covariance": None}
-            result = CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)
+            result = CheckResult(**vars(unknown()) | known, reason=f"{why}: {MORE_FRAMES}", causes=causes)
         return replace(
             result,
             frame_names=tuple(f.name or str(k) for k, f in enumerate(features)),

@@ -5,17 +5,17 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from calib_ros.cli.inputs import configuration
-from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
+from calib_ros.cli.output import again, check_json, first_lines, more_frames, note, print_or_save, progress_bar
 from calib_ros.datasets.folder import is_folder_rig
 from calib_ros.datasets.source import selected
 from calib_ros.errors import BadInputError
-from calib_ros.result import VERSION
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.result import VERSION, Cause
 from calib_ros.rig.description import read_rig
 from calib_ros_check.fleet.check import check_fleet
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
@@ -23,7 +23,7 @@ from calib_ros_check.fleet.history import ERROR
 from calib_ros_check.fleet.page import change_size
 from calib_ros_check.fleet.recordings import is_fleet
 from calib_ros_check.outcome import CauseState, CheckResult, CheckVerdict, Tolerance
-from calib_ros_check.recording import Checked, CheckOptions, check_source
+from calib_ros_check.recording import TF, Checked, CheckOptions, check_source
 from calib_ros_check.report import check_report, write_report, write_rig_check
 from calib_ros_check.rig.check import RigCheck, check_recording
 
@@ -34,9 +34,8 @@ SHOWN = 20  # changes, and errors, that are printed; all are in the tables
 def options_of(args: argparse.Namespace) -> CheckOptions:
     """How to check, as given on the command line. BadInputError for a tolerance out of range."""
     as_given = ("extrinsic", "camera", "image_topic", "points_topic", "camera_info_topic", "clock", "incomplete", "rectified")
-    options = CheckOptions(**{name: getattr(args, name) for name in as_given}, config=configuration(args.config))
-    tolerance = Tolerance(args.tolerance_deg, args.tolerance_m)
-    return replace(options, tolerance=tolerance, frames=args.frames or "", rig=args.rig or "")
+    given = {name: getattr(args, name) for name in as_given} | {"frames": args.frames or "", "rig": args.rig or ""}
+    return CheckOptions(**given, config=configuration(args.config), tolerance=Tolerance(args.tolerance_deg, args.tolerance_m))
 
 
 def is_one(sources: Sequence[str], rig: str | None) -> bool:
@@ -57,7 +56,8 @@ def check_one(args: argparse.Namespace) -> int:
     if args.rig is None:
         with progress_bar("reading ") as reading, progress_bar("checking") as step:
             checked = check_source(args.source[0], options, reading, lambda stage, share: step(share), note)
-        found, text, write = checked.result, summary(checked), partial(write_report, checked=checked)
+        text = summary(checked, next_command(args, checked))
+        found, write = checked.result, partial(write_report, checked=checked)
     else:
         with progress_bar("checking") as step:
             found = check_recording(args.source[0], options, lambda text, share: step(share))
@@ -68,17 +68,33 @@ def check_one(args: argparse.Namespace) -> int:
     return EXIT[found.verdict]
 
 
-def summary(checked: Checked) -> str:
-    """What `calib-ros check` prints."""
+def next_command(args: argparse.Namespace, checked: Checked) -> tuple[str, str]:
+    """By which what is wrong is mended, or more is found out, see `again`; empty where none does."""
+    result, cause, given = checked.result, checked.result.cause, args.given
+    if result.verdict is not CheckVerdict.FAIL:
+        is_open = result.verdict is CheckVerdict.INCONCLUSIVE
+        return again(given, more_frames(len(checked.frames), checked.in_all) if is_open else "")
+    if cause is Cause.NOT_RECTIFIED and checked.frames[0].camera.said_rectified:
+        return again(given, "--no-rectified")
+    if cause is Cause.ALREADY_RECTIFIED or (cause is not None and not cause.options):
+        return again(given, cause.options, "" if cause.options else "view")
+    start = "reference" if args.extrinsic == TF else shlex.quote(args.extrinsic)
+    start = "nominal" if result.rotation.error > SearchBox.MAX_DEG else start
+    seconds = next((own.values["seconds"] for own in result.causes if own.cause is cause and "seconds" in own.values), 0.0)
+    options = "" if cause is None else cause.options.format(seconds=checked.config.motion.time_offset_s + seconds)
+    return again(given, f"--initial {start} {options}".strip(), "calibrate")
+
+
+def summary(checked: Checked, command: tuple[str, str] = ("", "")) -> str:
+    """What `calib-ros check` prints. command: of `again`."""
     result = checked.result
-    lines = [f"{result.verdict.value}: {result.reason}"]
-    lines += [f"  {axis.name}  {axis.verdict.value:<12}  {axis.words}" for axis in result.axes]
+    lines = first_lines(result.verdict.value, result.reason, command)
+    lines += [f"{axis.name}  {axis.verdict.value:<12}  {axis.words}" for axis in result.axes]
     # What the frames do not tell. A cause that was found is the reason of the verdict.
     untold = [own for own in result.causes if own.state is CauseState.NOT_JUDGED and result.T_estimated is not None]
-    lines += [f"  {finding.cause.value}: {finding.message}" for finding in untold]
-    lines += [f"  {line}" for line in result.notes]
-    lines.append(f"  {result.frames_used} of {len(result.frame_names)} frames, {result.cpu_s:.1f} s of CPU")
-    return "\n".join(lines)
+    lines += [f"{finding.cause.value}: {finding.message}" for finding in untold]
+    last = f"{result.frames_used} of {len(result.frame_names)} frames, {result.cpu_s:.1f} s of CPU"
+    return "\n  ".join([*lines, *result.notes, last])
 
 
 def rig_summary(found: RigCheck) -> str:

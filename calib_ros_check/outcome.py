@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import datetime, timezone
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.errors import BadInputError
-from calib_ros.io import write_atomically
+from calib_ros.io import AsJson
 from calib_ros.result import VERSION, Cause
 
 
@@ -86,22 +83,6 @@ class CauseFinding:
     state: CauseState
     message: str
     values: Mapping[str, float] = field(default_factory=dict)
-
-
-class AsJson(ABC):
-    """What is written as JSON."""
-
-    @abstractmethod
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-
-    def dumps(self) -> str:
-        """JSON."""
-        return json.dumps(self.to_dict(), indent=1) + "\n"
-
-    def save(self, path: str | Path) -> None:
-        """Write JSON atomically. BadInputError if the folder cannot be written."""
-        write_atomically(path, self.dumps().encode())
 
 
 @dataclass(frozen=True, eq=False)

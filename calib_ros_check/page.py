@@ -12,6 +12,7 @@ import yaml
 from calib_ros.config import Config
 from calib_ros.errors import MissingDependencyError
 from calib_ros.io import write_atomically
+from calib_ros.registration.judgement.refusal import lines_of
 
 # Strings, so that they are installed with the code whatever installs it.
 # The colours of all pages. Blue, amber and purple stay apart for all kinds of colour vision, on both papers.
@@ -116,14 +117,15 @@ PAGE = (
 
 def page_template(template: str, **filters: Callable[..., Any]) -> Any:
     """Jinja template that fills the blocks style, contents and main of the page; rendered with command, title, facts and
-    configuration. filters: by name, beside base64. MissingDependencyError without Jinja2."""
+    configuration. filters: by name, beside base64 and lines, of a reason. MissingDependencyError without Jinja2."""
     try:
         from jinja2 import DictLoader, Environment, StrictUndefined
     except ImportError:
         raise MissingDependencyError("the page needs Jinja2: pip install jinja2, or apt install python3-jinja2") from None
     loader = DictLoader({"base": PAGE, "page": '{% extends "base" %}\n' + template})
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=loader)
-    environment.filters |= {"base64": lambda data: base64.b64encode(data).decode(), **filters}
+    own = {"base64": lambda data: base64.b64encode(data).decode(), "lines": lambda reason: "\n".join(lines_of(reason))}
+    environment.filters |= {**own, **filters}
     return environment.get_template("page")
 
 

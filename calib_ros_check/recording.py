@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from calib_ros import result
 from calib_ros.arrays import Transform
+from calib_ros.cli.inputs import bag_options
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.capture import RESULT, capture_config, is_capture
@@ -51,12 +51,13 @@ class CheckOptions:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A check with what it was made of, to be drawn. source: name of the recording. config: by which it was checked."""
+    """A check with what it was made of. source: name of the recording, of `in_all` frames. config: by which it was checked."""
 
     result: CheckResult
     frames: Sequence[Frame]
     source: str
     config: Config
+    in_all: int
 
 
 def check_source(
@@ -86,7 +87,7 @@ def check_source(
         camera_frame=source.camera_frame,
         lidar_frame=source.lidar_frame,
     )
-    return Checked(found, frames, source.name, options.config)
+    return Checked(found, frames, source.name, options.config, len(source))
 
 
 def positions_of(source: Source, options: CheckOptions) -> list[int]:
@@ -115,9 +116,7 @@ def extrinsic_of(source: Source, path: str, extrinsic: str, frame: Frame | None 
 
 def opened(path: str, options: CheckOptions) -> Source:
     """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
-    names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
-    given: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name)}
-    given |= {} if options.rectified is None else {"rectified": options.rectified}
+    given = bag_options(options)
     captured = is_capture(Path(path).expanduser())
     if captured or is_bag(Path(path).expanduser()):
         given |= {"motion": options.config.motion, "tolerance_s": options.config.online.pair_tolerance_s}

@@ -40,7 +40,7 @@ QUALITY = 85  # of JPEG
 STYLE = """\
 .verdict { display: inline-block; padding: .25rem .9rem; border-radius: 6px; color: #fff; font-weight: 700; font-size: 1.2rem; }
 .pass { background: #0072b2; } .fail { background: #a3246e; } .inconclusive { background: #8a5000; }
-.said { font-size: 1.05rem; margin: .8rem 0 1.2rem; overflow-wrap: anywhere; }
+.said { font-size: 1.05rem; margin: .8rem 0 1.2rem; overflow-wrap: anywhere; white-space: pre-line; }
 td.pass, td.fail, td.inconclusive { background: none; font-weight: 600; }
 td.pass { color: var(--good); } td.fail { color: var(--bad); } td.inconclusive { color: var(--doubtful); }
 td.words { white-space: normal; min-width: 13rem; }
@@ -111,7 +111,7 @@ its median, and where it lies with 95 %. Shaded: the tolerance, {{ facts.toleran
 {% if verdict %}
 <p><span class="verdict {{ verdict }}">{{ verdict }}</span></p>
 {% endif %}
-<p class="said">{{ said }}</p>
+<p class="said">{{ said|lines }}</p>
 {% if rig %}
 <p class="intro">{{ legend|safe }}</p>
 <div class="rig">

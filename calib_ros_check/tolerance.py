@@ -19,6 +19,7 @@ from scipy.stats import chi2
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.registration.judgement.judge import CONFIDENCE, EVEN, Match, convinces, evidence, log_odds
+from calib_ros.registration.judgement.refusal import joined
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.registration.search.optimizers import LEVELS, NEAR_LEVELS, POINTS, TOLERANCE_DEG, refined
 from calib_ros_check.outcome import CauseFinding, CheckVerdict, Deviation, Tolerance
@@ -32,13 +33,14 @@ QUANTILES = (np.arange(8) + 0.5) / 8  # of the variances that make up Student's 
 ACCUSATION = 0.01  # largest probability that what is accused is right
 INTERVAL = 0.95
 NEAREST_ROUNDS = 50  # of the fixed point
-MORE_FRAMES = "use more frames of other scenes, with objects in view of both sensors"
-# By axis: what a positive and what a negative error means. A positive rotation about y, which points down, moves all points to
-# the right in the image: the camera is taken to look further left than it does.
+MORE_FRAMES = "use more frames of other scenes"
+FLIPPED_DEG = 135.0  # an error above it is nearer to the opposite direction than to a quarter turn, as cameras are mounted
+# By axis: what a positive and what a negative error means, and one above FLIPPED_DEG. A positive rotation about y, which points
+# down, moves all points to the right in the image: the camera is taken to look further left than it does.
 DIRECTIONS = {
-    "rx": ("camera looks {} too far down", "camera looks {} too far up"),
-    "ry": ("camera looks {} too far left", "camera looks {} too far right"),
-    "rz": ("camera is rolled {} too far anticlockwise", "camera is rolled {} too far clockwise"),
+    "rx": ("camera looks {} too far down", "camera looks {} too far up", "camera looks backwards, turned over by {}"),
+    "ry": ("camera looks {} too far left", "camera looks {} too far right", "camera looks backwards, turned by {}"),
+    "rz": ("camera is rolled {} too far anticlockwise", "camera is rolled {} too far clockwise", "camera is upside down, by {}"),
     "tx": ("camera is {} too far left of the LiDAR", "camera is {} too far right of the LiDAR"),
     "ty": ("camera is {} too far above the LiDAR", "camera is {} too far below the LiDAR"),
     "tz": ("camera is {} too far behind the LiDAR", "camera is {} too far in front of the LiDAR"),
@@ -184,7 +186,8 @@ def _deviation(name: str, samples: Matrix, limit: float, unit: float, shown: boo
     elif low <= 0 <= high:
         words = f"between {signed(low, is_angle)} and {signed(high, is_angle)}"
     else:
-        way, spread = DIRECTIONS[name][int(error < 0)], amount(max(high - error, error - low), is_angle)
+        spread, flipped = amount(max(high - error, error - low), is_angle), is_angle and abs(error) > FLIPPED_DEG
+        way = DIRECTIONS[name][2 if flipped else int(error < 0)]
         words = f"{way.format(amount(error, is_angle))} (+- {spread})"
     return Deviation(name, verdict, error, low, high, words)
 
@@ -192,19 +195,19 @@ def _deviation(name: str, samples: Matrix, limit: float, unit: float, shown: boo
 def reason_of(
     judgement: Judgement, tolerance: Tolerance, cause: CauseFinding | None, possible: Sequence[CauseFinding] = ()
 ) -> str:
-    """The verdict in one line, for people."""
+    """The verdict for people, as of `Result`: what is wrong, then figures."""
     if cause is not None:
-        return f"{cause.message}; {_THEN[judgement.verdict].format(limits=tolerance, sizes=judgement.sizes)}"
+        return joined([cause.message, _THEN[judgement.verdict].format(limits=tolerance, sizes=judgement.sizes)])
     if judgement.verdict is CheckVerdict.PASS:
-        return f"right to within {tolerance}: {judgement.sizes}"
+        return joined([f"right to within {tolerance}", judgement.sizes])
     # The axes that fail, or else those that are inconclusive; the largest first.
     by_verdict = ([own for own in judgement.axes if own.verdict is v] for v in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE))
     worst = sorted(next(filter(None, by_verdict), []), key=lambda own: -abs(own.error) * (1.0 if own.name[0] == "r" else 5.0))
     if judgement.verdict is CheckVerdict.FAIL:
-        axes = "; ".join(own.words for own in worst) or judgement.sizes
-        return "; ".join([f"{axes}: more than {tolerance}", *(f"or else {own.message}" for own in possible)])
+        axes = [own.words for own in worst] or [judgement.sizes]
+        return joined([*axes, f"more than {tolerance}", *(f"or else {own.message}" for own in possible)])
     names = ", ".join(f"{own.name} {own.words}" for own in worst) or judgement.sizes
-    return f"the scenes do not tell it to within {tolerance}: {names}; {MORE_FRAMES}"
+    return joined([f"not known to within {tolerance}: {MORE_FRAMES}", names])
 
 
 def amount(value: float, is_angle: bool) -> str:

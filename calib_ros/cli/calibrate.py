@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import shlex
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from itertools import pairwise
@@ -13,7 +15,7 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.arrays import Transform
 from calib_ros.cli.inputs import initial_extrinsic, require_classes, search_box
-from calib_ros.cli.output import motion, note, progress_bar
+from calib_ros.cli.output import again, more_frames, motion, note, progress_bar
 from calib_ros.config import Config, update
 from calib_ros.datasets.source import Source, WithMotion, frame_positions, neighbours
 from calib_ros.errors import BadInputError, CalibrationError
@@ -24,8 +26,8 @@ from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, GUESSES, MOTION, nominal_start
-from calib_ros.registration.search.constraints import NOMINAL_BOX, Axes
-from calib_ros.result import Extrinsic, RefusalCode, Result
+from calib_ros.registration.search.constraints import NOMINAL_BOX, Axes, SearchBox
+from calib_ros.result import FRAMES, Cause, Extrinsic, RefusalCode, Result
 
 
 def calibrate(
@@ -79,11 +81,27 @@ def calibrate(
     return result
 
 
-def advice(result: Result, source: Source, config: Config, initial: str = "") -> str:
-    """What to do about an estimate from `initial`, in a line: start where the recording says, or add frames where those given
-    leave a direction open; "" where neither is missing."""
-    if not result.converged and initial == "nominal" and source.reference is not None:
-        return "start from the extrinsic that the recording has: --initial reference"
+def next_command(result: Result, source: Source, config: Config, args: argparse.Namespace) -> tuple[str, str]:
+    """By which what is wrong with an estimate may be mended, or be looked at, see `again`; empty where none does."""
+    wrong, initial = result.trouble, args.initial
+    if result.converged or wrong is None:
+        return "", ""
+    if wrong is RefusalCode.WORSE_THAN_START and initial not in ("nominal", *GUESSES):
+        return again(args.given, f"--extrinsic {shlex.quote(initial)}", "check")
+    if initial == "nominal" and source.reference is not None and result.cause is None:
+        return again(args.given, "--initial reference")
+    if wrong is Cause.NOT_RECTIFIED and source.camera.said_rectified:
+        return again(args.given, "--no-rectified")
+    if wrong.options == FRAMES:
+        return again(args.given, more_frames(len(result.frame_names), len(source)))
+    box, seconds = search_box(initial, config, args.search_deg, args.search_m), result.refusal_figures.get("seconds", 0.0)
+    figures = {"deg": min(2 * max(box.reach[0], 1.0), SearchBox.MAX_DEG), "m": min(2 * max(box.reach[1], 0.1), SearchBox.MAX_M)}
+    options = wrong.options.format(**figures, seconds=config.motion.time_offset_s + seconds)
+    return again(args.given, options, "" if options else "view")
+
+
+def advice(result: Result, source: Source, config: Config) -> str:
+    """What to do about an estimate, in a line: add frames where those given leave a direction open; "" where none do."""
     lacking = need(result, config) if result.refusal is RefusalCode.TOO_UNCERTAIN else None
     if lacking is None:
         return ""

@@ -155,7 +155,7 @@ def open_named_source(args: argparse.Namespace, config: Config | None = None) ->
     return source
 
 
-def bag_options(args: argparse.Namespace) -> dict[str, Any]:
+def bag_options(args: Any) -> dict[str, Any]:
     """What the command line says of a bag: its topics, clock, whether images are rectified and parts may be missing."""
     names = ("image_topic", "points_topic", "camera_info_topic", "clock", "incomplete")
     given = {name: getattr(args, name) for name in names if getattr(args, name)}

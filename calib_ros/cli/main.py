@@ -78,7 +78,7 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    from calib_ros.cli.calibrate import advice, calibrate
+    from calib_ros.cli.calibrate import advice, calibrate, next_command
     from calib_ros.cli.inputs import configuration, constraint_options, initial_of, open_named_source
     from calib_ros.cli.output import check_json, note, print_or_save, summary
     from calib_ros.config.sensors import REFINE
@@ -101,7 +101,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         note(f"calib-ros: the recording has cameras {names}; --camera chooses one, calib-ros rig estimates all together")
     limits = args.search_deg, args.search_m
     result = calibrate(source, args.frames, args.initial, args.yaw_deg, config, *limits, args.overlay)
-    print_or_save(result, summary(result, advice(result, source, config, args.initial)), args.json)
+    text = summary(result, advice(result, source, config), command=next_command(result, source, config, args))
+    print_or_save(result, text, args.json)
     if args.camera_info is not None and result.converged and result.refined_camera is not None:
         write_atomically(args.camera_info, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())
     elif args.camera_info is not None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,17 @@ from calib_ros.config import MotionConfig
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
-from calib_ros.io import check_output
+from calib_ros.io import AsJson, check_output
 from calib_ros.lidar.deskew import used_twist
 from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.judgement.refusal import lines_of, stamped
 from calib_ros.result import Result
+
+LINE, MANY_FRAMES = 100, 20  # characters; frames of a source that are enough
+FLAGS = ("--rectified", "--no-rectified", "--incomplete", "--rotation-only")  # options without a value
+WRITES = ("--json", "--overlay", "--report", "--camera-info")
+TOPICS = ("--image-topic", "--points-topic", "--camera-info-topic")
+OF_SOURCE = ("--camera", *TOPICS, "--clock", "--rectified", "--no-rectified", "--incomplete", "--frames", "--config")
 
 
 def describe(source: Source) -> str:
@@ -55,12 +62,46 @@ def motion(frames: Sequence[Frame], config: MotionConfig) -> str:
     return f"points stay where they were measured, the vehicle's velocity is not known{unused}"
 
 
-def summary(result: Result, advice: str = "", scan_period_s: float = MotionConfig.scan_period_s) -> str:
-    """What `calib-ros calibrate` prints. advice: what to add. scan_period_s: see ``motion.scan_period_s``."""
+def again(given: Sequence[str], options: str, command: str = "") -> tuple[str, str]:
+    """The command line that was given, without what it writes, with these options instead of its own, or another command about
+    the same source: in short, and whole. Empty where there is nothing to change."""
+    words, kept, rest = shlex.split(options), [command or given[0]], list(given[1:])
+    if not words and not command:
+        return "", ""
+    while rest:
+        word = rest.pop(0)
+        name, is_option = word.partition("=")[0], word.startswith("--")
+        own = [word] if "=" in word or not is_option or name in FLAGS or not rest else [word, rest.pop(0)]
+        dropped = name in (*words, *WRITES) or (command and is_option and name not in OF_SOURCE)
+        kept += [] if dropped else own
+    return f"calib-ros {kept[0]} ... {options}" if words else "", shlex.join(["calib-ros", *kept, *words])
+
+
+def more_frames(used: int, of_all: int) -> str:
+    """The option for some more frames of a source; "" if it has none."""
+    if used >= min(of_all, MANY_FRAMES):
+        return ""
+    return "--frames all" if of_all <= MANY_FRAMES else f"--frames 0:{of_all}:{-(-of_all // MANY_FRAMES)}"
+
+
+def first_lines(status: str, reason: str, command: tuple[str, str] = ("", "")) -> list[str]:
+    """A status with its reason: in a line what is wrong and what to do, by a command if there is room for it; then the command
+    whole, and the rest of the reason, a part a line. command: of `again`."""
+    (first, *rest), (short, whole) = lines_of(reason) or [""], command
+    wrong = f"{status}: {first.partition(': ')[0]}: "
+    told = next((own for own in (whole, short) if short and len(wrong + own) <= LINE), "")
+    line = wrong + told if told else ": ".join(filter(None, [status, first]))
+    return [line, *([f"next: {whole}"] if whole not in ("", told) else []), *rest]
+
+
+def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", "")) -> str:
+    """What `calib-ros calibrate` prints. advice: what to add. command: of `again`."""
     score = f"score {result.score:.3f}, " if np.isfinite(result.score) else ""
-    lines = [f"{result.status}: {result.frames_used} frames, {score}{result.elapsed_s:.1f} s"]
-    if result.reason:
-        lines.append(result.reason)
+    figures = f"{result.frames_used} frames, {score}{result.elapsed_s:.1f} s"
+    if result.converged:
+        lines = [f"{result.status}: {figures}", *lines_of(result.reason)]
+    else:
+        lines = [*first_lines(result.status, result.reason, command), figures]
     if advice:
         lines.append(f"advice: {advice}")
     kept = "" if result.converged else ", the start"
@@ -72,7 +113,7 @@ def summary(result: Result, advice: str = "", scan_period_s: float = MotionConfi
     if result.refined_camera is not None:
         lines.append(refined_words(result.refined_camera))
     if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
-        lines.append(_clocks(result, scan_period_s))
+        lines.append(_clocks(result))
     if result.initial is not None and result.converged:
         deg, m = se3.error(result.initial, result.T_camera_lidar)
         lines.append(f"moved {deg:.2f} deg, {100 * m:.1f} cm from the initial extrinsic")
@@ -106,19 +147,18 @@ def refined_words(refined: RefinedCamera) -> str:
     return f"refined intrinsics: {', '.join(parts)}; the extrinsic belongs to them"
 
 
-def _clocks(result: Result, scan_period_s: float) -> str:
+def _clocks(result: Result) -> str:
     """What the time offset is, and what to do about it if there clearly is one."""
     seconds, sigma_s = result.time_offset_s or 0.0, result.time_offset_sigma_s or 0.0
     text = f"time offset {1000 * seconds:+.1f} ms, 1 sigma {1000 * sigma_s:.1f} ms"
     if result.stamping is not None:
         from calib_ros.registration.joint import convention
 
-        found, left = convention(result.stamping, seconds, scan_period_s)
+        found, left = convention(result.stamping, seconds, MotionConfig.scan_period_s)
         return f"{text}; scans are stamped otherwise than configured: set {found}, motion.time_offset_s: {left:.4f}"
     if abs(seconds) <= 2 * sigma_s:
         return text
-    late = "images are stamped late, or scans early" if seconds > 0 else "images are stamped early, or scans late"
-    return f"{text}: {late}; set motion.time_offset_s: {seconds:.4f} wherever this extrinsic is used, or mend the driver"
+    return f"{text}: {stamped(seconds)}; set motion.time_offset_s: {seconds:.4f} for this extrinsic, or mend the driver"
 
 
 def _details(result: Result) -> list[str]:
@@ -143,13 +183,8 @@ def _details(result: Result) -> list[str]:
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[..., None]]:
     """A progress bar on a terminal, nothing in a pipe; yields a function of the work done and the total (default 1)."""
-    with tqdm(
-        total=1.0,
-        desc=label,
-        disable=not sys.stderr.isatty(),
-        bar_format="{desc} {bar} {percentage:3.0f}% {elapsed}",
-        leave=False,
-    ) as bar:
+    form = "{desc} {bar} {percentage:3.0f}% {elapsed}"
+    with tqdm(total=1.0, desc=label, disable=not sys.stderr.isatty(), bar_format=form, leave=False) as bar:
 
         def step(done: float, total: float = 1.0) -> None:
             bar.n = done / total
@@ -158,21 +193,13 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
         yield step
 
 
-class Savable(Protocol):
-    """A result that JSON can hold."""
-
-    def dumps(self) -> str: ...
-
-    def save(self, path: str) -> None: ...
-
-
 def check_json(path: str | None) -> None:
     """BadInputError, before the work, for what --json names and cannot be written. "-": standard output."""
     if path is not None and path != "-":
         check_output(path, "--json")
 
 
-def print_or_save(result: Savable, text: str, path: str | None) -> None:
+def print_or_save(result: AsJson, text: str, path: str | None) -> None:
     """What a command has found: as JSON in a file, if one is named, and in words on standard output; "-": JSON on standard
     output, and the words on the standard error. Neither a full disk nor a closed pipe takes the other one."""
     try:

@@ -35,16 +35,7 @@ EDGE_PX = 1.0  # edges of scan and image are placed within a pixel of the image 
 STRUCTURE = "poles, buildings or parked cars"
 LYING = "horizontal edges", "parked cars, low walls, kerbs"
 STANDING = "vertical edges", "poles, trunks, corners of buildings"
-FAULTS = {
-    SensorFault.CAMERA_BLIND: "clean or uncover the camera, or give it light",
-    SensorFault.IMAGE_FROZEN: "restart the camera or its driver: the image stands still",
-    SensorFault.LIDAR_BLIND: "clean or uncover the LiDAR",
-}
-# Refusals for which other scenes are no cure, and what is.
-CURES = {
-    RefusalCode.LOW_SCORE: "check the camera's exposure and focus, the topics and the time stamps",
-    RefusalCode.TOO_FAR_FROM_START: "widen the search, or give a better initial extrinsic",
-}
+NO_SCENES = (RefusalCode.LOW_SCORE, RefusalCode.TOO_FAR_FROM_START)  # for which other scenes are no cure
 IF_RAW = "set image_is_rectified: false if straight lines are bent in the images"
 
 
@@ -196,7 +187,7 @@ def _text(result: Result, config: Config, counted: Counted, lacking: Need | None
     status, missing, needed = result.status, counted.missing, config.online.min_keyframes
     weak = "" if lacking is None else words(lacking, camera, result.T_camera_lidar, "drive past")
     if status == BLINDED:
-        return FAULTS[counted.fault] if counted.fault else "", False
+        return counted.fault.advice if counted.fault else "", False
     if status == SUSPECT:
         return "keep driving: the newest keyframes decide whether the extrinsic still holds", False
     if counted.keyframes < needed and lacking is None:
@@ -206,8 +197,8 @@ def _text(result: Result, config: Config, counted: Counted, lacking: Need | None
     if result.cause is not None:
         raw = result.refusal is RefusalCode.WRONG_INTRINSICS and camera.said_rectified
         return f"{IF_RAW}, else {result.cause.advice}" if raw else result.cause.advice, False
-    if result.refusal in CURES:
-        return CURES[result.refusal], False
+    if result.refusal is not None and result.refusal in NO_SCENES:
+        return result.refusal.advice, False
     if config.online.mode == MANUAL and status != TENTATIVE:
         return f"{weak}; then call ~/calibrate" if weak else "call ~/calibrate", False
     if weak:

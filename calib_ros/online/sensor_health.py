@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from enum import Enum
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.frame import Frame, PointCloud
+from calib_ros.result import Trouble
 
 SHRINK_FACTOR = 8  # px that make one: noise of a dark image averages out, houses and cars stay
 HISTORY = 100  # frames whose median is the usual value
@@ -24,12 +24,12 @@ FROZEN_IMAGES = 5  # identical ones in a row while the scans change: a driver th
 SOME_ROWS = 16  # one row in so many tells most images apart
 
 
-class SensorFault(Enum):
+class SensorFault(Trouble):
     """What is wrong with a sensor."""
 
-    CAMERA_BLIND = "camera blind"
-    IMAGE_FROZEN = "image frozen"
-    LIDAR_BLIND = "lidar blind"
+    CAMERA_BLIND = "camera blind", "the camera shows nothing", "clean or uncover the camera, or give it light"
+    IMAGE_FROZEN = "image frozen", "the image stands still while scans change", "restart the camera or its driver"
+    LIDAR_BLIND = "lidar blind", "the LiDAR shows nothing", "clean or uncover the LiDAR, or check its driver"
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,11 @@ class SensorProblem:
 
     fault: SensorFault
     message: str = field(compare=False)
+
+    @classmethod
+    def of(cls, fault: SensorFault, figures: str) -> SensorProblem:
+        """With the usual message."""
+        return cls(fault, f"{fault.words} ({figures}): {fault.advice}")
 
 
 class SensorHealth:
@@ -75,14 +80,9 @@ class SensorHealth:
             self._contrasts.clear()
         elif contrast < MIN_CONTRAST or self._low_contrast:
             figures = f"contrast {contrast:.1f}" + (f", usually {usual:.1f}" if usual else "")
-            message = f"the camera shows nothing ({figures}): a covered lens, no light, or overexposed; check lens and exposure"
-            return SensorProblem(SensorFault.CAMERA_BLIND, message)
+            return SensorProblem.of(SensorFault.CAMERA_BLIND, figures)
         self._contrasts.append(contrast)
-        if not frozen:
-            return None
-        n = self._repeated_images
-        message = f"the image has not changed for {n} frames while the scans do: restart the camera driver"
-        return SensorProblem(SensorFault.IMAGE_FROZEN, message)
+        return SensorProblem.of(SensorFault.IMAGE_FROZEN, f"{self._repeated_images} frames") if frozen else None
 
     def _is_frozen(self, frame: Frame) -> bool:
         points = frame.cloud.xyz[:: max(len(frame.cloud) // COMPARED_POINTS, 1)]
@@ -105,7 +105,6 @@ class SensorHealth:
             self._returns.clear()
         elif returns == 0 or self._few_returns:
             figures = (f"{returns}" if returns else "no") + " returns" + (f", usually {usual:.0f}" if usual else "")
-            message = f"the LiDAR shows nothing ({figures}): a covered or failing scanner; check window and driver"
-            return SensorProblem(SensorFault.LIDAR_BLIND, message)
+            return SensorProblem.of(SensorFault.LIDAR_BLIND, figures)
         self._returns.append(returns)
         return None

@@ -344,8 +344,9 @@ class Calibrator:
         if found is None or is_only_off(found, refine.tolerance_deg, refine.tolerance_m):
             return result
         figures = {**result.refusal_figures, "z_score_mended": found.z_score}
-        reason = f"{found.hypothesis.message} (with that mended they match, z-score {found.z_score:.1f})"
-        return replace(result, reason=joined([reason, *notes]), cause=found.hypothesis.cause, refusal_figures=figures)
+        cause, mended = found.hypothesis.cause, f"with that mended they match, z-score {found.z_score:.1f}"
+        reason = joined([found.hypothesis.message, mended, *notes])
+        return replace(result, reason=reason, cause=cause, refusal_figures=figures)
 
     def pictures_of(self, used: Sequence[Used]) -> AsTaken:
         """The features of frames (those with these numbers, None = all), had another camera taken them."""

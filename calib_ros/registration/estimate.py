@@ -26,18 +26,14 @@ from calib_ros.registration.joint import Optimised, estimates_offset
 from calib_ros.registration.judgement.clocks import Effect, offset_effect, refuse_clocks, with_known_motion
 from calib_ros.registration.judgement.lens import LensEstimate
 from calib_ros.registration.judgement.refusal import (
+    BUT_FOR_PRIOR,
     KEPT,
     LEFT_OUT,
     NO_INTENSITY,
     ONE_FRAME,
     Refusal,
     joined,
-    low_score,
-    not_significant,
-    objectives_disagree,
-    too_far_from_start,
-    too_uncertain,
-    worse_than_start,
+    refused,
     wrong_times,
 )
 from calib_ros.registration.objective import Objective, penalised, trust_region
@@ -176,7 +172,8 @@ class Estimate:
 
 def insufficient(error: CalibrationError, initial: Transform, frames: int, notes: Sequence[str] = ()) -> Result:
     """The Result where the frames show too little to estimate anything."""
-    reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
+    code = RefusalCode.TOO_FEW_FEATURES
+    reason = joined([str(code), str(error), *notes])
     return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)
 
 
@@ -284,7 +281,9 @@ def refusal_of(found: Estimate, config: Config, camera: Camera, searched: bool, 
     led to it."""
     objective, T, start, limits = found.optimised.objective, found.T, found.start, found.optimised.objective.constraints.limits
     if penalised(objective, T) < penalised(objective, start):
-        return worse_than_start(objective.value(T), objective.value(start))
+        scores = {"score": objective.value(T), "initial_score": objective.value(start)}
+        why = BUT_FOR_PRIOR if scores["score"] >= scores["initial_score"] else ""
+        return refused(RefusalCode.WORSE_THAN_START, why, **scores)
     wrong = _check_intrinsics_and_clocks(found, config, camera, searched)
     if wrong is not None:
         return wrong
@@ -293,8 +292,9 @@ def refusal_of(found: Estimate, config: Config, camera: Camera, searched: bool, 
     if region is not None:
         moved = np.abs(se3.log(reached @ se3.inverse(region.T)))
         if (moved >= NEARLY * region.half)[limits.open_axes].any():
-            off = se3.error(found.initial, reached)
-            return too_far_from_start(*off, float(np.rad2deg(region.half[0])), float(region.half[3]))
+            deg, m = se3.error(found.initial, reached)
+            reach = {"max_rotation_deg": np.rad2deg(region.half[0]), "max_translation_m": region.half[3]}
+            return refused(RefusalCode.TOO_FAR_FROM_START, rotation_deg=deg, translation_m=m, **reach)
     wrong = _check_match(found, config.refine.max_p_value)
     # Only of a search: a refinement has a start to rely on, and is fused with it. What intrinsics and clocks leave open is
     # not asked: more scenes would not help.
@@ -304,7 +304,7 @@ def refusal_of(found: Estimate, config: Config, camera: Camera, searched: bool, 
         # If the edges, begun at the optimum of another objective, end far away, one of the two is wrong.
         deg, m = se3.error(T, objective.edges.optimise(T, False, progress))
         if not (deg <= objective.agreement[0] and m <= objective.agreement[1]):
-            return objectives_disagree(deg, m)
+            return refused(RefusalCode.OBJECTIVES_DISAGREE, rotation_deg=deg, translation_m=m)
     return wrong
 
 
@@ -318,9 +318,11 @@ def _check_match(found: Estimate, largest: float) -> Refusal | None:
         return None
     score, decoy_z = found.optimised.objective.edges.score.at(-1).value(T), evidence.decoy_z_score
     if not score > 0:  # that of the mean of the maps; less, or NaN, is of an image that shows nothing
-        return low_score(score)
-    decoy_z = HIGHEST_DECOY_Z if decoy_z is None else decoy_z
-    return not_significant(evidence.z_score, decoy_z, evidence.p_value, largest * ratio, ratio < 1)
+        return refused(RefusalCode.LOW_SCORE, score=score)
+    classes = "few labelled points meet pixels of their class there" if ratio < 1 else ""
+    figures = {"z_score": evidence.z_score, "decoy_z": HIGHEST_DECOY_Z if decoy_z is None else decoy_z}
+    figures |= {"p_value": evidence.p_value, "largest": largest * ratio, "inconsistent": ratio < 1}
+    return refused(RefusalCode.NOT_SIGNIFICANT, classes, **figures)
 
 
 def _check_intrinsics_and_clocks(found: Estimate, config: Config, camera: Camera, searched: bool) -> Refusal | None:
@@ -381,7 +383,8 @@ def check_uncertainty(covariance: Covariance, tolerance_deg: float, tolerance_m:
     limits = largest_sigmas(tolerance_deg, tolerance_m)
     if max(np.rad2deg(np.linalg.norm(sigma[:3])) / limits[0], np.linalg.norm(sigma[3:]) / limits[1]) <= np.sqrt(3):
         return None
-    return too_uncertain(unobservable_directions(covariance, *limits), tolerance_deg, tolerance_m)
+    told = ", ".join(map(str, unobservable_directions(covariance, *limits)[:2])) + " (standard deviations)"
+    return refused(RefusalCode.TOO_UNCERTAIN, told, tolerance_deg=tolerance_deg, tolerance_m=tolerance_m)
 
 
 def semantic_likelihood_ratio(consistency: PointScore | None, T: Transform) -> float:

@@ -16,6 +16,7 @@ from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import RefineConfig
 from calib_ros.errors import BadInputError
+from calib_ros.io import AsJson
 from calib_ros.result import CONSUMERS_SIGMAS, CONVERGED, INSUFFICIENT, REFUSED, VERSION, Consumer
 from calib_ros.rig.description import RigDescription
 from calib_ros.rig.edges import Measurement, RigMeasurer
@@ -28,7 +29,7 @@ WRITABLE = (*export.DESCRIPTIONS, *export.AUTOWARE)
 
 
 @dataclass(frozen=True, eq=False)
-class RigReport:
+class RigReport(AsJson):
     """The result of a rig.
 
     frames: of TF, by the sensors' names. cameras: intrinsics. truth: T_reference_sensor (4, 4) as the recording states it, as far
@@ -165,14 +166,6 @@ class RigReport:
             **{"time_offset_s": edge and edge.time_offset_s, "time_offset_sigma_s": edge and edge.time_sigma_s},
             "frames_used": edge.samples if edge else 0,
         }
-
-    def dumps(self) -> str:
-        """JSON."""
-        return json.dumps(self.to_dict(), indent=1) + "\n"
-
-    def save(self, path: str) -> None:
-        """Write JSON atomically. BadInputError if the folder cannot be written."""
-        io.write_atomically(path, self.dumps().encode())
 
     def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
         """Caption, column names and rows: sensors, edges, loops."""

@@ -104,7 +104,7 @@ in blue the mean between changes; a dashed line where it changed. Hollow: outlie
 <h3>{{ vehicle.name }}</h3>
 {% if certificate %}
 <p><span class="verdict {{ certificate.verdict }}">{{ certificate.verdict }}</span></p>
-<p class="said">{{ certificate.reason }}</p>
+<p class="said">{{ certificate.reason|lines }}</p>
 {% endif %}
 {% if rows %}
 """

@@ -14,6 +14,7 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.datasets.open import open_rig
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
+from calib_ros.io import AsJson
 from calib_ros.registration.judgement.judge import CONFIDENCE
 from calib_ros.result import VERSION, Cause
 from calib_ros.rig.description import MAX_SIGMA_DEG, MAX_SIGMA_M, RigDescription, prior_covariance, read_rig
@@ -22,7 +23,7 @@ from calib_ros.rig.graph import SIGNIFICANCE, Edge, RigSolution, solve
 from calib_ros.rig.moved import CLOCK, MOVED, NOTHING, RigHypothesis, hypotheses, verdict
 from calib_ros.rig.report import load, loop_dict
 from calib_ros_check.checker import Checker
-from calib_ros_check.outcome import AsJson, CheckResult, CheckVerdict, Tolerance, plain
+from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance, plain
 from calib_ros_check.recording import FRAMES, REFERENCE, TF, CheckOptions
 from calib_ros_check.tolerance import INTERVAL, MORE_FRAMES, Judgement, judge, unknown
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from calib_ros.arrays import Matrix
+from calib_ros.registration.judgement.refusal import joined, lines_of
 from calib_ros_check.rig.shown import BAD, DOUBTFUL, GOOD, NEUTRAL
 from calib_ros_check.tolerance import TITLES
 from calib_ros_view.node.calls import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Answer, NodeClient
@@ -40,7 +41,7 @@ CSS = """
 .live .strip { height: 22px; border-radius: 6px; width: 100%; background-clip: padding-box; background-repeat: no-repeat;
   cursor: crosshair; border: 1px solid var(--line); }
 .live .tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(190px, 1fr)); gap: 10px; width: 100%; }
-.live .large { grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); }
+.live .soft { white-space: pre-line; } .live .large { grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); }
 .live .tiles figure { margin: 0; } .live figcaption { font-size: .75rem; color: var(--soft); font-variant-numeric: tabular-nums; }
 .live .tiles img { width: 100%; border-radius: 6px; display: block; background: var(--line); min-height: 2.5rem; }
 .live .tiles a { color: var(--accent); } .live figcaption a { display: inline-block; margin-right: .8em; }
@@ -134,8 +135,7 @@ def said_of(watch: NodeClient, now: float) -> Said:
     own = state.result.reason.strip(" :;")
     for sign in ":;":  # the badge says the status already
         problem = problem.removeprefix(f"{state.result.status}{sign} ")
-    told, cause = problem if own in problem else "; ".join(filter(None, [own, problem])), state.result.cause
-    reason = told if cause is None else f"{cause.words}: {told}"
+    reason = "\n".join(lines_of(problem if own in problem else joined([own, problem])))
     status, usable = state.result.status, "usable" if state.usable else "not usable"
     return Said(status, COLOURS.get(status, LEVEL_COLOURS[state.level]), usable, state.words, reason, state.advice)
 

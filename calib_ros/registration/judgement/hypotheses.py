@@ -22,7 +22,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.lens import LENSES, PERSPECTIVE
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.judgement.refusal import AS_RAW
+from calib_ros.registration.judgement.refusal import AS_RAW, joined
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.result import Cause
 
@@ -34,7 +34,6 @@ MIXED_UP = (*OF_TRANSFORM, *OF_PICTURE)
 _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 # Turns of the picture about the optical axis, clockwise.
 _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 90 deg anticlockwise"}
-_TURNED = "the image is {}; turn it back, or mend the driver's rotation"
 PLACES, SAME_PLACE_M = 3, 0.1  # of the scanner in its clouds: how many are tried, and how far they are apart
 # Of an image to this one, as pictures are resized; between them the lens is refined.
 SIZES = (0.25, 1 / 3, 0.4, 0.5, 0.6, 2 / 3, 0.75, 0.8, 5 / 6, 0.9, 10 / 9, 1.2, 1.25, 4 / 3, 1.5, 5 / 3, 2.0, 2.5, 3.0, 4.0)
@@ -44,16 +43,13 @@ BARREL = (-0.3, -0.15, 0.15, 0.3, 0.45)
 NEAR_FOCALS = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # of a fisheye, whose pictures are unrolled otherwise for each
 LEAST_DISTORTION = 1e-9  # coefficient of an ideal fisheye: with none at all, a camera is a pinhole
 STARTS, ROUNDS, SAME_K = 12, 40, 0.01  # of the search for a raw picture's K, and how well it has to fit, as a share of fx
-INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
-ALREADY_RECTIFIED = "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
-_MOVED = f"{ALREADY_RECTIFIED}; set image_is_rectified (--rectified)"
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """A guess of what is wrong.
 
-    message: for people, what is wrong and how to mend it. T: T_camera_lidar (4, 4) that is right if it holds. mirrored: the
+    told: for people, beside the words of the cause. T: T_camera_lidar (4, 4) that is right if it holds. mirrored: the
     picture is mirrored left to right. lens: change of the focal length, as a share, and of the principal point, as shares of the
     image width. barrel: displacement at the corner that the picture has, a share of the radius, towards its centre. camera: that
     took the picture, by which it has to be rectified anew. usual: T is where the sensors of most vehicles nearly are: an optimum
@@ -61,13 +57,18 @@ class Hypothesis:
     """
 
     cause: Cause
-    message: str
+    told: str
     T: Transform
     mirrored: bool = False
     lens: tuple[float, float, float] = (0.0, 0.0, 0.0)
     barrel: float = 0.0
     camera: Camera | None = None
     usual: bool = False
+
+    @property
+    def message(self) -> str:
+        """For people, what is wrong and how to mend it."""
+        return joined([str(self.cause), self.told])
 
     @property
     def of_lens(self) -> bool:
@@ -89,40 +90,28 @@ class Hypothesis:
 def transforms(T: Transform) -> Iterator[Hypothesis]:
     """The extrinsic T (4, 4) is another transform than it is said to be; the simplest first."""
     inverse = se3.inverse(T)
-    what = "the transform is given the wrong way round: it is T_lidar_camera where T_camera_lidar is expected; invert it"
-    yield Hypothesis(Cause.INVERSE_TRANSFORM, what, inverse)
-    body = (
-        "the transform is that of the camera's body frame (camera_link: x forward, z up) instead of its optical frame "
-        "(x right, z forward)"
-    )
-    to_optical = "add the rotation between the two, quaternion (-0.5, 0.5, -0.5, 0.5)"
-    yield Hypothesis(Cause.BODY_FRAME, f"{body}; {to_optical}", _BODY @ T)
-    yield Hypothesis(
-        Cause.BODY_FRAME, f"{body}, and the wrong way round (T_lidar_link); invert it, and {to_optical}", _BODY @ inverse
-    )
+    yield Hypothesis(Cause.INVERSE_TRANSFORM, "it is T_lidar_camera where T_camera_lidar is expected", inverse)
+    body = "it is that of the camera's body frame (camera_link: x forward, z up); add the rotation (-0.5, 0.5, -0.5, 0.5)"
+    yield Hypothesis(Cause.BODY_FRAME, body, _BODY @ T)
+    yield Hypothesis(Cause.BODY_FRAME, f"{body}, and invert it, which is T_lidar_link", _BODY @ inverse)
     twice = "the rotation from the camera's body frame to its optical frame is applied twice; leave one out"
     yield Hypothesis(Cause.BODY_FRAME, twice, se3.inverse(_BODY) @ T)
     yield Hypothesis(Cause.BODY_FRAME, f"{twice}, and invert the transform", se3.inverse(_BODY) @ inverse)
     quaternion = se3.quaternion_from_rotation(T[:3, :3])
-    for how, shift in (
-        ("is given with w first, and was read as (x, y, z, w)", -1),
-        ("was read with w first, but is (x, y, z, w)", 1),
-    ):
+    for how, shift in (("it has w first, and was read as x, y, z, w", -1), ("it was read with w first, but is x, y, z, w", 1)):
         R = se3.rotation_from_quaternion(np.roll(quaternion, shift))
-        what = f"the quaternion of the transform {how}; mend its order"
-        yield Hypothesis(Cause.QUATERNION_ORDER, what, se3.from_parts(R, T[:3, 3]))
+        yield Hypothesis(Cause.QUATERNION_ORDER, how, se3.from_parts(R, T[:3, 3]))
 
 
 def pictures(T: Transform, camera: Camera) -> Iterator[Hypothesis]:
     """The image is mirrored or turned. Flipped, its principal point moves to the right, and downward."""
     (_, _, cx), (_, _, cy) = camera.K[:2].tolist()
     right, down = (camera.width - 1 - 2 * cx) / camera.width, (camera.height - 1 - 2 * cy) / camera.width
-    mirrored = "the image is mirrored left to right; flip it, or switch the driver's mirroring off"
-    yield Hypothesis(Cause.MIRRORED_IMAGE, mirrored, T, mirrored=True, lens=(0.0, right, 0.0))
+    yield Hypothesis(Cause.MIRRORED_IMAGE, "it is mirrored left to right", T, mirrored=True, lens=(0.0, right, 0.0))
     for deg, how in _TURNS.items():
         lens = (0.0, right, down) if deg == 180 else (0.0, 0.0, 0.0)
-        yield Hypothesis(Cause.ROTATED_IMAGE, _TURNED.format(how), _turned(T, deg), lens=lens)
-    flipped = "the image is mirrored upside down; flip it, or switch the driver's mirroring off"
+        yield Hypothesis(Cause.ROTATED_IMAGE, f"it is {how}", _turned(T, deg), lens=lens)
+    flipped = "it is mirrored upside down"
     yield Hypothesis(Cause.MIRRORED_IMAGE, flipped, _turned(T, 180), mirrored=True, lens=(0.0, 0.0, down))
 
 
@@ -130,26 +119,20 @@ def clouds(T: Transform, poses: Sequence[ScannerPose], frames: Mapping[str, Matr
     """The points are in another frame than the extrinsic T (4, 4) is of. poses: of the scanner in the frame of its clouds.
     frames: T_camera_F of further frames F of the vehicle, by name."""
     for name, T_camera_frame in frames.items():
-        what = f"the points are in the frame {name}, not in that of the extrinsic; mend the cloud's frame_id or its driver"
+        what = f"they are in the frame {name}, not in that of the extrinsic; mend the cloud's frame_id or its driver"
         yield Hypothesis(Cause.CLOUD_FRAME, what, T_camera_frame)
     for pose in distinct_poses(poses):
         x, y, z = pose.centre
-        what = (
-            f"the points are not in the scanner's frame: it stands at x {x:.2f}, y {y:.2f}, z {z:.2f} m of theirs, as in a frame "
-            "of the vehicle; publish them in the scanner's frame, or use the extrinsic of theirs"
-        )
+        what = f"the scanner stands at x {x:.2f}, y {y:.2f}, z {z:.2f} m of theirs, as in a frame of the vehicle"
         for R in (pose.rotation, np.eye(3)):
             yield Hypothesis(Cause.CLOUD_FRAME, what, T @ se3.inverse(se3.from_parts(R, pose.centre)))
-    already = "the points are in the camera's {} frame already; the extrinsic is applied a second time"
+    already = "they are in the camera's {} frame already, and the extrinsic is applied a second time"
     yield Hypothesis(Cause.CLOUD_FRAME, already.format("optical"), np.eye(4))
     yield Hypothesis(Cause.CLOUD_FRAME, already.format("body"), _BODY, usual=True)
     for R in axis_rotations():
         # For p_cloud = R p_expected, what each of the cloud's axes is of the expected ones.
         axes = ", ".join(f"{'-' if row[np.abs(row).argmax()] < 0 else ''}{'xyz'[np.abs(row).argmax()]}" for row in R)
-        what = (
-            f"the points have other axes than the extrinsic expects: their x, y and z are its {axes}; mend the driver's "
-            "axes, or the transform to the frame that the cloud names"
-        )
+        what = f"their x, y and z are {axes} of the extrinsic's; mend the driver's axes, or the transform to the cloud's frame"
         yield Hypothesis(Cause.CLOUD_FRAME, what, T @ se3.inverse(se3.from_parts(R, np.zeros(3))))
 
 
@@ -182,15 +165,10 @@ def other_lenses(T: Transform, camera: Camera) -> Iterator[Hypothesis]:
     if distorts(camera):
         return
     for share in FOCALS:
-        yield Hypothesis(Cause.FOCAL_LENGTH, f"{focal_words(share)}; {INTRINSICS}", T, lens=(share, 0.0, 0.0))
+        yield Hypothesis(Cause.FOCAL_LENGTH, focal_words(share), T, lens=(share, 0.0, 0.0))
     for barrel in BARREL:
         corners = f"corners lie {abs(barrel):.0%} of the radius {'towards' if barrel > 0 else 'away from'} the centre"
-        said = (
-            f"the image shows a lens distortion that its CameraInfo does not have: {corners}; take the rectified topic, or the "
-            "CameraInfo of the camera as it is"
-        )
-        if camera.said_rectified:
-            said = f"the image is taken for rectified, but is raw: {corners}; {AS_RAW}"
+        said = f"it is raw: {corners}; {AS_RAW}" if camera.said_rectified else f"its CameraInfo has no distortion: {corners}"
         yield Hypothesis(Cause.NOT_RECTIFIED, said, T, barrel=barrel)
 
 
@@ -199,7 +177,8 @@ def rectified_otherwise(T: Transform, camera: Camera) -> Iterator[Hypothesis]:
     if not distorts(camera):
         return
     pinhole = Camera(camera.K, camera.width, camera.height)
-    yield Hypothesis(Cause.ALREADY_RECTIFIED, _MOVED, T, camera=pinhole)
+    twice = "its CameraInfo has a distortion, which is removed a second time"
+    yield Hypothesis(Cause.ALREADY_RECTIFIED, twice, T, camera=pinhole)
     mixed = "K in camera_info is that of the rectified image, but D and the image are raw; take both from one calibration"
     for alpha in (0.0, 1.0):
         with suppress(BadInputError):
@@ -235,15 +214,13 @@ def fisheyes(T: Transform, camera: Camera) -> Iterator[Hypothesis]:
     length of a fisheye is another one."""
     if camera.is_pinhole:
         D = np.array([LEAST_DISTORTION, 0.0, 0.0, 0.0])
-        said = f"is taken for rectified; {AS_RAW}"
-        if not camera.said_rectified:
-            said = "its CameraInfo has no distortion; take the rectified topic, or give 'equidistant' with its coefficients"
         lens = replace(camera, model="equidistant", D=D)
-        yield Hypothesis(Cause.NOT_RECTIFIED, f"the image is that of a fisheye, but {said}", T, camera=lens)
+        cure = AS_RAW if camera.said_rectified else "give 'equidistant' with its coefficients"
+        yield Hypothesis(Cause.NOT_RECTIFIED, f"it is that of a fisheye; {cure}", T, camera=lens)
     elif not camera.is_sphere and camera.model not in PERSPECTIVE:
         for share in NEAR_FOCALS:
             K = camera.K * np.array([[1 + share, 1, 1], [1, 1 + share, 1], [1, 1, 1]])
-            said = f"wrong intrinsics: the scenes match clearly better with {focal_words(share)}; {INTRINSICS}"
+            said = f"the scenes match clearly better with {focal_words(share)}"
             yield Hypothesis(Cause.FOCAL_LENGTH, said, T, camera=replace(camera, K=K))
 
 
@@ -253,7 +230,7 @@ def turned_over(T: Transform, camera: Camera) -> Hypothesis:
     K[:2, 2] = camera.width - 1 - K[0, 2], camera.height - 1 - K[1, 2]
     if len(D):
         D[[k for k in LENSES[camera.model].off_radius if k < len(D)]] *= -1
-    return Hypothesis(Cause.ROTATED_IMAGE, _TURNED.format(_TURNS[180]), _turned(T, 180), camera=replace(camera, K=K, D=D))
+    return Hypothesis(Cause.ROTATED_IMAGE, f"it is {_TURNS[180]}", _turned(T, 180), camera=replace(camera, K=K, D=D))
 
 
 def distinct_poses(poses: Sequence[ScannerPose]) -> list[ScannerPose]:

@@ -265,7 +265,7 @@ class Judge:
         left, share = next((k for k, own in enumerate(lens.unknowns) if own.name == FOCAL), None), guess.lens[0]
         told = left is not None and abs(lens.change[left]) > SHOWN_SIGMAS * lens.sigma[left]
         if told and share and guess.cause is Cause.OTHER_CAMERA:
-            guess = replace(guess, message=of_another_size((1 + share) * (1 + float(lens.change[left]))))
+            guess = replace(guess, told=of_another_size((1 + share) * (1 + float(lens.change[left]))))
         T = refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0]
         return max(one, replace(one, score=seen, T=T, hypothesis=guess), key=evidence)
 

@@ -62,11 +62,7 @@ def test_what_the_scenes_do_not_show_is_inconclusive_on_that_axis_only():
     ("m", "known", "says"),
     [
         (0.0, SHARP, "wrong; with that mended, the extrinsic is right: rotation off by"),
-        (
-            0.1,
-            BLURRED,
-            "wrong; with that mended, the scenes do not tell whether it is right to within 0.5 deg / 10 cm",
-        ),
+        (0.1, BLURRED, "wrong; with that mended, the scenes do not tell whether it is right to within 0.5 deg / 10 cm"),
         (1.17, SHARP, "wrong; even with that mended the extrinsic seems to be off by more than 0.5 deg / 10 cm, rotation"),
     ],
 )
@@ -125,6 +121,8 @@ def test_the_error_is_that_of_eq_2_19_and_its_covariance_follows_a_twist_of_the_
         ([0, 0.8, 0], [0, 0, 0], "camera looks * too far left"),
         ([0.8, 0, 0], [0, 0, 0], "camera looks * too far down"),
         ([0, 0, -2], [0, 0, 0], "camera is rolled * too far clockwise"),
+        ([0, -179, 0], [0, 0, 0], "camera looks backwards, turned by 179 deg"),
+        ([0, 0, 178], [0, 0, 0], "camera is upside down, by 178 deg"),
         ([0, 0, 0], [0.3, 0, 0], "camera is * too far left of the LiDAR"),
         ([0, 0, 0], [0, -0.3, 0], "camera is * too far below the LiDAR"),
     ],

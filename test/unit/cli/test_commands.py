@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from argparse import Namespace
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +24,9 @@ from paths import ROOT
 from calib_ros import open_dataset, se3
 from calib_ros.camera import Camera
 from calib_ros.cli import inputs, main
-from calib_ros.cli.calibrate import advice, calibrate, draw
+from calib_ros.cli.calibrate import advice, calibrate, draw, next_command
 from calib_ros.cli.inputs import ConstraintOptions
-from calib_ros.cli.output import motion, summary
+from calib_ros.cli.output import more_frames, motion, summary
 from calib_ros.config import Config, MotionConfig, update
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.frame import Frame
@@ -34,16 +35,13 @@ from calib_ros.online.state import save_state
 from calib_ros.overlay import layout
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Extrinsic, RefusalCode, Result, load
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Cause, Extrinsic, RefusalCode, Result, load
 from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
 SOURCE = "synthetic:seed=1,frames=6,rings=32,width=640,height=192,speed=3"
 # Enough for what these tests are about; test_calibrate_writes_result_and_overlay runs the defaults.
-QUICK: dict[str, dict[str, Any]] = {
-    "semantics": {"segmentation": "none"},
-    "search": {"rounds": 1, "starts": 64},
-}
+QUICK: dict[str, dict[str, Any]] = {"semantics": {"segmentation": "none"}, "search": {"rounds": 1, "starts": 64}}
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
@@ -464,9 +462,28 @@ def test_summary_says_which_scenes_show_what_is_not_known(drive: SyntheticDrive)
     line = "advice: not known well enough: roll; add frames that show edges at any distance towards the sides of the image"
     assert line in summary(refused, advice(refused, drive, Config())).splitlines()
     assert advice(replace(refused, refusal=RefusalCode.NOT_SIGNIFICANT), drive, Config()) == ""
-    assert "--initial reference" in advice(refused, drive, Config(), "nominal")
-    assert "--initial" not in advice(refused, drive, Config(), "start.yaml")
-    assert advice(replace(refused, status=CONVERGED, refusal=None), drive, Config(), "nominal") == ""
+
+
+def test_a_refusal_is_a_line_with_the_command_to_paste(drive: SyntheticDrive) -> None:
+    given = ["calibrate", "drive", "--rectified", "--seed=1", "--search-deg", "1", "--json", "out.json", "--clock", "header"]
+
+    def lines(initial: str, **told: Any) -> list[str]:
+        args = Namespace(given=given, initial=initial, search_deg=1.0, search_m=0.1)
+        wrong = told.get("cause") or told["refusal"]
+        result = Result(np.eye(4), REFUSED, f"{wrong}; score 1", frame_names=("a",), **told)
+        return summary(result, command=next_command(result, drive, Config(), args)).splitlines()
+
+    wider = "refused: the optimum may be chance: calib-ros calibrate ... --search-deg 2 --search-m 0.2"
+    whole = "calib-ros calibrate drive --rectified --seed=1 --clock header --search-deg 2 --search-m 0.2"
+    assert lines("a b.json", refusal=RefusalCode.NOT_SIGNIFICANT)[:3] == [wider, f"next: {whole}", "score 1"]
+    assert "--initial reference" in lines("nominal", refusal=RefusalCode.NOT_SIGNIFICANT)[1]
+    apart = lines("nominal", refusal=RefusalCode.WRONG_TIMES, cause=Cause.TIME_OFFSET, refusal_figures={"seconds": 0.05})
+    assert apart[0] == "refused: clocks apart: calib-ros calibrate ... --time-offset 0.05"
+    first, view, *_ = lines("nominal", refusal=RefusalCode.NOT_SIGNIFICANT, cause=Cause.MIRRORED_IMAGE)
+    assert (first, view) == (f"refused: {Cause.MIRRORED_IMAGE}", "next: calib-ros view drive --rectified --clock header")
+    start = lines("a b.json", refusal=RefusalCode.WORSE_THAN_START)[0]
+    assert start == "refused: no better extrinsic found: calib-ros check ... --extrinsic 'a b.json'"
+    assert [more_frames(*counts) for counts in ((4, 8), (4, 100), (20, 100))] == ["--frames all", "--frames 0:100:5", ""]
 
 
 def test_summary_gives_nobody_the_start_to_publish() -> None:

@@ -72,13 +72,8 @@ def written(path: Path, columns: dict[str, np.ndarray]) -> None:
         path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + body)
     elif path.suffix in (".las", ".laz"):
         laspy = pytest.importorskip("laspy")
-        file = laspy.create(
-            **(
-                {"point_format": 1, "file_version": "1.2"}
-                if path.suffix == ".las"
-                else {"point_format": 6, "file_version": "1.4"}
-            )
-        )
+        kind, version = (1, "1.2") if path.suffix == ".las" else (6, "1.4")
+        file = laspy.create(point_format=kind, file_version=version)
         file.header.scales = [2.0**-20] * 3
         file.x, file.y, file.z = (np.nan_to_num(columns[axis].astype(float)) for axis in "xyz")
         file.intensity, file.gps_time = np.round(columns["intensity"] * 65535).astype(np.uint16), columns["time"]
@@ -279,8 +274,7 @@ def test_truncation_is_noticed_also_between_points(tmp_path):
         with pytest.raises(BadInputError, match="copy it again"):
             read_cloud(tmp_path / name)
     for name in ("a.ascii.pcd", "a.binary.pcd", "a.ascii.ply"):
-        path = tmp_path / name
-        columns = cloud(3)
+        path, columns = tmp_path / name, cloud(3)
         written(path, columns)
         data = path.read_bytes()
         last = data.splitlines(keepends=True)[-1] if "ascii" in name else b"0" * records(columns).itemsize

@@ -132,10 +132,7 @@ def test_a_camera_on_its_side_sees_poles_lie() -> None:
             advice(C=covariance(roll=2.0)),
             "not known well enough: roll; drive past edges at any distance towards the sides of the image",
         ),
-        (
-            advice(TENTATIVE, covariance(), missing=Confirmations(4, 1), of_all=CONFIRM),
-            "keep driving: 1 of 5 further keyframes",
-        ),
+        (advice(TENTATIVE, covariance(), missing=Confirmations(4, 1), of_all=CONFIRM), "keep driving: 1 of 5 further keyframes"),
         (advice(TENTATIVE, covariance(), missing=Confirmations(clocks=1), of_all=CONFIRM), "drive at another speed"),
         (advice(MOVED, covariance(), missing=Confirmations(5, 3), of_all=Confirmations(5, 4)), "3 further estimates"),
         (advice(SUSPECT, covariance()), "keep driving: the newest keyframes decide"),
