@@ -60,7 +60,7 @@ def export(
     if form not in FORMATS:
         raise BadInputError(f"format '{form}' is not known; choose one of {', '.join(FORMATS)}")
     result, T = renamed(result, camera_frame, lidar_frame), result.T_camera_lidar
-    of_pose: dict[str, Callable[[Edges], str]] = {"tf": _tf_command, "urdf": _urdf_joints, "autoware": _autoware}
+    of_pose: dict[str, Callable[[Edges], str]] = {"tf": tf_command, "urdf": _urdf_joints, "autoware": _autoware}
     if form in of_pose:
         return of_pose[form](poses_of(result, parent))
     if parent != "camera":
@@ -107,7 +107,8 @@ def xyz_rpy(T: Transform) -> list[float]:
     return [float(v) + 0.0 for v in (*T[:3, 3], roll, pitch, yaw)]  # + 0: no "-0.0" in files that people read
 
 
-def _tf_command(poses: Edges) -> str:
+def tf_command(poses: Edges) -> str:
+    """The line that publishes a pose."""
     (((parent, child), T),) = poses.items()
     values = [*T[:3, 3], *se3.quaternion_from_rotation(T[:3, :3])]
     numbers = " ".join(f"--{n} {v}" for n, v in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), map(_number, values), strict=True))

@@ -222,11 +222,6 @@ class Result(AsJson):
         """True if the estimate is to be used."""
         return self.status == CONVERGED
 
-    @property
-    def trouble(self) -> Trouble | None:
-        """What a refused or insufficient one suffers from, if it is known."""
-        return self.cause or self.refusal
-
     def to_dict(self) -> dict[str, Any]:
         """The result format of docs/result.md: plain numbers, lists and strings; NaN becomes null."""
         T, error = self.T_camera_lidar, self.reference_error

@@ -199,7 +199,7 @@ def reason_of(
     if cause is not None:
         return joined([cause.message, _THEN[judgement.verdict].format(limits=tolerance, sizes=judgement.sizes)])
     if judgement.verdict is CheckVerdict.PASS:
-        return joined([f"right to within {tolerance}", judgement.sizes])
+        return f"right to within {tolerance}: {judgement.sizes}"
     # The axes that fail, or else those that are inconclusive; the largest first.
     by_verdict = ([own for own in judgement.axes if own.verdict is v] for v in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE))
     worst = sorted(next(filter(None, by_verdict), []), key=lambda own: -abs(own.error) * (1.0 if own.name[0] == "r" else 5.0))

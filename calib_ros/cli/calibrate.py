@@ -83,7 +83,7 @@ def calibrate(
 
 def next_command(result: Result, source: Source, config: Config, args: argparse.Namespace) -> tuple[str, str]:
     """By which what is wrong with an estimate may be mended, or be looked at, see `again`; empty where none does."""
-    wrong, initial = result.trouble, args.initial
+    wrong, initial = result.cause or result.refusal, args.initial
     if result.converged or wrong is None:
         return "", ""
     if wrong is RefusalCode.WORSE_THAN_START and initial not in ("nominal", *GUESSES):
@@ -103,9 +103,8 @@ def next_command(result: Result, source: Source, config: Config, args: argparse.
 def advice(result: Result, source: Source, config: Config) -> str:
     """What to do about an estimate, in a line: add frames where those given leave a direction open; "" where none do."""
     lacking = need(result, config) if result.refusal is RefusalCode.TOO_UNCERTAIN else None
-    if lacking is None:
-        return ""
-    return words(lacking, FeatureExtractor(source.camera, config).camera, result.T_camera_lidar, "add frames that show")
+    camera = FeatureExtractor(source.camera, config).camera
+    return "" if lacking is None else words(lacking, camera, result.T_camera_lidar, "add frames that show")
 
 
 def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:

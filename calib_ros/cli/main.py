@@ -101,8 +101,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         note(f"calib-ros: the recording has cameras {names}; --camera chooses one, calib-ros rig estimates all together")
     limits = args.search_deg, args.search_m
     result = calibrate(source, args.frames, args.initial, args.yaw_deg, config, *limits, args.overlay)
-    text = summary(result, advice(result, source, config), command=next_command(result, source, config, args))
-    print_or_save(result, text, args.json)
+    told = advice(result, source, config), next_command(result, source, config, args)
+    print_or_save(result, summary(result, *told), args.json)
     if args.camera_info is not None and result.converged and result.refined_camera is not None:
         write_atomically(args.camera_info, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())
     elif args.camera_info is not None:

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.datasets.source import Source
+from calib_ros.export import tf_command
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
 from calib_ros.io import AsJson, check_output
@@ -102,8 +103,7 @@ def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""
         lines = [f"{result.status}: {figures}", *lines_of(result.reason)]
     else:
         lines = [*first_lines(result.status, result.reason, command), figures]
-    if advice:
-        lines.append(f"advice: {advice}")
+    lines += [f"advice: {advice}"] if advice else []
     kept = "" if result.converged else ", the start"
     lines.append(f"T_{result.camera_frame}_{result.lidar_frame}{kept}  {pose(result.T_camera_lidar)}")
     if result.covariance is not None:
@@ -123,12 +123,7 @@ def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""
     lines += _details(result)
     if not result.converged:
         return "\n".join(lines)  # nobody is to publish the start
-    (x, y, z), (qx, qy, qz, qw) = result.T_camera_lidar[:3, 3], se3.quaternion_from_rotation(result.T_camera_lidar[:3, :3])
-    lines.append(
-        f"ros2 run tf2_ros static_transform_publisher --x {x:.6f} --y {y:.6f} --z {z:.6f} --qx {qx:.8f} --qy {qy:.8f} "
-        f"--qz {qz:.8f} --qw {qw:.8f} --frame-id {result.camera_frame} --child-frame-id {result.lidar_frame}"
-    )
-    return "\n".join(lines)
+    return "\n".join([*lines, tf_command({(result.camera_frame, result.lidar_frame): result.T_camera_lidar}).rstrip()])
 
 
 def refined_words(refined: RefinedCamera) -> str:

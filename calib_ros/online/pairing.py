@@ -42,7 +42,7 @@ WINDOW = 11  # checks, at one a second: what happened in 10 s
 # Of the slower stream, from which share without partner on it is a problem: some messages get lost on most vehicles, and two of
 # the least number may still wait.
 UNPAIRED_SHARE, MIN_MESSAGES = 0.3, 10
-MISSING_SHARE = 0.1  # of a stream's messages, from which on their loss is named
+MISSING_SHARE, LASTING = 0.1, 0.5  # of a stream's messages, from which on their loss is named; and the part of it until which
 OTHER_CLOCK_S = 1.0  # between the newest stamps of both streams; drivers deliver within half a second
 SILENT_PERIODS = 2.5  # without a message: one may be lost, and another one late
 
@@ -337,6 +337,7 @@ class PairingHealth:
     def __init__(self, synchronizer: Synchronizer) -> None:
         self._synchronizer = synchronizer
         self._counts: deque[SynchronizerCounts] = deque(maxlen=WINDOW)
+        self.share = 0.0  # of the slower stream without partner, when that could last be told; 0 where it is no problem
 
     def check(self) -> str:
         """One line for a person if a large share of the slower stream has found no partner in the last 10 s, with the cause and
@@ -346,10 +347,11 @@ class PairingHealth:
         before = self._counts[0]
         images, clouds, pairs = now.images - before.images, now.clouds - before.clouds, now.pairs - before.pairs
         fewer = min(images, clouds)
-        if fewer < MIN_MESSAGES or now.jumps_back > before.jumps_back or pairs >= (1 - UNPAIRED_SHARE) * fewer:
+        if fewer < MIN_MESSAGES or now.jumps_back > before.jumps_back:
             return ""
+        self.share = 1 - pairs / fewer if pairs < (1 - UNPAIRED_SHARE) * fewer else 0.0
         of = "images" if images <= clouds else "clouds"
-        return f"{1 - pairs / fewer:.0%} of the {of} find no partner: {self.cause()}"
+        return f"{self.share:.0%} of the {of} find no partner: {self.cause()}" if self.share else ""
 
     @property
     def waiting(self) -> bool:

@@ -139,7 +139,10 @@ class JointSearch:
                     continue
                 score = self.make_objective([restamped(f, motion, after) for f in features]).edges.score
                 found = estimate_time_offset(score, T, limits, prior, moving[1], motion, search=True)
-                if found is not None and found.better_than(offset, len(CONVENTIONS) - 1):
+                if found is None:
+                    continue
+                log_ratio = (found.score - offset.score) / max(found.noise, offset.noise)
+                if log_ratio > np.log(len(CONVENTIONS) - 1):  # of the same edge points, one of so many that were tried
                     offset, stamping = found, other
         if offset is None or not (offset.exists(motion) or stamping):
             return Optimised(features, objective, T, search, offset)

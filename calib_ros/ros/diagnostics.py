@@ -35,6 +35,7 @@ LOAD_WINDOW_S = 30.0  # loads are those of the last so many seconds: a search or
 # Within these: keyframes that were left out since the motion is unknown, and the share of those taken beyond the budget.
 MANY_LEFT_OUT, FORCED_SHARE, MIN_KEYFRAMES = 3, 0.5, 3
 ERROR_SHOWN_S = 10.0  # a problem sets the level for this long
+CHANGED = 0.5  # a share of messages that are missing is told again where it differs by more of itself
 # What an operator has to do for each status of the extrinsic; the others need nothing.
 LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
 
@@ -54,6 +55,7 @@ class Health(NodeService):
         self.extrinsic: Extrinsic | None = None
         self.estimated_at: float | None = None
         self.losses: dict[str, str] = {}
+        self._missing: dict[str, float] = {}  # as told last
         self.silence: dict[str, str] = {}
         self.callback_ms: deque[float] = deque(maxlen=2000)
         self.errors = 0
@@ -63,6 +65,13 @@ class Health(NodeService):
         self.errors += 1
         self.last_error = (text, time.monotonic())
         self.log.add(kind, text, lambda line: self._logger.warning(line))  # rclpy takes one level per place that logs
+
+    def missing(self, kind: str, share: float, text: str) -> None:
+        """A share of messages that is missing now: an `error` where it begins or has changed by half, a `note` where it is 0."""
+        told = self._missing.get(kind, 0.0)
+        if share != told and abs(share - told) >= CHANGED * told:
+            self._missing[kind] = share
+            (self.error if share else self.note)(text, kind)
 
     def note(self, text: str, kind: str) -> None:
         """Something that is well again, in one line."""
@@ -158,8 +167,7 @@ class Diagnostics(NodeService):
     def check(self) -> None:
         """Rates and loads count from the calls before."""
         self._unpaired = self._pairing.check()
-        if self._unpaired:
-            self._health.error(self._unpaired, "unpaired")
+        self._health.missing("unpaired", self._pairing.share, self._unpaired or "images and clouds find their partners again")
         self._samples.append(_Sample.of(self._pipeline))
 
     def _window(self) -> tuple[_Sample, _Sample]:
@@ -318,7 +326,7 @@ class Diagnostics(NodeService):
             return None
         silent = last.images == first.images, last.clouds == first.clouds
         missing = [topic for topic, is_silent in zip(("image", "points"), silent, strict=True) if is_silent]
-        if missing and self._health.losses:
+        if missing and self._health.losses:  # none of its messages arrives whole
             return WARN, "; ".join(self._health.losses.values())
         if missing:
             return STALE, "; ".join(self._health.silence.get(topic, f"no messages on {topic}") for topic in missing)
@@ -329,7 +337,8 @@ class Diagnostics(NodeService):
         if self._pairing.waiting:
             return OK, "waiting for the next pair"
         text = f"images and clouds arrive, but none belong together: {self._pairing.cause()}"
-        self._health.error(text, "unpaired")
+        if not self._unpaired:  # which is told already
+            self._health.error(text, "unpaired")
         return WARN, text
 
 
@@ -348,15 +357,11 @@ def refined_values(refined: RefinedCamera | None) -> dict[str, str]:
         return values
     K = refined.camera.K
     for name, change in refined.changes.items():
-        digits, scale = 1, 1.0
-        if name == FOCAL:
-            value, scale = K[0, 0], K[0, 0] / (1 + change.value)  # a share of the stated one
-        elif name == ASPECT:
-            value, digits = change.value, 4
-        elif name == RADIAL:
-            value, digits = np.r_[refined.camera.D, 0.0][0], 4
-        else:
-            value = K[CENTRE.index(name), 2]
+        value, digits, scale = {
+            FOCAL: (K[0, 0], 1, K[0, 0] / (1 + change.value)),  # a share of the stated one
+            ASPECT: (change.value, 4, 1.0),
+            RADIAL: (np.r_[refined.camera.D, 0.0][0], 4, 1.0),
+        }.get(name) or (K[CENTRE.index(name), 2], 1, 1.0)
         seen = "" if change.observable else ", hardly shown"
         values[f"refined {titles[name]}"] = f"{value:.{digits}f} +- {scale * change.sigma:.{digits}f}{seen}"
     return values

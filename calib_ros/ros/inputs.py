@@ -22,13 +22,14 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
-from calib_ros.frame import Frame, PointCloud
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_camera_info, stamp_ns
 from calib_ros.online.common import Common
-from calib_ros.online.pairing import MISSING_SHARE
+from calib_ros.online.pairing import LASTING, MISSING_SHARE, SILENT_PERIODS
 from calib_ros.rig.description import CAMERA
 from calib_ros.rig.edges import SEEN, seen_share
 from calib_ros.ros.conversions import Serialized, cloud_from_message, pixels_from_message
+from calib_ros.ros.diagnostics import SILENCE_S
 from calib_ros.ros.distributions import remark
 from calib_ros.ros.parts import NodePart
 from calib_ros.ros.subscriptions import BEST_EFFORT, AdaptiveSubscription, Form, livox_forms, loss_advice, serialized
@@ -216,14 +217,18 @@ class SensorSubscriptions(NodePart):
             if problem := subscription.check():
                 self._health.error(problem, f"publishers of {subscription.topic}")
         self._health.silence = {name: own.silence for name, own in zip(("image", "points"), self.adaptive, strict=False)}
-        # Seen by the middleware, which knows of messages that did not arrive whole, or by the stamps of a stream that keeps its
-        # period; of images and clouds, where many get lost.
-        losses: dict[str, str] = {}
-        for own, missing in zip(self.adaptive, self._pipeline.pairing.synchronizer.missing_shares(), strict=False):
-            if (share := max(own.lost_share(), missing)) >= MISSING_SHARE:
-                losses[own.topic] = f"{share:.0%} of the messages on {own.topic} get lost; {loss_advice(own)}"
-                if own.tells:
-                    self._health.error(losses[own.topic], f"losses on {own.topic}")
+        losses, synchronizer = dict[str, str](), self._pipeline.pairing.synchronizer
+        for own, missing, period in zip(self.adaptive, synchronizer.missing_shares(), synchronizer.periods, strict=False):
+            # Seen by the middleware, which knows of messages that did not arrive whole, or by the stamps of a stream that keeps
+            # its period, until it falls silent; of images and clouds, where many get lost.
+            lost, topic = own.lost_share(), own.topic
+            silent = not lost and own.silent_s > max(SILENCE_S, SILENT_PERIODS * period / NANOSECONDS)
+            share = 0.0 if silent else max(lost, missing)
+            text = f"{topic} is silent" if silent else f"the messages on {topic} get through again"
+            if share >= MISSING_SHARE * (LASTING if topic in self._health.losses else 1):
+                losses[topic] = text = f"{share:.0%} of the messages on {topic} get lost; {loss_advice(own)}"
+            if own.tells:
+                self._health.missing(f"losses on {topic}", share if topic in losses else 0.0, text)
         self._health.losses = losses
         if parameters["image_is_rectified"] != self._rectified:
             self._rectified = parameters["image_is_rectified"]

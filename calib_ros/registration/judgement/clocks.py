@@ -169,11 +169,6 @@ class TimeOffset:
         log_ratio = 0.5 * self.gain**2 + np.log(self.sigma_s * np.sqrt(2 * np.pi) / self.width_s)
         return float(1 / (1 + np.exp(-np.clip(log_ratio, -50, 50))))
 
-    def better_than(self, other: TimeOffset, alternatives: int) -> bool:
-        """Is this a better match of the same edge points than another, if it is one of so many that were tried?"""
-        log_ratio = (self.score - other.score) / max(self.noise, other.noise)
-        return bool(log_ratio > np.log(alternatives))
-
 
 def estimate_time_offset(
     score: PointScore,

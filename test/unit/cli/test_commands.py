@@ -487,11 +487,11 @@ def test_a_refusal_is_a_line_with_the_command_to_paste(drive: SyntheticDrive) ->
 
 
 def test_summary_gives_nobody_the_start_to_publish() -> None:
-    kept, found = (summary(Result(np.eye(4), status)) for status in (REFUSED, CONVERGED))
-    assert "T_camera_lidar, the start" in kept
-    assert "static_transform_publisher" not in kept
-    assert "the start" not in found
-    assert "static_transform_publisher" in found
+    kept, found = (summary(Result(np.eye(4), status, "nothing matches", initial=np.eye(4))) for status in (REFUSED, CONVERGED))
+    assert "nothing matches" in kept
+    publishing = "T_camera_lidar, the start", "static_transform_publisher", "moved"
+    assert [text in kept for text in publishing] == [True, False, False]
+    assert [text in found for text in publishing] == [False, True, True]
 
 
 def test_summary_reports_deskewing(street: list) -> None:
