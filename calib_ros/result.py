@@ -82,7 +82,7 @@ class Cause(Trouble):
     FOCAL_LENGTH = "focal_length", "wrong focal length", INTRINSICS, "--intrinsics refine"  # or fx against fy
     PRINCIPAL_POINT = "principal_point", "wrong principal point", INTRINSICS, "--intrinsics refine"
     OTHER_CAMERA = "other_camera", "another camera's CameraInfo", "give K and D of this camera for this image size"
-    NOT_RECTIFIED = "not_rectified", "distorted image called rectified", "take the rectified topic, or the raw CameraInfo"
+    NOT_RECTIFIED = "not_rectified", "a lens distortion that is not stated", "take the rectified topic, or the raw CameraInfo"
     ALREADY_RECTIFIED = "already_rectified", "rectified image called distorted", "set image_is_rectified: true", "--rectified"
     MIRRORED_IMAGE = "mirrored_image", "mirrored image", "flip it, or switch the driver's mirroring off"
     ROTATED_IMAGE = "rotated_image", "turned image", "turn it back, or mend the driver's rotation"

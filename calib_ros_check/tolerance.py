@@ -204,8 +204,9 @@ def reason_of(
     by_verdict = ([own for own in judgement.axes if own.verdict is v] for v in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE))
     worst = sorted(next(filter(None, by_verdict), []), key=lambda own: -abs(own.error) * (1.0 if own.name[0] == "r" else 5.0))
     if judgement.verdict is CheckVerdict.FAIL:
-        axes = [own.words for own in worst] or [judgement.sizes]
-        return joined([*axes, f"more than {tolerance}", *(f"or else {own.message}" for own in possible)])
+        both = (f"{own.name} {own.words}" for own in (judgement.rotation, judgement.translation))
+        first, *axes = [own.words for own in worst] or both
+        return joined([f"{first}: estimate anew", *axes, f"more than {tolerance}", *(f"or else {o.message}" for o in possible)])
     names = ", ".join(f"{own.name} {own.words}" for own in worst) or judgement.sizes
     return joined([f"not known to within {tolerance}: {MORE_FRAMES}", names])
 

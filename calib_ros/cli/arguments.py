@@ -201,7 +201,7 @@ def add_camera_and_topics(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--rectified",
         action=argparse.BooleanOptionalAction,
-        help="images of a bag are rectified: P of CameraInfo is their camera; by default if the topic says so (image_rect)",
+        help="the images are rectified: P, or K, is their camera, without distortion; by default of a bag if its topic says so",
     )
     command.add_argument("--incomplete", action="store_true", help="use what is left of a bag of which parts are missing")
     command.add_argument(
@@ -244,9 +244,7 @@ def _constraints(command: argparse.ArgumentParser) -> None:
         "extrinsic.",
     )
     group.add_argument(
-        "--rotation-only",
-        action="store_true",
-        help="keep the camera's position in the LiDAR frame; estimate only its rotation",
+        "--rotation-only", action="store_true", help="keep the camera's position in the LiDAR frame; estimate only its rotation"
     )
     group.add_argument(
         "--fix", type=axis_names, action="extend", default=[], metavar="AXES", help="fix these axes, for example rx,tz"

@@ -102,9 +102,9 @@ def next_command(result: Result, source: Source, config: Config, args: argparse.
 
 def advice(result: Result, source: Source, config: Config) -> str:
     """What to do about an estimate, in a line: add frames where those given leave a direction open; "" where none do."""
-    lacking = need(result, config) if result.refusal is RefusalCode.TOO_UNCERTAIN else None
-    camera = FeatureExtractor(source.camera, config).camera
-    return "" if lacking is None else words(lacking, camera, result.T_camera_lidar, "add frames that show")
+    if result.refusal is not RefusalCode.TOO_UNCERTAIN or (lacking := need(result, config)) is None:
+        return ""
+    return words(lacking, FeatureExtractor(source.camera, config).camera, result.T_camera_lidar, "add frames that show")
 
 
 def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:

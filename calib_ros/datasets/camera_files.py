@@ -41,12 +41,12 @@ def camera_file(folder: Path) -> Path:
 
 
 def read_camera(
-    path: Path, choice: int | str | None, image_size: Callable[[], tuple[int, int]]
+    path: Path, choice: int | str | None, image_size: Callable[[], tuple[int, int]], rectified: bool = False
 ) -> tuple[Camera, Matrix | None, str, list[str]]:
     """A camera of a file, T_camera_lidar (4, 4) if the file has one, the camera's name, and those of others in the file.
 
     choice: its name or number where there are several; None = the first. image_size: gives width and height, px, where the file
-    has none. Raises BadInputError, with the file and what to do.
+    has none. rectified: the images are; P is their camera, else K. Raises BadInputError, with the file and what to do.
     """
     if not path.is_file():
         raise BadInputError(f"calibration {path} is missing; put there {WANTED}")
@@ -63,7 +63,9 @@ def read_camera(
         name = (dict(enumerate(cameras)) | {name: name for name in cameras}).get(choice)
         if name is None:
             raise BadInputError(f"there is no camera {shown(choice)}; there are {', '.join(map(shown, cameras)) or 'none'}")
-        camera = decode_camera_info(SimpleNamespace(**_info(cameras[name], image_size)))
+        info, P = _info(cameras[name], image_size), cameras[name].get("projection_matrix")
+        info["p"] = _numbers(P, "projection_matrix", 12) if rectified and P else np.insert(info["k"], (3, 6, 9), 0.0)
+        camera = decode_camera_info(SimpleNamespace(**info), rectified)
         T = values.get("T_camera_lidar")
         reference = None if T is None else se3.as_transform(T, "T_camera_lidar")
         return camera, reference, shown(name), [shown(other) for other in cameras if other != name]

@@ -52,15 +52,15 @@ CLOUD_COMPARE = "scalar_"  # before the names of fields in PLY files that CloudC
 
 
 def read_cloud(path: Path, stamp: int = 0) -> PointCloud:
-    """The points of a file by its ending, one of CLOUD_SUFFIXES; NaN points are kept. A .bin has float32 x, y, z, intensity, and
-    maybe more numbers a point.
+    """The points of a file by its ending, one of CLOUD_SUFFIXES; NaN points are kept. A .bin has float32 x, y, z, and maybe
+    intensity and more numbers a point.
 
     stamp: of the cloud, ns, from which absolute times of points count. Raises BadInputError for a damaged file or one without
     x, y, z; MissingDependencyError without the library that reads it.
     """
     suffix = path.suffix.lower()
     if suffix == ".bin":
-        return read_scan(path)
+        return read_scan(path, known=False)
     try:
         columns = _READERS[suffix](path)
     except (BadInputError, MissingDependencyError):

@@ -16,10 +16,11 @@ from calib_ros.frame import NANOSECONDS, PointCloud
 from calib_ros.messages.pictures import read_picture
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # KITTI has PNG; copies are often recompressed
-# Numbers of a point: x, y, z, reflectance, and in other data sets its ring, time, or a radar's values.
-COLUMNS = (4, 5, 6, 7, 8)
+# Numbers of a point: x, y, z, reflectance, and in other data sets its ring, time, or a radar's values; or x, y, z alone.
+COLUMNS = (4, 3, 5, 6, 7, 8)
 SAMPLED = 20000  # points that are looked at
 SAME_SCAN = 0.5  # of their distance: neighbours in a scan are closer; 0.004 to 0.2 in scans, 1 to 1.4 where it is read wrongly
+BINS, SURE, LEAST, ALIKE = 8, 5.0, 0.05, 0.9  # of `_distinct`: 0.2 to 1 for points in any order, and for multiples alike
 DIGITS = 10  # of a frame number; longer names are not frames
 DATE = re.compile(r"(19|20)\d\d-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 MAX_STAMP_S = 2**31  # that a ROS message can hold
@@ -44,29 +45,34 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...], digits: int = DIGITS
     return {int(p.stem): p for p in sorted(files, key=lambda p: int(p.stem))}
 
 
-def read_scan(path: Path) -> PointCloud:
-    """A Velodyne .bin in the order of the file, intensity 0..1, without rings and times. BadInputError if damaged."""
-    points = read_points(path, COLUMNS)
-    return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
+def read_scan(path: Path, known: bool = True) -> PointCloud:
+    """A Velodyne .bin in the order of the file, without rings and times. known, and what is raised: as of `read_points`."""
+    points = read_points(path, COLUMNS, known)
+    return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy() if points.shape[1] > 3 else None)
 
 
-def read_points(path: Path, columns: Sequence[int]) -> NDArray[np.float32]:
-    """Points (n, k) of a file of float32, k one of `columns`: the first, unless only by another one its points follow each other.
-    BadInputError if damaged."""
+def read_points(path: Path, columns: Sequence[int], known: bool = True) -> NDArray[np.float32]:
+    """Points (n, k) of a file of float32, k one of `columns`, which its numbers tell where the size fits several. known: where
+    they do not tell, the first is taken. BadInputError if damaged, or if nobody knows."""
     try:
         values = np.fromfile(path, "<f4")
         size = path.stat().st_size
     except OSError as error:
         raise BadInputError(f"scan {path} cannot be read ({error.strerror}); check the file") from error
-    usual, *others = columns
-    fits = size > 0 and size % (4 * usual) == 0
-    if fits and (not others or _gap(values, usual) <= SAME_SCAN):
+    usual, fits = columns[0], [k for k in sorted(columns) if size and size % (4 * k) == 0]
+    if usual in fits and (len(fits) == 1 or _gap(values, usual) <= SAME_SCAN):
         return values.reshape(-1, usual)
-    gaps = [(_gap(values, k), k) for k in others if size and size % (4 * k) == 0]
-    closest, chosen = min(gaps, default=(np.inf, usual))
-    if closest > SAME_SCAN and not fits:
+    gaps = {k: _gap(values, k) for k in fits}
+    told = sorted((k for k in fits if gaps[k] <= SAME_SCAN), key=lambda k: gaps[k])
+    if not told:  # points in no order
+        kinds = {k: _distinct(values, k) for k in fits}
+        told = [k for k in fits if kinds[k] >= max(ALIKE * max(kinds.values()), LEAST)] or [usual] * (known and usual in fits)
+    if not told and usual in fits:
+        layouts = " or ".join(map(str, fits))
+        raise BadInputError(f"scan {path} has {layouts} numbers a point, which they do not tell; save it as .npz")
+    if not told:
         raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {4 * usual}; copy it again")
-    return values.reshape(-1, chosen if closest <= SAME_SCAN else usual)
+    return values.reshape(-1, told[0])
 
 
 def _gap(values: NDArray[np.float32], columns: int) -> float:
@@ -77,6 +83,17 @@ def _gap(values: NDArray[np.float32], columns: int) -> float:
         gaps = np.linalg.norm(np.diff(xyz, axis=0), axis=1) / np.maximum(np.linalg.norm(xyz[1:], axis=1), 1e-3)
     known = gaps[np.isfinite(gaps)]
     return float(np.median(known)) if len(known) else np.inf
+
+
+def _distinct(values: NDArray[np.float32], columns: int) -> float:
+    """How much the place of a number in its point tells of its value, nats, if numbers (n,) are of so many a point."""
+    values = values[: 4 * SAMPLED]
+    ranks = np.argsort(np.argsort(values, kind="stable"), kind="stable")
+    cells = np.arange(len(values)) % columns * BINS + ranks * BINS // len(values)
+    joint = np.bincount(cells, minlength=columns * BINS).reshape(columns, BINS) / len(values)
+    surprise = joint * np.log(np.maximum(joint, 1e-12) / np.outer(joint.sum(axis=1), joint.sum(axis=0)))
+    freedom = (BINS - 1) * (columns - 1)  # of chance, which is chi-squared
+    return float(surprise.sum() - (freedom + SURE * np.sqrt(2 * freedom)) / (2 * len(values)))
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:

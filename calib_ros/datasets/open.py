@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from calib_ros.camera import Camera
+from calib_ros.datasets.camera_files import camera_file, read_camera
 from calib_ros.datasets.capture import CaptureSource, is_capture
 from calib_ros.datasets.folder import (
     CLOUDS,
@@ -51,8 +53,8 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         ``"synthetic[:name=value,...]"``, the simulated drive.
     camera : of a KITTI folder, 0 to 3 (default 2; of KITTI-360 0 or 1), of nuScenes, its channel or number (default CAM_FRONT),
         of ONCE, a plain folder or a synthetic rig of several, a name or number in its calibration (default the first).
-    **options : of a bag or capture, see `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, rectified,
-        motion, T_camera_lidar, windows; None = default.
+    **options : rectified, whether the pictures are already: the lens is not removed a second time. Of a bag or capture, see
+        `BagSource`: image_topic, points_topic, camera_info_topic, tolerance_s, motion, T_camera_lidar, windows. None = default.
 
     Raises BadInputError if the path is none of these, or an option does not belong to the dataset.
     """
@@ -63,9 +65,8 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         camera = int(camera)
     opened_by_name = None if path.exists() else source_of(text)
     if opened_by_name is not None:
-        _refuse(options, text)
-        named: Source = opened_by_name(text) if camera is None else opened_by_name(text, camera)
-        return named
+        choice: tuple[Any, ...] = () if camera is None else (camera,)
+        return _said(_only_rectified(options, text), opened_by_name(text, *choice), camera)
     if not path.exists() and not is_nuscenes(path):
         by_name = "".join(f", or '{name}'" for name in installed(SOURCES))
         raise BadInputError(f"{text} does not exist; give a folder or a bag{by_name}")
@@ -73,17 +74,12 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     if not is_nuscenes(path) and (is_bag(path) or is_capture(path)):
         from calib_ros.datasets.bag import BagSource
 
-        _refuse({name: options[name] for name in options.keys() - signature(BagSource).parameters}, text)
+        _only_rectified({name: options[name] for name in options.keys() - signature(BagSource).parameters}, text)
         return CaptureSource(path, **options) if is_capture(path) else BagSource(path, **options)
-    for fits, reader in (
-        (is_nuscenes, NuScenesSource),
-        (is_folder_dataset, FolderSource),
-        (is_once, OnceSource),
-        (find_drive, KittiSource),
-    ):
+    readers = {is_nuscenes: NuScenesSource, is_folder_dataset: FolderSource, is_once: OnceSource, find_drive: KittiSource}
+    for fits, reader in readers.items():
         if fits(path):
-            _refuse(options, text)
-            return reader(path, camera)
+            return _said(_only_rectified(options, text), reader(path, camera), camera)
     if any(path.glob("lidar/*.pkl*")):
         raise BadInputError(
             f"{text}: PandaSet's scans are pickles, which run code where they are read; write x, y, z, i of pandas.read_pickle, "
@@ -205,6 +201,18 @@ def is_nuscenes(path: Path) -> bool:
     return tables_folder(Path(split_scene(str(path))[0])) is not None
 
 
-def _refuse(options: dict[str, Any], source: str) -> None:
-    if options:
-        raise BadInputError(f"{source} has no option {', '.join(sorted(options))}; leave it out")
+def _only_rectified(options: dict[str, Any], source: str) -> bool:
+    """Whether pictures are said to be rectified. BadInputError for other options, which only bags have."""
+    if others := sorted(options.keys() - {"rectified"}):
+        raise BadInputError(f"{source} has no option {', '.join(others)}; leave it out")
+    return bool(options.get("rectified"))
+
+
+def _said(rectified: bool, source: Any, camera: int | str | None) -> Source:
+    """A source. Of rectified pictures, its camera is P of a folder's calibration, or K, without distortion."""
+    own = source.camera
+    if rectified and isinstance(source, FolderSource):
+        source.camera = read_camera(camera_file(source.path), camera, lambda: (own.width, own.height), rectified)[0]
+    elif rectified and not own.is_pinhole:
+        source.camera = Camera(own.K, own.width, own.height, said_rectified=True)
+    return cast(Source, source)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import dataclass, field
 
 import cv2
@@ -18,7 +18,7 @@ MIN_HISTORY = 5  # frames before any value is called unusual
 ACCUSTOMED = 300  # frames of little in a row, half a minute, after which this is what is usual: a garage, an open field
 # Shares of the usual contrast and number of returns below which a sensor is blinded: far below what scenes differ by.
 BLIND_CONTRAST, BLIND_RETURNS = 0.25, 0.2
-MIN_CONTRAST = 1.0  # grey levels between neighbouring squares; streets by day and night have 4 to 20
+LEAST = 1.0  # return, and grey level between neighbouring squares: streets by day and night have 4 to 20
 COMPARED_POINTS = 500  # points that decide whether two scans are the same
 FROZEN_IMAGES = 5  # identical ones in a row while the scans change: a driver that repeats one now and then is none
 SOME_ROWS = 16  # one row in so many tells most images apart
@@ -52,12 +52,11 @@ class SensorHealth:
     """
 
     def __init__(self) -> None:
-        self._contrasts: deque[float] = deque(maxlen=HISTORY)
-        self._returns: deque[int] = deque(maxlen=HISTORY)
+        self._usual: dict[SensorFault, deque[float]] = defaultdict(lambda: deque(maxlen=HISTORY))
+        self._low: dict[SensorFault, int] = defaultdict(int)  # frames in a row
         self._image: NDArray[np.uint8] | None = None
         self._points: NDArray[np.float32] | None = None
-        self.faulty_frames = 0
-        self._repeated_images = self._low_contrast = self._few_returns = 0  # frames in a row
+        self.faulty_frames = self._repeated_images = 0  # in a row
 
     def check(self, frame: Frame) -> SensorProblem | None:
         """The problem of the frame's image or scan, None if there is none. The camera comes first."""
@@ -72,17 +71,9 @@ class SensorHealth:
         whole = grey[: height * SHRINK_FACTOR, : width * SHRINK_FACTOR]
         small = np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
         contrast = float(np.mean([np.abs(np.diff(small.astype(np.int16), axis=axis)).mean() for axis in (0, 1)]))
-        frozen = self._is_frozen(frame)
-        usual = float(np.median(self._contrasts)) if len(self._contrasts) >= MIN_HISTORY else 0.0
-        low = MIN_CONTRAST <= contrast < BLIND_CONTRAST * usual
-        self._low_contrast = self._low_contrast + 1 if low else 0
-        if self._low_contrast > ACCUSTOMED:
-            self._contrasts.clear()
-        elif contrast < MIN_CONTRAST or self._low_contrast:
-            figures = f"contrast {contrast:.1f}" + (f", usually {usual:.1f}" if usual else "")
-            return SensorProblem.of(SensorFault.CAMERA_BLIND, figures)
-        self._contrasts.append(contrast)
-        return SensorProblem.of(SensorFault.IMAGE_FROZEN, f"{self._repeated_images} frames") if frozen else None
+        said = f"contrast {contrast:.1f}, usually {{:.1f}}"
+        frozen, blind = self._is_frozen(frame), self._blind(SensorFault.CAMERA_BLIND, contrast, BLIND_CONTRAST, said)
+        return blind or (SensorProblem.of(SensorFault.IMAGE_FROZEN, f"{self._repeated_images} frames") if frozen else None)
 
     def _is_frozen(self, frame: Frame) -> bool:
         points = frame.cloud.xyz[:: max(len(frame.cloud) // COMPARED_POINTS, 1)]
@@ -99,12 +90,15 @@ class SensorHealth:
 
     def _check_lidar(self, cloud: PointCloud) -> SensorProblem | None:
         returns = int(cloud.finite_mask().sum())
-        usual = float(np.median(self._returns)) if len(self._returns) >= MIN_HISTORY else 0.0
-        self._few_returns = self._few_returns + 1 if 0 < returns < BLIND_RETURNS * usual else 0
-        if self._few_returns > ACCUSTOMED:
-            self._returns.clear()
-        elif returns == 0 or self._few_returns:
-            figures = (f"{returns}" if returns else "no") + " returns" + (f", usually {usual:.0f}" if usual else "")
-            return SensorProblem.of(SensorFault.LIDAR_BLIND, figures)
-        self._returns.append(returns)
+        return self._blind(SensorFault.LIDAR_BLIND, returns, BLIND_RETURNS, f"{returns or 'no'} returns, usually {{:.0f}}")
+
+    def _blind(self, fault: SensorFault, value: float, share: float, said: str) -> SensorProblem | None:
+        """The problem of a value that is none, or less than this share of what is usual; what stays becomes usual."""
+        usual = float(np.median(self._usual[fault])) if len(self._usual[fault]) >= MIN_HISTORY else 0.0
+        self._low[fault] = self._low[fault] + 1 if LEAST <= value < share * usual else 0
+        if self._low[fault] > ACCUSTOMED:
+            self._usual[fault].clear()
+        elif value < LEAST or self._low[fault]:
+            return SensorProblem.of(fault, said.format(usual) if usual else said.partition(",")[0])
+        self._usual[fault].append(value)
         return None

@@ -20,13 +20,7 @@ from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import ESTIMATE
 from calib_ros.lidar.deskew import moved, scan_times
 from calib_ros.registration.features import FrameFeatures, at_time_offset, other_objective
-from calib_ros.registration.judgement.clocks import (
-    MIN_FRAMES,
-    Effect,
-    TimeOffset,
-    estimate_time_offset,
-    with_known_motion,
-)
+from calib_ros.registration.judgement.clocks import MIN_FRAMES, Effect, TimeOffset, estimate_time_offset, with_known_motion
 from calib_ros.registration.objective import Objective
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z, null_distribution, p_value

@@ -20,14 +20,7 @@ from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.covariance import REGIONS, disagreement, effective_frames, inflation, noise_of
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.judgement.refusal import (
-    GROSSLY,
-    OPEN_PROBABILITY,
-    SIGNIFICANCE,
-    Refusal,
-    left_open,
-    wrong_times,
-)
+from calib_ros.registration.judgement.refusal import GROSSLY, OPEN_PROBABILITY, SIGNIFICANCE, Refusal, left_open, wrong_times
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, Prior
 from calib_ros.registration.search.optimizers import (
@@ -171,13 +164,7 @@ class TimeOffset:
 
 
 def estimate_time_offset(
-    score: PointScore,
-    T: Transform,
-    limits: Limits,
-    prior: Prior | None,
-    twists: Matrix,
-    config: MotionConfig,
-    search: bool,
+    score: PointScore, T: Transform, limits: Limits, prior: Prior | None, twists: Matrix, config: MotionConfig, search: bool
 ) -> TimeOffset | None:
     """The joint optimum of extrinsic and time offset; None where the frames are too few or do not move differently.
 

@@ -159,19 +159,25 @@ def test_a_scan_in_firing_order_keeps_all_its_points(tmp_path):
     assert len(read_cloud(tmp_path / "a.bin")) == len(xyz)
 
 
-@pytest.mark.parametrize("more", [0, 1, 2, 3, 4])
-def test_scans_of_more_numbers_than_four_are_recognised(tmp_path, more):
-    """Along a ring, neighbours are near each other; other numbers taken for coordinates are not."""
-    azimuth = np.linspace(0, 2 * np.pi, 2000, dtype=np.float32)
+@pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize("more", [-1, 0, 1, 2, 3, 4])
+def test_scans_of_other_numbers_than_four_are_recognised(tmp_path, more, shuffled):
+    """Along a ring, neighbours are near each other; other numbers taken for coordinates are not. In any order, the numbers of a
+    point differ by their places."""
+    azimuth, rng = np.linspace(0, 2 * np.pi, 2000, dtype=np.float32), np.random.default_rng(0)
     xyz = np.stack([12 * np.cos(azimuth), 9 * np.sin(azimuth), np.full(2000, -1.5)], axis=1)
-    rest = np.random.default_rng(0).random((2000, 1 + more)) * 60
+    rows = np.hstack([xyz, rng.random((2000, 1 + more)) * 60]).astype("<f4")
+    rows = rng.permutation(rows) if shuffled else rows
     path = tmp_path / "a.bin"
-    np.hstack([xyz, rest]).astype("<f4").tofile(path)
+    rows.tofile(path)
     found = read_cloud(path)
-    assert np.allclose(found.xyz, xyz)
-    assert np.allclose(found.intensity, rest[:, 0])
+    assert np.array_equal(found.xyz, rows[:, :3])
+    assert found.intensity is None if more < 0 else np.array_equal(found.intensity, rows[:, 3])
     path.write_bytes(path.read_bytes()[:-4])
     with pytest.raises(BadInputError, match="truncated"):
+        read_cloud(path)
+    rng.normal(size=240).astype("<f4").tofile(path)
+    with pytest.raises(BadInputError, match="has 3 or 4 or 5 or 6 or 8 numbers a point, which they do not tell"):
         read_cloud(path)
 
 

@@ -10,6 +10,7 @@ import pytest
 from test_cloud_files import cloud, written
 from test_kitti import HEIGHT, WIDTH, write_image
 
+from calib_ros.cli.main import main
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.folder import FolderSource
 from calib_ros.errors import BadInputError
@@ -63,6 +64,19 @@ def test_frames_are_the_names_with_image_and_cloud(folder):
     assert np.array_equal(frame.reference, REFERENCE)
     assert (frame.camera.model, frame.camera.D.tolist()) == ("plumb_bob", [-0.1, 0.02, 0, 0, 0])
     assert (source.camera_frame, source.lidar_frame) == ("front", "lidar")
+
+
+def test_pictures_that_are_rectified_already_are_of_p_or_k(folder, capsys):
+    of_p = f"{CALIBRATION}projection_matrix: {{data: [30, 0, 22, 0, 0, 30, 12, 0, 0, 0, 1, 0]}}\n"
+    for text, cx in ((CALIBRATION, 20), (of_p, 22)):
+        (folder / "calibration.yaml").write_text(text + ROWS)
+        assert not open_dataset(folder, rectified=False).camera.is_pinhole
+        for source in (folder, "synthetic:rig=os1_64_wide,frames=1"):
+            camera = open_dataset(source, rectified=True).camera
+            assert (camera.is_pinhole, camera.said_rectified) == (True, True)
+        assert open_dataset(folder, rectified=True)[0].camera.K[0, 2] == cx
+    assert main(["info", str(folder), "--rectified"]) == 0
+    assert "no distortion" in capsys.readouterr().out
 
 
 def test_text_and_pictures_beside_frames_are_of_something_else(folder):

@@ -138,7 +138,6 @@ def test_a_camera_on_its_side_sees_poles_lie() -> None:
         (advice(SUSPECT, covariance()), "keep driving: the newest keyframes decide"),
         (advice(BLINDED, covariance(), fault=SensorFault.CAMERA_BLIND), "clean or uncover the camera"),
         (advice(BLINDED, covariance(), fault=SensorFault.LIDAR_BLIND), "clean or uncover the LiDAR"),
-        (advice(BLINDED, covariance(), fault=SensorFault.IMAGE_FROZEN), "restart the camera"),
         (advice(REFUSED, refusal=RefusalCode.NOT_SIGNIFICANT), "drive where there are poles, buildings or parked cars"),
         (advice(REFUSED, refusal=RefusalCode.WRONG_INTRINSICS, cause=Cause.FOCAL_LENGTH), "calibrate the camera's intrinsics"),
         (advice(REFUSED, refusal=RefusalCode.WRONG_TIMES, cause=Cause.TIME_OFFSET), "mend the time stamps"),

@@ -25,11 +25,7 @@ CONFIG = Config.from_dict(
         "search": {"rotation_deg": 0.0, "translation_m": 0.0},
         "semantics": {"segmentation": "none"},
         "motion": {"max_time_offset_s": 0.0},  # always the same street at the same speed, which says nothing of the clocks
-        "online": {
-            "min_keyframes": 3,
-            "buffer_size": 6,
-            "similarity_threshold": 1.0,
-        },
+        "online": {"min_keyframes": 3, "buffer_size": 6, "similarity_threshold": 1.0},
     }
 )
 

@@ -63,10 +63,7 @@ def estimate(
 
 @pytest.mark.parametrize(
     ("what", "box"),
-    [
-        *((what, None) for what in ("another scene", "another moment", "black", "mirrored", "two")),
-        ("covered", SearchBox(5, 0.3)),
-    ],
+    [*((what, None) for what in ("another scene", "another moment", "black", "mirrored", "two")), ("covered", SearchBox(5, 0.3))],
 )
 def test_outlier_frames_of_eight_are_named_and_left_out(eight, other, what, box):
     frames = eight.frames
@@ -93,11 +90,7 @@ def test_the_last_frame_can_be_the_outlier_and_is_named_by_its_number_without_a_
 
 
 @pytest.mark.parametrize(
-    ("seed", "options"),
-    [
-        (7, {"rings": 16}),
-        pytest.param(8, {"rings": 32, "speed": 5.0}, marks=pytest.mark.slow),
-    ],
+    ("seed", "options"), [(7, {"rings": 16}), pytest.param(8, {"rings": 32, "speed": 5.0}, marks=pytest.mark.slow)]
 )
 def test_no_frame_of_a_clean_drive_is_left_out(seed, options):
     drive = Scene(seed, 5, **{"width": 480, "height": 180, **options})
