@@ -71,10 +71,13 @@ class NodeService:
         """Any event of the pipeline (calib_ros/online/events.py); on any thread."""
 
 
+_installed = cache(entry_points)  # of all groups, since each question reads every distribution
+
+
 @cache
 def _entries(group: str) -> Mapping[str, EntryPoint]:
     found = {}
-    for entry in sorted(entry_points(group=group), key=lambda e: e.name):
+    for entry in sorted(_installed().select(group=group), key=lambda e: e.name):
         with suppress(ImportError):  # a distribution may leave some of our packages out
             if find_spec(entry.module.partition(".")[0]) is not None:
                 found[entry.name] = entry

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -24,6 +25,7 @@ from calib_ros.ros.parameters import Parameters
 
 # Of the executor: in the first one coroutines whose promise is done return, in the second one what they left to do is done.
 ROUNDS = 2
+NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)  # which rclpy would ask at every wake
 
 
 class NodePart(NodeService):
@@ -50,7 +52,7 @@ class NodePart(NodeService):
         return pipeline
 
     def _create_publisher(self, kind: Any, topic: str, qos: QoSProfile | int) -> Publisher:
-        self._publishers.append(self._node.create_publisher(kind, topic, qos))
+        self._publishers.append(self._node.create_publisher(kind, topic, qos, event_callbacks=NO_EVENTS))
         return self._publishers[-1]
 
     def _serve(self, kind: Any, name: str, answer: Callable[[Any, Any], Any], group: CallbackGroup | None = None) -> None:

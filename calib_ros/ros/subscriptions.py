@@ -178,11 +178,11 @@ class AdaptiveSubscription:
         receive = partial(self._receive, self._made, self._form.restore)
         subscribe = partial(self._node.create_subscription, self._form.kind, self._topic, receive, qos, raw=True)
         try:
-            return subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
+            return subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost, use_default_callbacks=False))
         except UnsupportedEventTypeError:
             text = "this middleware does not report lost messages: only gaps in the stamps tell of them"
             self._node.get_logger().info(text, once=True)
-            return subscribe()
+            return subscribe(event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
 
     def _on_lost(self, event: Any) -> None:
         self._lost += event.total_count_change
