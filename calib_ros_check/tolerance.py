@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -157,7 +157,7 @@ def posterior_samples(error: Matrix, C: Matrix, tolerance: Tolerance, freedom: f
     well the component predicts the estimate. Deterministic.
     """
     variances = [[turn**2] * 3 + [shift**2] * 3 for turn in np.deg2rad(tolerance.deg) * SCALES for shift in tolerance.m * SCALES]
-    noises = freedom / chi2.ppf(QUANTILES, freedom) if np.isfinite(freedom) else np.ones(1)
+    noises = freedom / (2 * scipy.special.gammaincinv(freedom / 2, QUANTILES)) if np.isfinite(freedom) else np.ones(1)
     prior = np.tile(np.array([np.diag(own) for own in variances]), (len(noises), 1, 1))
     noise = np.repeat(noises, len(variances))[:, None, None] * C
     L = np.linalg.cholesky(noise + prior)

@@ -45,8 +45,10 @@ from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, Proce
 from calib_ros.ros.services import Services
 from calib_ros.ros.tf import CURES, StaticTf
 from calib_ros.ros.write_back import WriteBack, check_files
+from calib_ros.runtime import trim_memory
 
 DIAGNOSED_AGAIN_S = 0.2  # between two changes of status that /diagnostics follows at once
+CHECKS_PER_TRIM = 20  # keyframes leave gaps
 TF_CURE = "take what says otherwise out of the robot's description, or write the rig to its joints with calib-ros rig --out"
 TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")  # of the name of a node
 # Settings of a node of one pair that a rig has in another way, or a pair each by itself.
@@ -86,7 +88,7 @@ class Calibration(NodeService):
         self.parts: list[NodeService] = [self.health, self.tf, self.write_back]  # as they begin; they end the other way round
         self._end_threads: Callable[[], bool] = lambda: True  # all but those of the parts; True if they ended
         self._timers: list[Timer] = []
-        self._is_part, self.active = inputs is not None, False
+        self._is_part, self.active, self._checks = inputs is not None, False, 0
         self.ended: bool | None = None
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._status_changed = node.create_guard_condition(self._on_status_change)
@@ -203,6 +205,9 @@ class Calibration(NodeService):
             for part in self.parts:
                 part.check()
             self._diagnose()
+            self._checks += 1
+            if not self._is_part and self._checks % CHECKS_PER_TRIM == 0:
+                trim_memory()
 
     def again(self) -> None:
         """See `NodeService`."""

@@ -34,9 +34,7 @@ from calib_ros.ros.inputs import Decoded
 from calib_ros.ros.parts import NodePart
 from calib_ros.ros.publishers import VALID_PERIODS
 from calib_ros.ros.rig_lidars import LidarsOfRig
-from calib_ros.runtime import trim_memory
 
-CHECKS_PER_TRIM = 20  # keyframes of many pairs leave gaps
 Priors = dict[str, tuple[Transform, Covariance]]
 
 
@@ -77,7 +75,7 @@ class RigGraph(NodePart):
         self._lock = threading.Lock()  # of state and what is published of them
         self._priors_now: Priors = dict(self._priors_given)
         self._told: list[PairState] = []  # what the newest solution rests on
-        self._text, self._checks = "", 0
+        self._text = ""
         self._edges: list[TransformStamped] = []  # of the newest solution
         self._solver: Worker[tuple[LiveRig, list[PairState], Priors]] = Worker("calib_rig", self._solve, self._failed)
         self._publisher = self._create_publisher(Rig, "~/rig", LATCHED)
@@ -130,9 +128,6 @@ class RigGraph(NodePart):
     def check(self) -> None:
         """See `NodeService`."""
         self.load.count_messages()
-        self._checks += 1
-        if self._checks % CHECKS_PER_TRIM == 0:
-            trim_memory()
         states, priors = [self._state_of(*names, pair) for names, pair in self.pairs.items()], self._priors()
         self._priors_now, reference = priors, self.description.reference
         doubt, lost = any(own.status in (SUSPECT, MOVED) for own in states), {own.pair for own in states if own.status == MOVED}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
@@ -89,7 +89,7 @@ def scatter(sequences: Sequence[Extrinsics]) -> Matrix:
 
 def _excess(squares: Matrix, variances: Matrix) -> float:
     """Variance per recording, which differences of two have twice, that is missing in `variances` (n,) of differences."""
-    wanted = float(chi2.median(1))
+    wanted = float(chdtri(1, 0.5))
 
     def median(excess: float) -> float:
         return float(np.median(squares / (variances + 2 * excess)))
@@ -129,7 +129,7 @@ def segments(sequence: Extrinsics, false_alarms: float = FALSE_ALARMS, seed: int
     if not n:
         return Segments(np.zeros(0, np.intp), (), np.zeros((0, 6)), np.zeros((0, 6, 6)), ())
     penalty = change_penalty(sequence.covariances, false_alarms, seed)
-    outlier_penalty = float(chi2.isf(false_alarms, 6))
+    outlier_penalty = float(chdtri(6, false_alarms))
     outliers: list[int] = []
     while True:
         kept = np.setdiff1d(np.arange(n), outliers)
@@ -221,7 +221,7 @@ def change_penalty(covariances: Matrix, false_alarms: float, seed: int = 0) -> f
     """
     n = len(covariances)
     if n < 2:
-        return float(chi2.isf(false_alarms, 6))
+        return float(chdtri(6, false_alarms))
     probability = -np.expm1(-false_alarms * n)
     count = int(np.clip(EXCEEDING / probability, FEWEST, MOST))
     W = np.linalg.inv(covariances)

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import erfcinv
-from scipy.stats import chi2
+from scipy.special import chdtrc, erfcinv
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
@@ -205,7 +204,7 @@ def _mark(known: Sequence[Row], sequence: Extrinsics, found: Segments) -> None:
         square = float(drift @ np.linalg.solve(C + sequence.covariances[k], drift))
         row.drift_deg = float(np.rad2deg(np.linalg.norm(drift[:3])))
         row.drift_m = float(np.linalg.norm(drift[3:]))
-        row.drift_sigma = float(np.minimum(np.sqrt(2) * erfcinv(chi2.sf(square, 6)), MOST_SIGMAS))
+        row.drift_sigma = float(np.minimum(np.sqrt(2) * erfcinv(chdtrc(6, square)), MOST_SIGMAS))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi
+import scipy
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
@@ -47,7 +47,7 @@ def claimed(
 ) -> RigSolution:
     """Poses T_reference_sensor (4, 4) as a solution of which the check asks: known so well that 95 % of errors are within the
     tolerance, which is no displacement. edges: whose offsets of clocks are claimed to be clock_s, s."""
-    sigmas = np.array([tolerance.deg, tolerance.m]) / chi.ppf(INTERVAL, 3)
+    sigmas = np.array([tolerance.deg, tolerance.m]) / np.sqrt(2 * scipy.special.gammaincinv(3 / 2, INTERVAL))
     others = [name for name in poses if name != reference]
     covariance = np.zeros((6 * len(others), 6 * len(others)))
     for k, name in enumerate(others):

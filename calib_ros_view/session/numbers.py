@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
@@ -204,7 +204,7 @@ def ellipse(covariance: Matrix, pair: tuple[int, int]) -> Matrix:
     values, vectors = np.linalg.eigh(C)
     turn = np.linspace(0, 2 * np.pi, ELLIPSE_POINTS)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return np.asarray(circle * np.sqrt(chi2.ppf(PROBABILITY, 2) * np.maximum(values, 0)) @ vectors.T)
+    return np.asarray(circle * np.sqrt(chdtri(2, 1 - PROBABILITY) * np.maximum(values, 0)) @ vectors.T)
 
 
 def curve_plots(numbers: Numbers) -> str:
