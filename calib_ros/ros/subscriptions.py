@@ -166,8 +166,9 @@ class AdaptiveSubscription:
     def _problem(self, types: list[str], publishers: list[QoSProfile]) -> str:
         others = sorted(set(types) - {type_name(self.kind)})
         if others:
-            text = f"{', '.join(others)}, but {type_name(self.kind)} is wanted"
-            return f"{self.topic} is published as {text}; {advice(others[0], self._forms[0].kind)}"
+            cures = {Image: IMAGE_ADVICE, CompressedImage: IMAGE_ADVICE, PointCloud2: POINTS_ADVICE}.get(self._forms[0].kind, {})
+            text = f"{', '.join(others)}, but {type_name(self.kind)} is wanted; {cures.get(others[0], 'check the remapping')}"
+            return f"{self.topic} is published as {text}"
         if self.reliable and any(p.reliability == BEST_EFFORT for p in publishers):
             return f"a publisher of {self.topic} offers best effort only and cannot be received; set reliability: auto"
         return ""
@@ -200,12 +201,6 @@ class AdaptiveSubscription:
             self._received_at = time.monotonic()
             self.largest = max(self.largest, len(data))
             self._callback(stamp, msg)
-
-
-def advice(published: str, wanted: type[Any]) -> str:
-    """What to do where a topic is published as another type than is wanted."""
-    known = {Image: IMAGE_ADVICE, CompressedImage: IMAGE_ADVICE, PointCloud2: POINTS_ADVICE}.get(wanted, {})
-    return known.get(published, "check the remapping")
 
 
 def livox_forms() -> list[Form]:
