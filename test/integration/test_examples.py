@@ -39,7 +39,6 @@ NOT_RUN = {
     "needs a data set": (r".*nuscenes|calib-ros certify /data/", 2),
     "needs a longer recording": (r"calib-ros calibrate \w+ --initial motion", 1),
     "takes minutes": (r"make (demo|test)$|calib-ros (rig|evaluate|check \S+ --rig|convert \S+rig=two_lidars)", 8),
-    "needs a Dask cluster": (r".* --scheduler ", 1),
 }
 PREPARED: dict[str, Callable[[Path], None]] = {
     "check": sample_drives.for_check,
