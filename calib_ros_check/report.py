@@ -21,7 +21,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.io import check_output
 from calib_ros.lidar.deskew import deskewed_frame
-from calib_ros.overlay import render
+from calib_ros.overlay import layout, render
 from calib_ros.result import VERSION
 from calib_ros.rig.description import CAMERA, LIDAR
 from calib_ros.rig.edges import RigMeasurer
@@ -35,7 +35,7 @@ from calib_ros_check.rig.shown import EdgeShown, RigShown, SensorShown
 from calib_ros_check.tolerance import TITLES, Judgement, amount, signed
 
 PICTURES = 3
-MAX_WIDTH = 1100  # px of a picture on the page
+MAX_WIDTH = 700  # px of a picture on the page
 QUALITY = 85  # of JPEG
 STYLE = """\
 .verdict { display: inline-block; padding: .25rem .9rem; border-radius: 6px; color: #fff; font-weight: 700; font-size: 1.2rem; }
@@ -58,7 +58,9 @@ td.words { white-space: normal; min-width: 13rem; }
 }
 .part { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; padding: .7rem .9rem; }
 .rig .grid { margin: 0 0 1.2rem; } .rig figure svg { padding: .8rem .6rem .2rem; }
-.intro span { white-space: nowrap; }
+.beside { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 18rem), 1fr)); gap: 3px; }
+.beside > div { position: relative; } .intro span { white-space: nowrap; }
+.beside span { position: absolute; padding: 0 .5rem; color: #fff; background: #000a; font-size: .85rem; }
 nav { display: none; }
 """
 # Of `rows`, see `deviation_rows`.
@@ -77,12 +79,13 @@ DEVIATIONS = """\
 {% endfor %}
 </table></div></div>
 """
-# Of `pictures`: names and JPEGs.
+# Of `pictures`: names, and what `views_of` gives.
 SHEET = """\
 <div class="grid">
-{% for name, picture in pictures %}
-<figure{{ ' class=wide' if pictures|length < 4 }}><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="{{ name }}">
-<figcaption><b>{{ name }}</b></figcaption></figure>
+{% for name, shown in pictures %}
+<figure{{ ' class=wide' if pictures|length < 4 }}><div class="beside">{% for what, picture in shown %}
+<div><span>{{ what }}</span><img src="data:image/jpeg;base64,{{ picture|base64 }}" alt="{{ name }}, {{ what }}"></div>
+{% endfor %}</div><figcaption><b>{{ name }}</b></figcaption></figure>
 {% endfor %}
 </div>
 """
@@ -139,6 +142,7 @@ its median, and where it lies with 95 %. Shaded: the tolerance, {{ facts.toleran
     + "{% endif %}\n{% endblock %}\n"
 )
 Part = tuple[str, str, list[dict[str, object]], list[tuple[str, str, str]], bool]  # name, verdict, rows, causes, what was mended
+Views = list[tuple[str, bytes]]  # what each shows, and a JPEG
 SHOWS = "Before: as given. After: as the scenes show it."
 
 
@@ -154,36 +158,30 @@ def write_report(path: str | Path, checked: Checked) -> None:
         "tolerance": str(result.tolerance),
     }
     shown = [frames[k] for k in spread_positions(PICTURES, len(frames))]
-    pictures = [(f"frame {own.name}", picture_of(own, result.T_checked, result.T_estimated, config)) for own in shown]
-    part = _part("", result.verdict.value, result, result.tolerance)
-    more: dict[str, Any] = {
-        "compared": "The extrinsic as given." if result.T_estimated is None else SHOWS,
-        "verdict": result.verdict.value,
-    }
-    _write(path, checked.source, config, facts, pictures, said=result.reason, notes=result.notes, parts=[part], **more)
+    pictures = [(f"frame {own.name}", views_of(own, result.T_checked, result.T_estimated, config)) for own in shown]
+    more: dict[str, Any] = {"verdict": result.verdict.value, "said": result.reason, "notes": result.notes}
+    more["compared"] = "The extrinsic as given." if result.T_estimated is None else SHOWS
+    more["parts"] = [_part("", result.verdict.value, result, result.tolerance)]
+    _write(path, checked.source, config, facts, pictures, **more)
 
 
 def write_rig_check(path: str | Path, found: RigCheck, config: Config) -> None:
     """The same of a rig: its sensors, its pairs one by one, and a frame of each camera with a LiDAR."""
-    sensors = []
+    sensors, edges, parts, pictures = [], [], [], []
     for name, own in found.sensors.items():
         kind, sizes = CAMERA if name in found.cameras else LIDAR, (own.judgement.rotation, own.judgement.translation)
         error = ", ".join(size.words for size in sizes if size.is_known and size.words not in own.reason)
-        verdict = own.verdict.value
-        sensors.append(SensorShown(name, kind, found.given[name], verdict, own.reason, usable=None, error=error))
-    edges = []
+        sensors.append(SensorShown(name, kind, found.given[name], own.verdict.value, own.reason, usable=None, error=error))
     for p in found.pairs:
-        rotation, translation = p.judgement.rotation, p.judgement.translation
-        size = (rotation.error, translation.error) if rotation.is_known else None
-        edges.append(EdgeShown(p.target, p.source, p.kind, p.verdict.value, html.LEVELS[p.verdict.value], p.reason, size))
+        name, verdict, turn, shift = f"{p.target} with {p.source}", p.verdict.value, p.judgement.rotation, p.judgement.translation
+        size = (turn.error, shift.error) if turn.is_known else None
+        edges.append(EdgeShown(p.target, p.source, p.kind, verdict, html.LEVELS[verdict], p.reason, size))
+        if p.check is not None:
+            parts.append(_part(name, verdict, p.check, found.tolerance))
+            if p.frame is not None:
+                pictures.append((name, views_of(p.frame, p.check.T_checked, p.check.T_estimated, config)))
     loops = tuple((own.sensors, own.size, own.p_value, own.closes) for own in found.solution.loops)
     rig = RigShown(found.solution.reference, tuple(sensors), tuple(edges), loops, found.reason)
-    parts = [_part(f"{p.target} with {p.source}", p.verdict.value, p.check, found.tolerance) for p in found.pairs if p.check]
-    pictures = [
-        (f"{p.target} with {p.source}", picture_of(p.frame, p.check.T_checked, p.check.T_estimated, config))
-        for p in found.pairs
-        if p.frame is not None and p.check is not None
-    ]
     more: dict[str, Any] = {"verdict": found.verdict.value, "compared": SHOWS, "notes": found.notes, "parts": parts}
     _write(path, found.source, config, {"tolerance": str(found.tolerance)}, pictures, rig, **more)
 
@@ -197,10 +195,10 @@ def write_rig(path: str | Path, report: RigReport, measurer: RigMeasurer) -> Non
             lidar = (seen or measurer.description.lidars)[0]
             source = measurer.rig.pair(camera, lidar)
             ends = known.between(camera, lidar)[0], solution.between(camera, lidar)[0]
-            pictures.append((f"{camera} with {lidar}", picture_of(source[len(source) // 2], *ends, measurer.config_of(camera))))
+            pictures.append((f"{camera} with {lidar}", views_of(source[len(source) // 2], *ends, measurer.config_of(camera))))
     facts = {"tolerance": f"{report.limits.tolerance_deg:g} deg / {100 * report.limits.tolerance_m:g} cm"}
-    more: dict[str, Any] = {"compared": "Before: by the priors. After: as estimated.", "parts": [], "command": "rig", "notes": []}
-    _write(path, report.source, measurer.config, facts, pictures, html.of_report(report), **more)
+    more: dict[str, Any] = {"compared": "Before: by the priors. After: as estimated.", "parts": [], "notes": []}
+    _write(path, report.source, measurer.config, facts, pictures, html.of_report(report), "rig", **more)
 
 
 def rig_page(path: str | Path) -> Callable[[RigReport, RigMeasurer], None]:
@@ -214,22 +212,22 @@ def _write(
     source: str,
     config: Config,
     facts: Mapping[str, str],
-    pictures: Sequence[tuple[str, bytes]],
+    pictures: Sequence[tuple[str, Views]],
     rig: RigShown | None = None,
     command: str = "check",
     **shown: Any,
 ) -> None:
     facts = {"recording": source, **facts, "version": VERSION}
     if rig is not None:
-        facts["sensors"] = f"{len(rig.cameras)} cameras, {len(rig.lidars)} LiDARs, in the frame of {rig.reference}"
+        facts["sensors"] = f"cameras: {len(rig.cameras)}, LiDARs: {len(rig.lidars)}, in the frame of {rig.reference}"
         captions = "what was measured between the sensors", "the sensors from above, and where each looks"
         shown["drawings"] = list(zip((html.graph_svg(rig), html.plan_svg(rig)), captions, strict=True))
         shown["tables"] = [("Sensors", html.sensors_html(rig)), ("Edges", html.edges_html(rig)), ("Loops", html.loops_html(rig))]
-        shown |= {"legend": html.legend(), "said": rig.text}
-    name = re.split("[:,]", source.rstrip("/").rpartition("/")[2])[0] or source  # of a synthetic one without its settings
-    title = f"{'Rig' if command == 'rig' else 'Check'} of {name}"
-    values = {"verdict": "", "command": command, "title": title, "pictures": pictures, "rig": rig, **shown}
-    write_page(path, page_template(TEMPLATE), config, facts, **values)
+        shown |= {"legend": html.legend(any(own.excess is not None for own in rig.edges)), "said": rig.text}
+    # Of a synthetic one that of its rig.
+    name = re.sub(r"^synthetic:(.*rig=(\w+).*|.*)$", r"\2", source.rstrip("/").rpartition("/")[2]) or source.partition(":")[0]
+    values = {"verdict": "", "command": command, "pictures": pictures, "rig": rig, **shown}
+    write_page(path, page_template(TEMPLATE), config, facts, title=f"{command.title()} of {name}", **values)
 
 
 def check_report(path: str | Path) -> None:
@@ -245,21 +243,16 @@ def _part(name: str, verdict: str, check: CheckResult, tolerance: Tolerance) -> 
 
 def deviation_rows(found: CheckResult | Judgement, tolerance: Tolerance) -> list[dict[str, object]]:
     """What DEVIATIONS shows of the size of an error."""
-    return [_row(own, tolerance) for own in (found.rotation, *found.axes[:3], found.translation, *found.axes[3:])]
-
-
-def _row(own: Deviation, tolerance: Tolerance) -> dict[str, object]:
-    is_angle = own.name in ("rotation", "rx", "ry", "rz")
-    limit = tolerance.deg if is_angle else tolerance.m
-    known, said = own.is_known, amount if own.name in ("rotation", "translation") else signed
-    return {
-        "name": f"{TITLES[own.name]} ({own.name})" if own.name in TITLES else f"{own.name} in all",
-        "verdict": own.verdict.value,
-        "error": said(own.error, is_angle) if known else "-",
-        "interval": f"{said(own.low, is_angle)} to {said(own.high, is_angle)}" if known else "-",
-        "words": own.words,
-        "bar": _bar(own, limit) if known else None,
-    }
+    rows: list[dict[str, object]] = []
+    for own in (found.rotation, *found.axes[:3], found.translation, *found.axes[3:]):
+        is_angle, known = own.name in ("rotation", "rx", "ry", "rz"), own.is_known
+        said = amount if own.name in ("rotation", "translation") else signed
+        name = f"{TITLES[own.name]} ({own.name})" if own.name in TITLES else f"{own.name} in all"
+        error, low, high = (said(value, is_angle) if known else "-" for value in (own.error, own.low, own.high))
+        bar = _bar(own, tolerance.deg if is_angle else tolerance.m) if known else None
+        row = {"name": name, "verdict": own.verdict.value, "error": error, "words": own.words, "bar": bar}
+        rows.append({**row, "interval": f"{low} to {high}" if known else "-"})
+    return rows
 
 
 def _bar(own: Deviation, limit: float) -> dict[str, object]:
@@ -278,14 +271,13 @@ def _bar(own: Deviation, limit: float) -> dict[str, object]:
     }
 
 
-def picture_of(frame: Frame, T_checked: Transform, T_found: Transform | None, config: Config) -> bytes:
-    """JPEG of a frame under the extrinsic (4, 4) as given and as the scenes show it."""
-    shown = deskewed_frame(frame, config.motion)
-    error = "" if T_found is None else f"{se3.rotation_error_deg(T_found, T_checked):.2f} deg apart"
-    picture = render(
-        shown, T_checked if T_found is None else T_found, T_before=T_found if T_found is None else T_checked, lines=[error]
-    )
-    if picture.shape[1] > MAX_WIDTH:
-        height = round(picture.shape[0] * MAX_WIDTH / picture.shape[1])
-        picture = np.asarray(cv2.resize(picture, (MAX_WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
-    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1])
+def views_of(frame: Frame, T_checked: Transform, T_found: Transform | None, config: Config) -> Views:
+    """A frame with its points at the extrinsic (4, 4) as given, and as the scenes show it."""
+    shown, (height, width) = deskewed_frame(frame, config.motion), frame.image.shape[:2]
+    names = ["before"] if T_found is None else ["before", f"after, turned by {se3.rotation_error_deg(T_found, T_checked):.2f}°"]
+    picture = render(shown, T_checked if T_found is None else T_found, T_before=T_found if T_found is None else T_checked)
+    size = min(width, MAX_WIDTH), round(height * min(1.0, MAX_WIDTH / width))
+    panels = (picture[y : y + height, x : x + width] for x, y in layout(width, height, len(names)).panels)
+    small = (cv2.resize(panel, size, interpolation=cv2.INTER_AREA) for panel in panels)
+    jpegs = (cv2.imencode(".jpg", own, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes() for own in small)
+    return list(zip(names, jpegs, strict=True))

@@ -18,7 +18,7 @@ from calib_ros_check.fleet.fleet import Fleet, FleetOptions
 from calib_ros_check.fleet.history import ERROR, VERDICTS, Certificate, Row, Vehicle, VehicleChange
 from calib_ros_check.page import page_template, write_page
 from calib_ros_check.recording import CheckOptions, opened, positions_of, read_frames
-from calib_ros_check.report import DEVIATIONS, SHEET, STYLE, deviation_rows, picture_of
+from calib_ros_check.report import DEVIATIONS, SHEET, STYLE, Views, deviation_rows, views_of
 from calib_ros_check.tolerance import AXES, amount, signed
 
 WIDTH, HEIGHT = 380, 150  # px, where a phone shows it
@@ -278,8 +278,8 @@ def _many(count: int, what: str) -> str:
     return f"{count} {what}{'s' if count != 1 else ''}"
 
 
-def pictures_of(own: Certificate, options: CheckOptions) -> list[tuple[str, bytes]]:
-    """Name and JPEG of a few frames."""
+def pictures_of(own: Certificate, options: CheckOptions) -> list[tuple[str, Views]]:
+    """A few frames, by name."""
     if own.shown is None or own.T_checked is None:
         return []
     job = own.shown.of
@@ -289,7 +289,7 @@ def pictures_of(own: Certificate, options: CheckOptions) -> list[tuple[str, byte
         positions = positions_of(source, options)
         few = [positions[k] for k in spread_positions(PICTURES, len(positions))]
         frames = read_frames(source, few, options.config, lambda share: None, None)[0]
-        return [(f"frame {frame.name}", picture_of(frame, own.T_checked, own.T_found, options.config)) for frame in frames]
+        return [(f"frame {frame.name}", views_of(frame, own.T_checked, own.T_found, options.config)) for frame in frames]
     except CalibrationError:
         return []
 

@@ -29,7 +29,8 @@ LEVELS = {  # of whatever has a status: a pair, a sensor, an edge, a check
     **dict.fromkeys((REFUSED, INSUFFICIENT, SUSPECT, DOUBTED, "inconclusive"), DOUBTFUL),
     **dict.fromkeys((MOVED, BLINDED, UNCHECKED, REJECTED, "fail"), BAD),
 }
-EXCESS = 2.0  # standard deviations, in the mean of the six axes, from which on an edge that is used is doubtful
+# Standard deviations, in the mean of the six axes, from which on an edge is drawn otherwise, and one that is used is doubtful.
+FAR, EXCESS = (0.5, 1.0), 2.0
 Size = tuple[float, float]  # deg and m
 LoopShown = tuple[Sequence[str], Size, float, bool]  # sensors, residual, p-value, whether it closes
 NOT_ESTIMATED = "nothing is estimated: these are the priors; give a result of calib-ros rig --json with --initial"
@@ -54,6 +55,8 @@ CSS = """
 .graph path { stroke: var(--level); fill: none; stroke-width: 2.5; } .graph rect { fill: var(--card); stroke: var(--level); }
 .graph .neutral path { stroke-width: 1.5; stroke-dasharray: 2 4; } .graph .doubtful path { stroke-dasharray: 9 4; }
 .graph .bad path { stroke-dasharray: 3 3; } .graph circle { fill: var(--card); stroke: var(--level); }
+.far1 { --level: color-mix(in oklch decreasing hue, var(--good), var(--doubtful) 40%); } .graph path.far1 { stroke-width: 3.5; }
+.far2 { --level: color-mix(in oklch decreasing hue, var(--good), var(--doubtful) 75%); } .graph path.far2 { stroke-width: 4.5; }
 .graph line { stroke: var(--line); } .graph .ahead { stroke: var(--ink); stroke-width: 1.5; }
 @media (max-width: 800px) {
   .rig th { display: none; } .rig tr { display: block; border-top: 1px solid var(--line); padding: .25rem 0; }
@@ -158,13 +161,11 @@ def of_result(data: Mapping[str, Any], solution: RigSolution) -> RigShown:
         sensors = []
         for name, T in solution.poses.items():
             own, error = data["sensors"][name], data["sensors"][name].get("reference_error")
-            words = (
-                "" if error is None or name == solution.reference else amounts((error["rotation_deg"], error["translation_m"]))
-            )
+            off = None if error is None or name == solution.reference else (error["rotation_deg"], error["translation_m"])
             sensors.append(
                 SensorShown(
                     *(name, str(own["kind"]), T, str(own["status"]), str(own["reason"]), own["status"] in (CONVERGED, REFERENCE)),
-                    *(worst_sigmas(at_sensor(T, solution.marginal(name))), moved.get(name), words),
+                    *(worst_sigmas(at_sensor(T, solution.marginal(name))), moved.get(name), amounts(off)),
                 )
             )
         edges = []
@@ -200,9 +201,11 @@ def summary(sensors: Sequence[SensorShown], edges: Sequence[EdgeShown], loops: S
     return "; ".join([*parts, *(f"loop {', '.join(names)} does not close" for names, _, _, closes in loops if not closes)])
 
 
-def legend() -> str:
-    """Signs and colours of the levels."""
-    return " &nbsp; ".join(_signed(level, word) for level, word in WORDS.items())
+def legend(residuals: bool = True) -> str:
+    """Signs and colours of the levels; and those of what is left of good edges."""
+    shown = [_signed(level, word) for level, word in WORDS.items()]
+    lines = (f'<span><b class="sign good far{k}">━</b> up to {most:g}σ</span>' for k, most in enumerate((*FAR, EXCESS)))
+    return " &nbsp; ".join([*shown, f"residual of an edge: {' '.join(lines)}"] if residuals else shown)
 
 
 def _signed(level: str, word: str) -> str:
@@ -211,8 +214,7 @@ def _signed(level: str, word: str) -> str:
 
 def graph_svg(rig: RigShown) -> str:
     """Cameras to the left, LiDARs to the right, the reference first; between them what was measured."""
-    columns = [[own for own in rig.sensors if own.name in names] for names in (rig.cameras, rig.lidars)]
-    columns[1].sort(key=lambda own: own.name != rig.reference)
+    columns = [[own for name in names for own in rig.sensors if own.name == name] for names in (rig.cameras, rig.lidars)]
     rows = max(len(column) for column in columns)
     at = {
         own.name: (0.0 if side == 0 else float(WIDTH - BOX), ROW * (k + 0.5) * rows / len(column))
@@ -239,6 +241,11 @@ def _cut(name: str) -> str:
     return escape(name if len(name) <= LETTERS else name[: LETTERS - 1] + "…")
 
 
+def _path(edge: EdgeShown, d: str) -> str:
+    far = 0 if edge.excess is None or edge.level != GOOD else int(np.searchsorted(FAR, edge.excess))
+    return f'<path class="far{far}" d="{d}"/>'
+
+
 def _line(edge: EdgeShown, at: dict[str, tuple[float, float]]) -> str:
     (x, y), (u, v) = sorted((at[edge.target], at[edge.source]))
     same = x == u
@@ -252,7 +259,7 @@ def _line(edge: EdgeShown, at: dict[str, tuple[float, float]]) -> str:
         f"{SIGNS[edge.level]}</text>"
     )
     title = escape(f"{edge.target} with {edge.source}: {edge.fate} {amounts(edge.residual)} {edge.reason}".strip())
-    return f'<g class="{edge.level}"><title>{title}</title><path d="{path}"/>{mark if edge.level in (DOUBTFUL, BAD) else ""}</g>'
+    return f'<g class="{edge.level}"><title>{title}</title>{_path(edge, path)}{mark if edge.level in (DOUBTFUL, BAD) else ""}</g>'
 
 
 def plan_svg(rig: RigShown) -> str:
@@ -268,7 +275,7 @@ def plan_svg(rig: RigShown) -> str:
     for edge in rig.edges:
         if edge.target in at and edge.source in at:
             (x, y), (u, v) = at[edge.target], at[edge.source]
-            drawn.append(f'<g class="{edge.level}"><path d="M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}"/></g>')
+            drawn.append(f'<g class="{edge.level}">{_path(edge, f"M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}")}</g>')
     across = sorted(rig.sensors, key=lambda own: float(at[own.name][0]))
     for side, column in enumerate((across[:rows], across[rows:])):
         for k, own in enumerate(sorted(column, key=lambda own: float(at[own.name][1]))):
@@ -276,7 +283,7 @@ def plan_svg(rig: RigShown) -> str:
             u, v = np.array([x, y]) + 13 * own.T[:2, 2 if own.kind == CAMERA else 0] * [1, -1]
             end, anchor = (LABEL - 4, "end") if side == 0 else (LABEL + PLAN + 4, "start")
             drawn.append(
-                f'<line x1="{end}" y1="{row:.1f}" x2="{x:.1f}" y2="{y:.1f}"/>'
+                f'<line x1="{end + (4 if side == 0 else -4)}" y1="{row:.1f}" x2="{x:.1f}" y2="{y:.1f}"/>'
                 f'<line class="ahead" x1="{x:.1f}" y1="{y:.1f}" x2="{u:.1f}" y2="{v:.1f}"/>'
                 f'<g class="{own.level}"><circle cx="{x:.1f}" cy="{y:.1f}" r="3.5"/>'
                 f'<text x="{end}" y="{row + 4:.1f}" text-anchor="{anchor}">{_cut(own.name)}</text></g>'

@@ -259,7 +259,7 @@ def test_right_and_wrong_calibrations_of_a_data_set_are_told_apart(tree: Path, c
     assert doubtful.index("(2 of 2)") < doubtful.index("damaged")
     assert "campus" not in doubtful
     shown = [np.frombuffer(base64.b64decode(own.partition("base64,")[2]), np.uint8) for own in Page(page).sources]
-    assert [cv2.imdecode(picture, cv2.IMREAD_COLOR).shape[1] for picture in shown] == [640] * 6
+    assert [cv2.imdecode(picture, cv2.IMREAD_COLOR).shape[1] for picture in shown] == [640] * 12
 
     before = (out / "results.jsonl").read_bytes()
     assert main(command) == 1
