@@ -36,8 +36,6 @@ OF_SOURCES = (
     *("source", "rig", "initial", "yaw_deg", "config", "frames", "out"),
     *("camera", "image_topic", "points_topic", "camera_info_topic", "rectified", "clock", "incomplete"),
 )
-
-
 Shown = tuple[str, Callable[[], None], Opening | None]  # title, builds the page for a browser, opens those of a rig's pairs
 
 

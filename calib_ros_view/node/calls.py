@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from calib_ros.errors import BadInputError
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros_check.rig.shown import BAD, GOOD, NEUTRAL
-from calib_ros_view.session.live import LiveHistory, Presence
+from calib_ros_view.session.live import LiveHistory
 
 CALIBRATE, RESET, SAVE, CAPTURE, CHECK, GET_EXTRINSIC, KEYFRAMES = (
     "calibrate", "reset", "save", "capture", "check", "get_extrinsic", "keyframes"
@@ -102,9 +102,6 @@ class NodeClient:
 
     def listen(self) -> None:
         """Subscribe to what is to be heard, before the thread begins."""
-
-    def work(self) -> None:
-        """What else is to be done on the thread, four times a second or more often."""
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -188,7 +185,6 @@ class NodeClient:
                         jobs, self._jobs = self._jobs, []
                     for job in jobs:
                         job()
-                    self.work()
                 except ExternalShutdownException:
                     raise
                 except Exception as error:  # a page that silently stands still would be worse
@@ -276,7 +272,7 @@ class NodeClient:
         now = time.monotonic()
         with self.lock:
             self.history.tick(time.time())
-            gone, restarted = self.history.presence is Presence.GONE, time.monotonic() - time.time() + self.history.restarted
+            gone, restarted = self.history.gone, time.monotonic() - time.time() + self.history.restarted
             calls = list(self._calls)
         for call in calls:
             where, waited = f"{self.name}/{call.name}", now - call.began

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -43,18 +43,9 @@ LOOK_S = 4.0  # after which a page that does not say so again is not looked at a
 NOT_HEARD = "The node is not heard any more; this is the last known."
 
 
-@dataclass(frozen=True)
-class Overlay:
-    """The newest ~/overlay. at: s since the epoch. number: rises with every picture."""
-
-    jpeg: bytes = b""
-    at: float = 0.0
-    number: int = 0
-
-
 class Watch(NodeClient):
-    """Subscribes to one node; what it says of a pair is in `history`. The overlay, which the node draws for subscribers only,
-    comes while somebody looks.
+    """Subscribes to one node; what it says of a pair is in `history`. overlay: the newest one, which comes while somebody looks,
+    as the node draws it for subscribers only: JPEG, when, s since the epoch, and a number that rises.
 
     rig: what a node with a rig says of its sensors, None for one of a pair. See `RigSession` for tiles, which are of pairs here,
     clouds, version and problem. A tile is the newest keyframe of a pair, which the node draws on request; while somebody looks, a
@@ -63,14 +54,14 @@ class Watch(NodeClient):
 
     def listen(self) -> None:
         """See `NodeClient`."""
-        self.overlay, self.problem, self.version = Overlay(), "", 0
+        self.overlay, self.problem, self.version = (b"", 0.0, 0), "", 0
         self.rig: RigShown | None = None
         self.tiles: dict[str, bytes] = {}
         self.clouds: dict[str, NDArray[np.float32]] = {}
         self._overlay_subscription: Any = None
         self._looked, self._heard = -LOOK_S, 0.0
         self._message: Rig | None = None
-        self._pairs: dict[Pair, tuple[Result, bool] | None] = {}  # what each has said, and whether it is usable
+        self.pairs: dict[Pair, tuple[Result, bool] | None] = {}  # what each has said, and whether it is usable
         self._clients: dict[Pair, Any] = {}
         self._turns, self._cloud_turns = itertools.count(), itertools.count()
         self._asked: tuple[Any, Any, float] | None = None  # client, future, since when
@@ -80,14 +71,10 @@ class Watch(NodeClient):
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self._node.create_subscription(Rig, f"{self.name}/rig", self._on_rig, LATCHED)
         self._node.create_timer(1.0, self._every_second)
+        self._node.create_timer(0.25, self._subscribe_overlay)
 
     def __enter__(self) -> Watch:
         return self
-
-    @property
-    def pairs(self) -> list[Pair]:
-        """Cameras and LiDARs that have been heard of."""
-        return list(self._pairs)
 
     def pairs_of(self, tile: str) -> list[Pair]:
         """See `RigSession`."""
@@ -104,8 +91,7 @@ class Watch(NodeClient):
 
     # ---- the thread, of a pair ----------------------------------------------------------------------------------------
 
-    def work(self) -> None:
-        """See `NodeClient`."""
+    def _subscribe_overlay(self) -> None:
         wanted = time.monotonic() - self._looked < LOOK_S and not self._closed
         if wanted and self._overlay_subscription is None:
             self._overlay_subscription = self._node.create_subscription(Image, f"{self.name}/overlay", self._on_overlay, 1)
@@ -148,7 +134,7 @@ class Watch(NodeClient):
         if scale < 1:
             picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, OVERLAY_QUALITY])[1].tobytes()
-        self.overlay = Overlay(jpeg, time.time(), self.overlay.number + 1)
+        self.overlay = jpeg, time.time(), self.overlay[2] + 1
 
     # ---- the thread, of a rig -----------------------------------------------------------------------------------------
 
@@ -156,7 +142,7 @@ class Watch(NodeClient):
         """Put together what was heard."""
         self._heard, self._message = time.monotonic(), message
         self._find_pairs()
-        cameras = {camera for camera, _ in self._pairs}
+        cameras = {camera for camera, _ in self.pairs}
         sensors = []
         for own in message.sensors:
             T, C = matrix_from_transform(own.transform.transform), covariance_from_ros(own.covariance)
@@ -167,7 +153,7 @@ class Watch(NodeClient):
             )
         loops = tuple((own.sensors, (own.rotation_deg, own.translation_m), own.p_value, own.closes) for own in message.loops)
         rig = RigShown(message.reference, tuple(sensors), (), loops, message.text)
-        edges = [self._edge(pair, told, rig, message) for pair, told in self._pairs.items()]
+        edges = [self._edge(pair, told, rig, message) for pair, told in self.pairs.items()]
         for own in message.edges:
             if own.kind != KIND:
                 edge = EdgeShown(own.target, own.source, own.kind, own.status, LEVELS.get(own.status, BAD), own.reason)
@@ -178,15 +164,15 @@ class Watch(NodeClient):
     def _find_pairs(self) -> None:
         own = re.compile(re.escape(self.name) + r"/(\w+)/(\w+)/extrinsic")
         for topic, _ in self._node.get_topic_names_and_types():
-            if (found := own.fullmatch(topic)) and found.groups() not in self._pairs:
+            if (found := own.fullmatch(topic)) and found.groups() not in self.pairs:
                 pair = found[1], found[2]
-                self._pairs = {**self._pairs, pair: None}  # another one, since pages read it
+                self.pairs = {**self.pairs, pair: None}  # another one, since pages read it
                 self._node.create_subscription(ExtrinsicMsg, topic, lambda m, p=pair: self._on_pair(p, m), LATCHED)
                 self._clients[pair] = self._node.create_client(GetKeyframes, f"{self.name}/{'/'.join(pair)}/keyframes")
 
     def _on_pair(self, pair: Pair, message: ExtrinsicMsg) -> None:
         try:
-            self._pairs[pair] = result_from_message(message), bool(message.usable)
+            self.pairs[pair] = result_from_message(message), bool(message.usable)
         except CalibrationError:
             return  # the page of the pair says so
 
@@ -206,9 +192,9 @@ class Watch(NodeClient):
         if self._asked is not None and now - self._asked[2] > PATIENCE_S:
             self._asked[0].remove_pending_request(self._asked[1])
             self._asked = None
-        if not wanted or self._asked is not None or not self._pairs:
+        if not wanted or self._asked is not None or not self.pairs:
             return
-        pair = self.pairs[next(self._turns) % len(self._pairs)]
+        pair = list(self.pairs)[next(self._turns) % len(self.pairs)]
         client = self._clients[pair]
         if client.service_is_ready():
             future = client.call_async(GetKeyframes.Request(max_keyframes=1, max_width=TILE_WIDTH))

@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from itertools import pairwise
 
 import numpy as np
@@ -39,14 +38,6 @@ WORDS = {
     BLINDED: "A sensor shows nothing: covered lens, frozen image or empty cloud. The extrinsic is not checked any more.",
 }
 UNCHECKED = "The extrinsic was known when data last came; nothing checks it now."
-
-
-class Presence(Enum):
-    """Whether the node is heard."""
-
-    WAITING = "waiting"
-    LIVE = "live"
-    GONE = "gone"
 
 
 @dataclass(frozen=True)
@@ -116,13 +107,7 @@ class Ring:
             self._rows.clear()
         if len(self._rows) > 1 and time_s // self.step_s == self._rows[-1][0] // self.step_s:
             self._rows.pop()
-        row = np.empty(self._empty.shape[1])
-        row[0], row[1:] = time_s, values
-        self._rows.append(row)
-
-    def add_gap(self, time_s: float) -> None:
-        """Nothing was known at this time: lines are broken here."""
-        self.add(time_s, np.nan)
+        self._rows.append(np.hstack([time_s, np.broadcast_to(values, self._empty.shape[1] - 1)]))
 
     def rows(self, since_s: float = -np.inf, most: int = 0) -> Matrix:
         """(n, 1 + width): times and values not older than since_s nor than the span, oldest first.
@@ -141,7 +126,7 @@ class Ring:
 
 
 class LiveHistory:
-    """State, series and events of one node.
+    """State, series and events of one node. heard: when last, None = not yet. gone: it was, but is no more, as of the last tick.
 
     states: T row by row (12 numbers), six standard deviations, drift. measures: p-value, images, clouds and pairs per s, share of
     a core.
@@ -158,7 +143,7 @@ class LiveHistory:
         self._first: Matrix | None = None
         self._accepted = self._images = 0.0
         self._last_error = ""
-        self._gone = False
+        self.gone = False
         self._back = -math.inf  # when it was heard again
         self.restarted = -math.inf  # since when another process of the node is heard
 
@@ -211,18 +196,18 @@ class LiveHistory:
 
     def tick(self, now: float) -> None:
         """To be called about once a second: notices that the node is gone."""
-        if self.heard is not None and not self._gone and now - self.heard > SILENT_S:
-            self._gone = True
-            self.states.add_gap(self.heard + self.states.step_s)
-            self.measures.add_gap(self.heard + self.measures.step_s)
+        if self.heard is not None and not self.gone and now - self.heard > SILENT_S:
+            self.gone = True
+            for series in (self.states, self.measures):  # lines are broken here
+                series.add(self.heard + series.step_s, np.nan)
             self._begin(self.heard, "gone")
             self.note(self.heard, "nothing heard of the node from here on", BAD)
 
     def _hear(self, at: float) -> None:
-        if self._gone and self.heard is not None:
+        if self.gone and self.heard is not None:
             away = at - self.heard
             self.note(at, f"the node is back after {f'{away:.0f} s' if away < 90 else f'{away / 60:.0f} min'}", GOOD)
-            self._gone, self.state, self._back = False, None, at
+            self.gone, self.state, self._back = False, None, at
         elif self.heard is None:
             self.note(at, "the node is heard", NEUTRAL)
         self.heard = at
@@ -232,13 +217,6 @@ class LiveHistory:
             self.spans.append((at, status))
 
     # ---- what is shown ------------------------------------------------------------------------------------------------
-
-    @property
-    def presence(self) -> Presence:
-        """Whether the node is heard, as of the last tick."""
-        if self.heard is None:
-            return Presence.WAITING
-        return Presence.GONE if self._gone else Presence.LIVE
 
     def pose_at(self, at: float) -> Matrix | None:
         """T_camera_lidar (4, 4) that held at a time, the first one heard for times before it; None if nothing was heard yet."""
@@ -272,20 +250,13 @@ class LiveHistory:
         bounds = pairwise([*self.spans, (now, "")])
         return [(max(begin, since), end, status) for (begin, status), (end, _) in bounds if end > since]
 
-    def newest_events(self, count: int = 100) -> list[Event]:
-        """Newest first."""
-        return list(self.events)[: -count - 1 : -1]
-
 
 def moment_of(clock: str, now: float) -> float | None:
     """The last time, s since the epoch, at which it was HH:MM or HH:MM:SS by the local clock; None for what is no time of day."""
     try:
-        parts = [int(part) for part in clock.split(":")]
-        hour, minute, second = [*parts, 0] if len(parts) == 2 else parts
+        at = time.strptime(clock, "%H:%M:%S" if clock.count(":") == 2 else "%H:%M")
     except ValueError:
         return None
-    if not (0 <= hour < 24 and 0 <= minute < 60 and 0 <= second < 60):
-        return None
     day = time.localtime(now)
-    moment = time.mktime((day.tm_year, day.tm_mon, day.tm_mday, hour, minute, second, 0, 0, -1))
+    moment = time.mktime((*day[:3], *at[3:6], 0, 0, -1))
     return moment if moment <= now else moment - 24 * HOUR

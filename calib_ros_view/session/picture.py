@@ -20,21 +20,15 @@ from calib_ros.overlay import PALETTE, depth_levels
 Image = NDArray[np.uint8]
 EDGE_KIND = "edge kind"
 COLORINGS = ("depth", "reflectivity", "ring", "class", EDGE_KIND)
+NEEDED = {"reflectivity": "intensities", "ring": "rings", "class": "classes"}  # of points that are to be coloured so
 BACKGROUNDS = ("colour", "grey", "edges")
 COMPARISONS = ("now", "side by side", "blended")
-KIND_COLORS = {  # BGR
-    EdgeKind.SIDE: (255, 0, 255),
-    EdgeKind.TOP: (255, 255, 0),
-    EdgeKind.REFLECTIVITY: (0, 255, 255),
-    EdgeKind.SKY_SIDE: (120, 120, 255),
-    EdgeKind.SKY_TOP: (255, 160, 80),
-}
-KIND_NAMES = {
-    EdgeKind.SIDE: "range, left or right",
-    EdgeKind.TOP: "range, above",
-    EdgeKind.REFLECTIVITY: "reflectivity",
-    EdgeKind.SKY_SIDE: "sky, left or right",
-    EdgeKind.SKY_TOP: "sky, above",
+KINDS = {  # BGR, and the name
+    EdgeKind.SIDE: ((255, 0, 255), "range, left or right"),
+    EdgeKind.TOP: ((255, 255, 0), "range, above"),
+    EdgeKind.REFLECTIVITY: ((0, 255, 255), "reflectivity"),
+    EdgeKind.SKY_SIDE: ((120, 120, 255), "sky, left or right"),
+    EdgeKind.SKY_TOP: ((255, 160, 80), "sky, above"),
 }
 PLAIN = (150, 150, 150)  # BGR of points that are no edge, where points are coloured by the kind of their edge
 DIM = 0.6  # of the image's brightness, so that points stand out
@@ -101,19 +95,14 @@ class FramePicture:
         self._labels = cloud.label if labels is None else labels[keep]
         self._edge_xyz = np.ascontiguousarray(edges.xyz.T if edges is not None else np.zeros((3, 0)), np.float32)
         table = np.full((max(EdgeKind) + 1, 3), 255, np.uint8)
-        table[list(KIND_COLORS)] = list(KIND_COLORS.values())
+        table[list(KINDS)] = [color for color, _ in KINDS.values()]
         self._edge_colors: Image = table[edges.kind if edges is not None else []]
         self._backgrounds: dict[str, Image] = {}
 
     def missing(self, coloring: str) -> str:
         """What points need to be coloured so, and these do not have; empty if nothing. They are coloured by depth then."""
-        needed = {
-            "reflectivity": ("intensities", self._intensity),
-            "ring": ("rings", self._ring),
-            "class": ("classes", self._labels),
-        }
-        name, values = needed.get(coloring, ("", ()))
-        return name if values is None else ""
+        fields = {"reflectivity": self._intensity, "ring": self._ring, "class": self._labels}
+        return NEEDED[coloring] if coloring in fields and fields[coloring] is None else ""
 
     def size(self, look: Look) -> tuple[int, int]:
         """Width and height of one picture, px."""
@@ -259,15 +248,9 @@ def colored_cloud(
     rgb[visible] = image[v, u, ::-1]
     seen = np.zeros(len(xyz), bool)
     seen[visible] = True
-    kept = _drawn(seen, most, np.random.default_rng(0))
+    kept = np.arange(len(seen))
+    if len(seen) > most:
+        rng, first, others = np.random.default_rng(0), np.flatnonzero(seen), np.flatnonzero(~seen)
+        more = rng.choice(others, most - len(first), replace=False) if len(first) < most else others[:0]
+        kept = np.sort(np.concatenate([first if len(first) < most else rng.choice(first, most, replace=False), more]))
     return np.ascontiguousarray(xyz[kept]), rgb[kept], seen[kept]
-
-
-def _drawn(seen: NDArray[np.bool_], most: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Positions (m,), ascending, of at most so many points, those that are seen before the others."""
-    if len(seen) <= most:
-        return np.arange(len(seen))
-    first, others = np.flatnonzero(seen), np.flatnonzero(~seen)
-    if len(first) >= most:
-        return np.sort(rng.choice(first, most, replace=False))
-    return np.sort(np.concatenate([first, rng.choice(others, most - len(first), replace=False)]))

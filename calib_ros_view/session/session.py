@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.arrays import Matrix
-from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, CalibrationError
@@ -77,41 +76,27 @@ class Session:
         self.reference = source.reference
         self.config = config or Config()
         self.scores = FrameScores(frames, frames[0].camera if frames else source.camera, self.config, progress)
+        self.camera = frames[0].camera
         self.start = se3.as_transform(start, "the initial extrinsic")
         self.out = out
         self._lock = threading.RLock()
         self._models = threading.Lock()
         self._undo: deque[SessionState] = deque(maxlen=MOST_UNDO)
         self._redo: deque[SessionState] = deque()
-        self._state = SessionState(self.start)
+        self.state = SessionState(self.start)  # it never changes, another takes its place
         self._pictures: dict[int, FramePicture] = {}
         self._drag: str | None = None
         self.version = 0
 
     @property
-    def camera(self) -> Camera:
-        """Of all frames."""
-        return self.frames[0].camera
-
-    @property
-    def state(self) -> SessionState:
-        """The present one; it never changes, another takes its place."""
-        return self._state
-
-    @property
     def offsets(self) -> Matrix:
         """From the start, (6,) deg and cm; see `motion.offsets`."""
-        return offsets(self.start, self._state.T)
+        return offsets(self.start, self.state.T)
 
     @property
-    def can_undo(self) -> bool:
-        """Whether there is a step to go back to."""
-        return bool(self._undo)
-
-    @property
-    def can_redo(self) -> bool:
-        """Whether a step was undone."""
-        return bool(self._redo)
+    def can_step(self) -> tuple[bool, bool]:
+        """Whether there is a step to go back to, and one that was undone."""
+        return bool(self._undo), bool(self._redo)
 
     def move_to(self, values: Matrix, drag: str | None = None) -> None:
         """Set the six numbers (6,), deg and cm from the start. drag: name of the movement that goes on; all of one are one step
@@ -119,32 +104,32 @@ class Session:
         values = np.asarray(values, float)
         if values.shape != (6,) or not (np.abs(values) <= MOST).all():
             raise BadInputError(f"an extrinsic is moved by six numbers, up to {MOST[0]:g} deg and {MOST[3]:g} cm from the start")
-        self._set(replace(self._state, T=moved(self.start, values), what=BY_HAND, result=None), drag)
+        self._set(replace(self.state, T=moved(self.start, values), what=BY_HAND, result=None), drag)
 
     def set_time_offset(self, seconds: float, drag: str | None = None) -> None:
         """Take all points as measured `seconds` later."""
         if not abs(seconds) <= MOST_TIME_OFFSET_S:
             raise BadInputError(f"a time offset of {seconds:g} s is out of range +-{MOST_TIME_OFFSET_S:g} s")
-        self._set(replace(self._state, time_offset_s=float(seconds), what=BY_HAND, result=None), drag)
+        self._set(replace(self.state, time_offset_s=float(seconds), what=BY_HAND, result=None), drag)
 
     def take(self, result: Result, what: str) -> SessionState:
         """Take the extrinsic of an estimate; returns the state that it makes."""
         with self._lock:  # what was left out meanwhile stays so
-            return self._set(replace(self._state, T=result.T_camera_lidar, what=what, result=result))
+            return self._set(replace(self.state, T=result.T_camera_lidar, what=what, result=result))
 
     def restart(self) -> None:
         """Back to the start, as a step of its own."""
-        self._set(replace(self._state, T=self.start, time_offset_s=0.0, what="start", result=None))
+        self._set(replace(self.state, T=self.start, time_offset_s=0.0, what="start", result=None))
 
     def leave_out(self, frame: int, left: bool) -> None:
         """Leave a frame out, or take it back in. BadInputError if it is the last one, or there is no such frame."""
         if not 0 <= frame < len(self.frames):
             raise BadInputError(f"there is no frame {frame}; there are {len(self.frames)}")
         with self._lock:
-            out = self._state.left_out | {frame} if left else self._state.left_out - {frame}
+            out = self.state.left_out | {frame} if left else self.state.left_out - {frame}
             if len(out) == len(self.frames):
                 raise BadInputError("at least one frame has to stay in")
-            self._set(replace(self._state, left_out=frozenset(out)))
+            self._set(replace(self.state, left_out=frozenset(out)))
 
     def undo(self) -> None:
         """One step back, if there is one."""
@@ -157,24 +142,19 @@ class Session:
     def _step(self, here: deque[SessionState], back: deque[SessionState]) -> None:
         with self._lock:
             if here:
-                back.append(self._state)
-                self._state, self._drag = here.pop(), None
+                back.append(self.state)
+                self.state, self._drag = here.pop(), None
                 self.version += 1
 
     def _set(self, state: SessionState, drag: str | None = None) -> SessionState:
         with self._lock:
             if drag is None or drag != self._drag:
-                self._undo.append(self._state)
+                self._undo.append(self.state)
             self._drag = drag
             self._redo.clear()
-            self._state = state
+            self.state = state
             self.version += 1
         return state
-
-    def touch(self) -> None:
-        """Something else than the extrinsic has changed that pages show."""
-        with self._lock:
-            self.version += 1
 
     def picture(self, frame: int) -> FramePicture:
         """What draws a frame, with its LiDAR edges."""
@@ -184,16 +164,14 @@ class Session:
             return self._pictures[frame]
 
     def picture_by(self, frame: int, coloring: str) -> FramePicture:
-        """The same for points that are coloured so. BadInputError if they have not what that takes, and no model finds it."""
-        picture = self.classified(frame) if coloring == "class" else self.picture(frame)
-        if missing := picture.missing(coloring):
+        """The same for points that are coloured so, classes by the configured models. BadInputError if they have not what that
+        takes, and no model finds it."""
+        if not (missing := self.picture(frame).missing(coloring)):
+            return self.picture(frame)
+        if coloring != "class":
             raise BadInputError(f"the points of this frame have no {missing} to be coloured by; choose another colouring")
-        return picture
-
-    def classified(self, frame: int) -> FramePicture:
-        """The same with the classes of its points, by the configured models. BadInputError if they find none."""
         with self._models:  # one at a time
-            if self.picture(frame).missing("class"):
+            if self.picture(frame).missing(coloring):
                 found = self.scores.calibrator.segmentation(self.frames[frame])
                 if found.labels is None:
                     why = "; ".join(found.problems) or "no model is configured that finds them"
@@ -219,7 +197,7 @@ class Session:
 
     def result(self) -> Result:
         """The present extrinsic as a result: that of the estimate, or one that says that it was set by hand."""
-        state = self._state
+        state = self.state
         made = state.result
         if made is None:
             status, reason = (INITIAL, "as it was given") if state.what == "start" else (TENTATIVE, BY_HAND)
@@ -241,10 +219,6 @@ class Session:
         own = self.result()
         names = {"camera_frame": own.camera_frame or "camera_optical_frame", "lidar_frame": own.lidar_frame or "lidar"}
         return export(own, form, camera=self.camera, **names)
-
-    def error(self) -> tuple[float, float] | None:
-        """Rotation, deg, and translation, m, from the source's reference; None if it has none."""
-        return None if self.reference is None else se3.error(self.reference, self._state.T)
 
 
 class StoppedError(Exception):
@@ -290,17 +264,12 @@ class SessionJobs:
         self._thread: threading.Thread | None = None
         self.current: SessionJob | None = None
 
-    @property
-    def busy(self) -> bool:
-        """Whether something runs."""
-        return self.current is not None and self.current.running
-
     def start(self, name: str) -> SessionJob:
         """Begin refine, search or check. BadInputError if something runs already, or there is no such work."""
         if name not in (REFINE, SEARCH, CHECK):
             raise BadInputError(f"'{name}' is not known; choose one of {REFINE}, {SEARCH}, {CHECK}")
         with self._lock:
-            if self.busy:
+            if self.current is not None and self.current.running:
                 raise BadInputError("something runs already; wait for it, or stop it")
             job = self.current = SessionJob(name)
             self._thread = threading.Thread(target=self._run, args=(job,), name=f"view {name}", daemon=True)
@@ -329,7 +298,6 @@ class SessionJobs:
             job.failed, job.message = True, f"failed, {type(error).__name__}: {error}"
         finally:
             job.running = False
-            self._session.touch()
 
     def _estimate(self, job: SessionJob, state: SessionState) -> None:
         box = SearchBox(SEARCH_DEG, SEARCH_M) if job.name == SEARCH else None

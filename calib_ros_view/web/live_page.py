@@ -17,7 +17,8 @@ from nicegui import run, ui
 from nicegui.events import GenericEventArguments, KeyEventArguments
 
 from calib_ros_check.rig import shown as html
-from calib_ros_view.session.live import HOUR, Event, Pair, Presence, moment_of
+from calib_ros_view.node.calls import CHECK
+from calib_ros_view.session.live import HOUR, Event, Pair, moment_of
 from calib_ros_view.session.rig_session import RigSession
 from calib_ros_view.web import live_words as words
 from calib_ros_view.web import theme
@@ -46,7 +47,9 @@ def live_page(feed: Watch | RigSession, pictures: Pictures, gallery: Gallery | N
         part, keys = PairView(feed, gallery, pictures), KEYS_OF_PAIR
     ui.add_css(html.CSS + CSS)
     with theme.bar(feed.name, keys, back) as (switch, listed):
-        part.build_bar()
+        if isinstance(part, RigView):
+            part.build_bar()
+        ui.space()
     with ui.element("main").classes("rig live"):
         part.build()
     part.keys |= {"?": listed.open, "t": switch, "d": switch}
@@ -90,7 +93,6 @@ class RigView:
             self._moment = ui.label().classes("figures text-sm")
             theme.icon_button("chevron_right", "next moment", partial(self._go, 1), "n")
             self.keys = {key: partial(ui.timer, 0, partial(self._go, by), once=True) for key, by in (("p", -1), ("n", 1))}
-        ui.space()
 
     def build(self) -> None:
         """Pictures, graph, tables, clouds."""
@@ -203,10 +205,6 @@ class PairView:
         self._events_shown: list[Event] | None = None
         if time.time() - gallery.at > FORGOTTEN_S:
             gallery.drawn_of = 0
-
-    def build_bar(self) -> None:
-        """Nothing of its own."""
-        ui.space()
 
     def build(self) -> None:
         """Everything; once a second it is brought up to date as long as the browser is there."""
@@ -338,7 +336,7 @@ class PairView:
             history = watch.history
             said = words.said_of(watch, now)
             self._numbers.content = words.numbers_html(history)
-            events = history.newest_events(EVENTS_SHOWN)
+            events = list(history.events)[: -EVENTS_SHOWN - 1 : -1]
             since = max(now - min(self._window, HOUR), history.started) if now - history.started > 60 else now - 60
             strip = history.strip(since, now)
             if now >= self._charts_due:
@@ -373,19 +371,21 @@ class PairView:
             self._stage.text, self._bar.value = progress[0] or "waits its turn", progress[1]
         if answers:
             service, (at, answer) = list(answers.items())[-1]
-            self._answer.text = words.words_of_answer(service, at, answer)
+            found = words.words_of_check(answer.response) if service == CHECK and answer.response is not None else []
+            text = f"{words.clock(at)} ~/{service} ({answer.seconds:.1f} s): {answer.message}"
+            self._answer.text = "\n".join([f"{'✓' if answer.success else '✗'} {text}", *found])
 
     def _update_pictures(self, now: float) -> None:
-        overlay, gallery, history = self._watch.overlay, self._gallery, self._watch.history
-        if overlay.number and overlay.number != self._overlay_number:
-            self._overlay_number = overlay.number
-            self._picture.props(f'src="{self._pictures.put(f"overlay{self._watch.name}", overlay.jpeg)}"')
+        (jpeg, at, number), gallery, history = self._watch.overlay, self._gallery, self._watch.history
+        if number and number != self._overlay_number:
+            self._overlay_number = number
+            self._picture.props(f'src="{self._pictures.put(f"overlay{self._watch.name}", jpeg)}"')
             self._picture.set_visibility(True)
-        if overlay.number:
-            self._overlay_note.text = f"drawn {words.ago(now - overlay.at)}; before: initial extrinsic, after: current one"
+        if number:
+            self._overlay_note.text = f"drawn {words.ago(now - at)}; before: initial extrinsic, after: current one"
         if gallery.at != self._gallery_shown:
             self._gallery_shown, self._tiles.content = gallery.at, gallery.content
         keyframes = history.diagnosis.number("keyframes in the buffer")
-        if history.presence is Presence.LIVE and keyframes >= 0 and gallery.is_due(int(keyframes)):
+        if history.heard and not history.gone and keyframes >= 0 and gallery.is_due(int(keyframes)):
             ui.timer(0, gallery.draw, once=True)
         self._gallery_note.text = gallery.note + (f", {words.ago(now - gallery.at)}" if gallery.at else "")

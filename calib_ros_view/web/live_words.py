@@ -18,8 +18,8 @@ from calib_ros.arrays import Matrix
 from calib_ros.registration.judgement.refusal import joined, lines_of
 from calib_ros_check.rig.shown import BAD, DOUBTFUL, GOOD, NEUTRAL
 from calib_ros_check.tolerance import TITLES
-from calib_ros_view.node.calls import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Answer, NodeClient
-from calib_ros_view.session.live import Event, LiveHistory, Presence
+from calib_ros_view.node.calls import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, NodeClient
+from calib_ros_view.session.live import Event, LiveHistory
 
 if TYPE_CHECKING:
     from calib_ros_msgs.msg import KeyframePicture
@@ -108,8 +108,8 @@ class Said(NamedTuple):
 def said_of(watch: NodeClient, now: float) -> Said:
     """The status of the node, or where it is; to be called under the watch's lock."""
     history = watch.history
-    state, presence = history.state, history.presence
-    if presence is Presence.WAITING:
+    state = history.state
+    if history.heard is None:
         seen = watch.nodes_seen()
         words = f"No node {watch.name} is heard in ROS domain {watch.domain_id}. The page goes on once it is."
         hint = (
@@ -117,13 +117,13 @@ def said_of(watch: NodeClient, now: float) -> Said:
             f"discovery range and RMW_IMPLEMENTATION? Nodes seen: {', '.join(seen) if seen else 'none'}."
         )
         return Said("waiting", COLOURS["initial"], "", words, hint)
-    if presence is Presence.GONE:
+    if history.gone:
         hint = (
             "ROS still lists it: it hangs, is not active, or ended moments ago."
             if watch.name in watch.nodes_seen()
             else "ROS lists it no more: it has ended."
         )
-        words = f"Node gone since {clock(history.heard or now)}. {hint}"
+        words = f"Node gone since {clock(history.heard)}. {hint}"
         return Said(
             "gone", LEVEL_COLOURS[BAD], "not usable", words, "It comes back by itself; what is shown below is the last known."
         )
@@ -183,12 +183,6 @@ def tile_html(tile: KeyframePicture, address: str) -> str:
         f'<figure><img src="{address}" alt="keyframe, {age}" loading="lazy">'
         f"<figcaption>{age} · {score} · {tile.in_view} of {tile.edge_points} edge points</figcaption></figure>"
     )
-
-
-def words_of_answer(service: str, at: float, answer: Answer) -> str:
-    """What a service has answered, and what a check has found."""
-    text = f"{'✓' if answer.success else '✗'} {clock(at)} ~/{service} ({answer.seconds:.1f} s): {answer.message}"
-    return "\n".join([text, *(words_of_check(answer.response) if service == CHECK and answer.response is not None else ())])
 
 
 def words_of_check(response: Check.Response) -> list[str]:

@@ -25,8 +25,7 @@ from calib_ros_view.session.picture import (
     COLORINGS,
     COMPARISONS,
     EDGE_KIND,
-    KIND_COLORS,
-    KIND_NAMES,
+    KINDS,
     MOST_POINTS,
     Look,
     colored_cloud,
@@ -89,8 +88,9 @@ class NumberPanel:
         self._score.text = f"score {numbers.score:.4f}"
         self._bars.set_content(frame_bars(numbers.frame_scores, frame))
         self._curves.set_content(curve_plots(numbers))
-        error = self._session.error()
-        self._error.text = "" if error is None else f"{error[0]:.3f} deg and {100 * error[1]:.2f} cm from the source's reference"
+        if (reference := self._session.reference) is not None:
+            deg, m = se3.error(reference, state.T)
+            self._error.text = f"{deg:.3f} deg and {100 * m:.2f} cm from the source's reference"
         known = await run.io_bound(scores.known, state.T, state.left_out, state.time_offset_s)
         if known is None:
             return
@@ -283,10 +283,8 @@ def _rounded(values: NDArray[np.floating]) -> list[list[float]]:
 
 
 class Viewer:
-    """Picture and controls of one browser.
-
-    frame: index of the one that is shown. on_change: called when the picture is to be drawn anew.
-    """
+    """Picture and controls of one browser. frame: index of the one that is shown. on_change: the picture is to be drawn anew.
+    image, edges: what is shown, and whether LiDAR edges are."""
 
     def __init__(self, session: Session, frame: Callable[[], int], on_change: Callable[[], None]) -> None:
         self._session, self._frame, self._on_change = session, frame, on_change
@@ -301,9 +299,9 @@ class Viewer:
     def build_picture(self) -> None:
         """Lay out the picture, which zooms by the wheel and is moved by a click."""
         with ui.element("div").classes("card overflow-hidden stays"):
-            self._image = ui.interactive_image(on_mouse=self._mouse, events=["mousedown"], cross=False).classes("w-full")
+            self.image = ui.interactive_image(on_mouse=self._mouse, events=["mousedown"], cross=False).classes("w-full")
             turned = lambda e: self.zoom(ZOOM if e.args[2] < 0 else 1 / ZOOM, (e.args[0], e.args[1]))  # noqa: E731
-            self._image.on("wheel.prevent", turned, js_handler=WHEEL, throttle=0.05, trailing_events=False)
+            self.image.on("wheel.prevent", turned, js_handler=WHEEL, throttle=0.05, trailing_events=False)
 
     def build_controls(self) -> None:
         """Lay out how the picture is drawn."""
@@ -321,7 +319,7 @@ class Viewer:
             self._slider("points up to, m", "far", 31, 200, 1)
             with ui.row().classes("items-center gap-2"):
                 ui.checkbox("cloud", value=True, on_change=lambda e: self._set(cloud=e.value)).props("dense")
-                self._edges = ui.checkbox("edges", value=False, on_change=lambda e: self._set(edges=e.value)).props("dense")
+                self.edges = ui.checkbox("edges", value=False, on_change=lambda e: self._set(edges=e.value)).props("dense")
             with ui.row().classes("items-center gap-1 no-wrap"):
                 theme.icon_button("zoom_in", "zoom in", lambda: self.zoom(ZOOM), "+")
                 theme.icon_button("zoom_out", "zoom out", lambda: self.zoom(1 / ZOOM), "-")
@@ -329,14 +327,10 @@ class Viewer:
             self._legend = ui.row().classes("gap-3 text-xs").style("grid-column: 1 / -1")
             self._legend.visible = False
             with self._legend:
-                for kind, (b, g, r) in KIND_COLORS.items():
+                for (b, g, r), name in KINDS.values():
                     with ui.row().classes("items-center gap-1"):
                         ui.element("span").style(f"width: .7em; height: .7em; border-radius: 50%; background: rgb({r},{g},{b})")
-                        ui.label(KIND_NAMES[kind]).classes("soft")
-
-    def show(self, source: str) -> None:
-        """Show the picture at an address."""
-        self._image.set_source(source)
+                        ui.label(name).classes("soft")
 
     # --- what keys do
 
@@ -348,10 +342,6 @@ class Viewer:
         """The next of COMPARISONS."""
         now = COMPARISONS.index(self._look.comparison)
         self._selects["comparison"].set_value(COMPARISONS[(now + 1) % len(COMPARISONS)])
-
-    def switch_edges(self) -> None:
-        """Show the LiDAR edges, or hide them."""
-        self._edges.set_value(not self._edges.value)
 
     def zoom(self, factor: float, at: tuple[float, float] = (0.5, 0.5)) -> None:
         """Zoom in by a factor, about a place in shares of the picture."""

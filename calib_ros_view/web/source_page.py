@@ -162,24 +162,17 @@ class SourcePage:
     def _commands(self) -> list[tuple[str, str, dict[str, Callable[[], object]]]]:
         """Keys and what they do, in words and indeed."""
         view, session = self._view, self._session
-        zoom: dict[str, Callable[[], object]] = {
-            "+": partial(view.zoom, ZOOM),
-            "-": partial(view.zoom, 1 / ZOOM),
-            "0": view.show_all,
-        }
+        near, far = partial(view.zoom, ZOOM), partial(view.zoom, 1 / ZOOM)
+        out: dict[str, Callable[[], object]] = {"x": lambda: self._leave(self._frame, self._frame not in session.state.left_out)}
         return [
             ("n / p", "next / previous frame", {"n": partial(self._go, 1), "p": partial(self._go, -1)}),
-            (
-                "x",
-                "leave this frame out, or take it back in",
-                {"x": lambda: self._leave(self._frame, self._frame not in session.state.left_out)},
-            ),
+            ("x", "leave this frame out, or take it back in", out),
             ("z / y", "undo / redo", {"z": session.undo, "y": session.redo}),
             ("Enter", "refine from here", {"Enter": partial(self._begin, REFINE)}),
             ("h", "search around here", {"h": partial(self._begin, SEARCH)}),
             ("c", "check", {"c": partial(self._begin, CHECK)}),
             ("Escape", "stop what runs; the keys belong to the picture again", {"Escape": self._jobs.stop}),
-            ("+ / - / 0", "zoom in / out / all of the image", {**zoom, "=": zoom["+"]}),
+            ("+ / - / 0", "zoom in / out / all of the image", {"+": near, "=": near, "-": far, "0": view.show_all}),
             (
                 *("i / j / k / l", "look further up / left / down / right, when zoomed in"),
                 {key: partial(view.pan, *to) for key, to in zip("ijkl", ((0, -1), (-1, 0), (0, 1), (1, 0)), strict=True)},
@@ -189,7 +182,7 @@ class SourcePage:
                 {str(k + 1): partial(view.color_by, name) for k, name in enumerate(COLORINGS)},
             ),
             ("b", "now, side by side, blended with before", {"b": view.compare_next}),
-            ("g", "LiDAR edges on or off", {"g": view.switch_edges}),
+            ("g", "LiDAR edges on or off", {"g": lambda: view.edges.set_value(not view.edges.value)}),
         ]
 
     def _leave(self, frame: int, left: bool) -> None:
@@ -256,7 +249,7 @@ class SourcePage:
             if data is None or client.is_deleted:
                 continue
             with client:
-                self._view.show(self._pictures.put(self._id, data))
+                self._view.image.set_source(self._pictures.put(self._id, data))
         self._pictures.drop(self._id)
 
     def _rendered(self, frame: int, state: Any, look: Look) -> bytes:
@@ -291,8 +284,8 @@ class SourcePage:
             number.value = round(value, 3)
         rotation, shift = float(np.linalg.norm(values[:3])), float(np.linalg.norm(values[3:]))
         self._words.text = f"{state.what}: {rotation:.2f} deg and {shift:.1f} cm from the start"
-        self._undo.set_enabled(self._session.can_undo)
-        self._redo.set_enabled(self._session.can_redo)
+        for button, can in zip((self._undo, self._redo), self._session.can_step, strict=True):
+            button.set_enabled(can)
 
     def _show_job(self) -> None:
         name = self._session.frames[self._frame].name

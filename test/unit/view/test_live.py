@@ -17,7 +17,7 @@ from calib_ros import se3
 from calib_ros.result import CONVERGED, MOVED, Result
 from calib_ros_check.rig.shown import GOOD
 from calib_ros_view.node.calls import Answer
-from calib_ros_view.session.live import MAX_EVENTS, Diagnosis, LiveHistory, NodeState, Presence, Ring, moment_of
+from calib_ros_view.session.live import MAX_EVENTS, Diagnosis, Event, LiveHistory, NodeState, Ring, moment_of
 from calib_ros_view.web.live_page import Gallery
 from calib_ros_view.web.live_words import numbers_html
 from calib_ros_view.web.server import Pictures
@@ -133,19 +133,16 @@ def test_a_time_of_day_is_the_last_moment_that_had_it() -> None:
 def test_a_node_that_is_silent_is_gone_since_its_last_word_and_comes_back() -> None:
     history = LiveHistory(T0)
     history.tick(T0 + 100)
-    assert history.strip(0, T0 + 100) == []
-    assert len(history.poses(0)) == 0
-    assert history.presence is Presence.WAITING
+    assert (history.strip(0, T0 + 100), len(history.poses(0)), history.heard) == ([], 0, None)
     history.add_extrinsic(T0 + 100, state())
     history.tick(T0 + 103)
-    assert history.presence is Presence.LIVE
+    assert not history.gone
     for after in (105, 106, 107):
         history.tick(T0 + after)
-    assert history.presence is Presence.GONE
-    assert history.heard == T0 + 100
+    assert (history.gone, history.heard) == (True, T0 + 100)
     assert np.isnan(history.poses(0)[-1, 1]), "the line is broken"
     history.add_extrinsic(T0 + 130, state())
-    assert history.presence is Presence.LIVE
+    assert not history.gone
     texts = [event.text for event in history.events]
     assert [text for text in texts if "node" in text] == [
         "the node is heard",
@@ -164,12 +161,11 @@ def test_statuses_are_events_with_their_reason_and_repetitions_are_counted() -> 
     history.add_extrinsic(T0, state())
     history.add_extrinsic(T0 + 1, state())
     history.add_extrinsic(T0 + 2, state(status=MOVED, reason="searched anew", usable=False))
-    assert history.newest_events()[0].text == "moved: searched anew"
+    assert history.events[-1].text == "moved: searched anew"
     assert history.state is not None and history.state.level == "bad"  # noqa: PT018
     for k in range(3):
         history.note(T0 + 3 + k, f"{k} % get lost")
-    assert (history.newest_events()[0].count, history.newest_events()[0].at) == (3, T0 + 5)
-    assert history.newest_events()[0].text == "2 % get lost"
+    assert history.events[-1] == Event(T0 + 5, "2 % get lost", count=3)
     for k in range(2 * MAX_EVENTS):
         history.note(T0 + 10 + k, f"event {'ab'[k % 2]}")
     assert len(history.events) == MAX_EVENTS
@@ -179,8 +175,7 @@ def test_diagnostics_give_rates_loads_estimates_and_restarts() -> None:
     history = LiveHistory(T0)
     values = {"images": "100", "images per s": "10.0", "CPU, share of a core": "0.29 of 0.5", "monitor p-value": "0.04"}
     history.add_diagnosis(T0, Diagnosis(0, "converged", {**values, "estimates accepted": "3", "drift": "0.2"}))
-    assert history.measures.rows()[0, 1:3].tolist() == [0.04, 10.0]
-    assert history.measures.rows()[0, 5] == 0.29
+    assert history.measures.rows()[0, [1, 2, 5]].tolist() == [0.04, 10.0, 0.29]
     assert (history.events[-1].text, history.events[-1].level) == ("estimate accepted, drift 0.2", GOOD)
     history.add_diagnosis(T0 + 1, Diagnosis(0, "", {"images": "2", "monitor p-value": "unknown"}))
     assert "started anew" in history.events[-1].text

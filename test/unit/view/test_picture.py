@@ -13,7 +13,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.initial_guess import nominal
-from calib_ros_view.session.picture import COLORINGS, GAP, KIND_COLORS, UNSEEN, FramePicture, Look, colored_cloud, encoded
+from calib_ros_view.session.picture import COLORINGS, GAP, KINDS, UNSEEN, FramePicture, Look, colored_cloud, encoded
 
 CAMERA = Camera(np.array([[100.0, 0, 100], [0, 100.0, 50], [0, 0, 1]]), 200, 100)
 GRAY = np.full((100, 200, 3), 100, np.uint8)
@@ -54,8 +54,7 @@ def test_a_window_is_drawn_at_the_full_resolution_of_the_picture():
 
 def test_near_points_cover_far_ones_and_ranges_leave_out():
     both = FramePicture(frame((5, 0, 0), (50, 0, 0)))
-    near = FramePicture(frame((5, 0, 0)))
-    far = FramePicture(frame((50, 0, 0)))
+    near, far = FramePicture(frame((5, 0, 0))), FramePicture(frame((50, 0, 0)))
     assert (both.draw(nominal(), None, OPAQUE) == near.draw(nominal(), None, OPAQUE)).all()
     beyond = Look(width=200, size=1, opacity=1.0, near=10)
     assert (both.draw(nominal(), None, beyond) == far.draw(nominal(), None, beyond)).all()
@@ -74,10 +73,8 @@ def test_colours_follow_what_is_chosen():
     assert seen["depth"][0] == seen["depth"][1]
     assert all(seen[name][0] != seen[name][1] for name in ("reflectivity", "ring", "class"))
     assert seen["edge kind"][0] == seen["edge kind"][1], "no edges, of no kind"
-    kinds = own.draw(nominal(), None, Look(width=200, size=1, coloring="edge kind"))
-    assert tuple(kinds[50, 100]) == KIND_COLORS[EdgeKind.REFLECTIVITY]
-    edges = own.draw(nominal(), None, Look(width=200, size=1, cloud=False, edges=True))
-    assert tuple(edges[50, 100]) == KIND_COLORS[EdgeKind.REFLECTIVITY]
+    for look in (Look(width=200, size=1, coloring="edge kind"), Look(width=200, size=1, cloud=False, edges=True)):
+        assert tuple(own.draw(nominal(), None, look)[50, 100]) == KINDS[EdgeKind.REFLECTIVITY][0]
 
 
 def test_before_and_now():
