@@ -17,7 +17,7 @@ export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 .PHONY: help env demo test test-all bench compare lint docs dist clean distclean
 
 help:
-	@echo "make demo               drive, node and player on a synthetic street; before and after"
+	@echo "make demo               drive, node and player on a synthetic street; before and after; GIF=, a moving picture"
 	@echo "make test               the standard tests of the product; a few minutes"
 	@echo "make test ROOM=lidar    all tests of one room: a folder below test/, or a module such as config"
 	@echo "make test PYTEST_ARGS='-k deskew -x'    further arguments of pytest"
@@ -35,7 +35,7 @@ env:
 	@$(PYTHON) tools/make_env.py $(ROS)
 
 demo: env
-	$(VENV)/bin/calib-ros demo --out demo_out
+	$(VENV)/bin/calib-ros demo --out demo_out $(if $(GIF),--gif $(GIF))
 
 # `make test` guards the product in a few minutes. It leaves out two markers of pytest:
 #   slow        a scenario that takes long; a shorter test of the same behaviour stays in `make test`

@@ -25,8 +25,8 @@ EXTRAS = {
     "motion": ["small_gicp"],
     # Pages of `calib-ros check`, of one recording or a fleet; fleet.parquet; several processes, or those of a cluster.
     "fleet": ["Jinja2", "distributed", "pyarrow"],
-    # `calib-ros view`: the page in the browser.
-    "view": ["nicegui"],
+    # `calib-ros view`: the page in the browser; and --gif of `calib-ros replay` and `demo`.
+    "view": ["nicegui", "pillow"],
     # `calib-ros evaluate` and `calib-ros steps`: reports, tables, pages and plots.
     "evaluation": ["Jinja2", "distributed", "matplotlib", "pandas"],
 }
@@ -144,6 +144,7 @@ setup(
         ],
         "calib_ros.pages": [
             "rig = calib_ros_check.report:rig_page",
+            "gif = calib_ros_view.session.film:film",
         ],
         "calib_ros.node_services": [
             "check = calib_ros_check.node.server:CheckServer",

@@ -11,7 +11,7 @@ The core imports none of them. What is not installed is missing as if it had nev
 ``calib_ros.classes``             what recognises classes of points and pixels: a `ClassModels` of registration/classes.py
 ``calib_ros.stages``              a stage of the configuration: a frozen dataclass made with `calib_ros.config.options`
 ``calib_ros.presets``             configurations by one word: the YAML files that they are made of, in this order
-``calib_ros.pages``               the page of a command's ``--report``: a callable, path -> what writes the page there
+``calib_ros.pages``               a page or picture for an option of commands: a callable, path -> what makes it there
 ``calib_ros.node_services``       a service of the node, ``~/NAME``: a callable, node, pipeline, health -> `NodeService`
 ================================  ===========================================================================================
 """

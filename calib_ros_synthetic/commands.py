@@ -16,13 +16,14 @@ class Demo:
         """See `calib-ros demo --help`."""
         command.add_argument("--out", default="demo_out", help="folder for bag, pictures and result (default demo_out)")
         command.add_argument("--seed", type=int, default=0, help="seed of the street and of the wrong start")
+        command.add_argument("--gif", metavar="FILE", help="a moving picture of the drive, replayed, of at most 2 MB")
         add_preset(command)
 
     def run(self, args: argparse.Namespace) -> int:
         """Run it; 0 if the extrinsic was recovered, else 1."""
         from calib_ros_synthetic.demo import run
 
-        return 0 if run(args.out, args.seed, args.preset) else 1
+        return 0 if run(args.out, args.seed, args.preset, args.gif) else 1
 
 
 DEMO = Demo()

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -19,11 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.cli.calibrate import draw
-from calib_ros.cli.output import progress_bar
+from calib_ros.cli.calibrate import draw, replay
+from calib_ros.cli.inputs import configuration
+from calib_ros.cli.output import page, progress_bar
 from calib_ros.config import Config
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
-from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
+from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.overlay import write_png
 from calib_ros.result import Extrinsic, Result
 from calib_ros_synthetic.drive import SyntheticDrive
@@ -50,17 +53,13 @@ def wrong_start(truth: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     return start
 
 
-def run(out: str, seed: int, preset: str = "") -> bool:
+def run(out: str, seed: int, preset: str = "", gif: str | None = None) -> bool:
     """Run the demo and leave everything in the folder `out`; True if the extrinsic was recovered to 0.2 deg and 5 cm. preset: of
-    the node."""
-    try:
-        from calib_ros.ros.client import ExtrinsicClient
-        from calib_ros.ros.distributions import on_this_machine_only
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"the demo needs ROS 2 ({error.name} is missing); source your ROS install or pip install 'calib_ros[ros]'"
-        ) from None
-    drive = SyntheticDrive(seed, FRAMES, stride=STRIDE)
+    the node. gif: file for a moving picture of the drive, by a replay of the bag."""
+    from calib_ros.ros.client import ExtrinsicClient
+    from calib_ros.ros.distributions import on_this_machine_only
+
+    write_film, drive = page("gif", gif), SyntheticDrive(seed, FRAMES, stride=STRIDE)
     folder = _fresh_folder(Path(out))
     for number in (signal.SIGTERM, signal.SIGHUP):  # end like Ctrl-C, so that node and player do not outlive us
         signal.signal(number, signal.default_int_handler)
@@ -84,7 +83,11 @@ def run(out: str, seed: int, preset: str = "") -> bool:
         with _Process("player", play, folder / "player.log") as player:
             result, drift = _drive(client, node, player)
         node.must_stop()
-    return _report(folder, drive, start, result, drift, client)
+    recovered = _report(folder, drive, start, result, drift, client)
+    if write_film is not None:
+        given = str(folder / "initial.json"), 0.0, configuration(None, preset_name=preset), write_film
+        deque(replay(open_dataset(folder / "bag"), "all", *given), maxlen=0)
+    return recovered
 
 
 def _drive(client: ExtrinsicClient, node: _Process, player: _Process) -> tuple[Result, float]:
@@ -164,34 +167,30 @@ def _fresh_folder(folder: Path) -> Path:
     return folder
 
 
-class _Process:
+class _Process(subprocess.Popen[bytes]):
     """A child process with a log file; stopped by SIGINT when the block ends."""
 
     def __init__(self, name: str, command: Sequence[str], log: Path) -> None:
         self.name, self.log = name, log
-        self._log = log.open("wb")
-        self._child = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT)
+        with log.open("wb") as file:
+            super().__init__(command, stdout=file, stderr=subprocess.STDOUT)
 
-    def __enter__(self) -> _Process:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *what: object) -> None:
         with suppress(CalibrationError):
             self.must_stop()
-        self._child.kill()
-        self._child.wait()
-        self._log.close()
+        self.kill()
+        self.wait()
 
     def must_run(self) -> None:
         """CalibrationError with the end of the log if the process has ended."""
-        if self._child.poll() is not None:
-            raise self._failed(f"ended with code {self._child.returncode}")
+        if self.poll() is not None:
+            raise self._failed(f"ended with code {self.returncode}")
 
     def must_stop(self) -> None:
         """Stop by SIGINT; CalibrationError if it does not end well within STOP_S."""
-        self._child.send_signal(signal.SIGINT)
+        self.send_signal(signal.SIGINT)
         try:
-            code = self._child.wait(STOP_S)
+            code = self.wait(STOP_S)
         except subprocess.TimeoutExpired:
             raise self._failed("does not stop on SIGINT") from None
         if code != 0:

@@ -156,6 +156,7 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
     command = add("replay", "run the online recalibrator over a source, without ROS; prints a JSON line per estimate")
     _frames_and_start(command)
     _constraints(command)
+    command.add_argument("--gif", metavar="FILE", help="a moving picture of it, for people, of at most 2 MB")
 
     command = add("export", "convert a result or state file for other tools: TF, URDF, KITTI, Autoware", source=False)
     command.add_argument("file", help="JSON or YAML result, or the node's state file")

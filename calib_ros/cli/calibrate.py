@@ -128,9 +128,11 @@ def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -
     write_png(path, picture)
 
 
-def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Config) -> Iterator[dict[str, Any]]:
+def replay(
+    source: Source, frames: str, initial: str, yaw_deg: float, config: Config, write_film: Any = None
+) -> Iterator[dict[str, Any]]:
     """Run the online recalibrator over a source; yields a JSON object per estimate and per change of status between estimates.
-    Unusable frames are noted on stderr."""
+    Unusable frames are noted on stderr. write_film: writes what was known after each frame, source and configuration."""
     positions = frame_positions(frames, len(source))
     T0 = initial_extrinsic(initial, source, yaw_deg)
     if initial == "nominal":
@@ -152,6 +154,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
         config = update(config, {"lidar": {"accumulate_s": 0.0}})
     recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
     status = recalibrator.current.result.status
+    moments = []
     with progress_bar("replaying") as step:
         for k, i in enumerate(positions):
             frame = None
@@ -166,6 +169,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
             step(k + 1, len(positions))
             estimated = recalibrator.ready()
             extrinsic = recalibrator.estimate() if estimated else recalibrator.current
+            moments.append((i, extrinsic))
             if not estimated and extrinsic.result.status == status:
                 continue
             result, status = extrinsic.result, extrinsic.result.status
@@ -182,3 +186,5 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
             }
     if recalibrator.motion.missing:
         note(recalibrator.motion.missing)
+    if write_film is not None:
+        note(write_film(moments, source, config))

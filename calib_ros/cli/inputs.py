@@ -118,9 +118,9 @@ def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: 
     box = SearchBox(
         default.rotation_deg if search_deg is None else search_deg, default.translation_m if search_m is None else search_m
     )
-    return SearchBox(
-        _within(box.rotation_deg, config.constraints.limit_deg), _within(box.translation_m, config.constraints.limit_m)
-    )
+    pairs = (box.rotation_deg, config.constraints.limit_deg), (box.translation_m, config.constraints.limit_m)
+    rotation, translation = (tuple(np.minimum(half, limit).tolist()) for half, limit in pairs)
+    return SearchBox(rotation, translation)
 
 
 def require_classes(config: Config, initial: str) -> None:
@@ -132,11 +132,6 @@ def require_classes(config: Config, initial: str) -> None:
             "cloud_classes in --config at their defaults, or set the classes to an ONNX file, a folder, or 'source' for "
             "synthetic drives"
         )
-
-
-def _within(half: Axes, limit: tuple[float, ...]) -> Three:
-    x, y, z = np.minimum(half, limit).tolist()
-    return x, y, z
 
 
 def open_named_source(args: argparse.Namespace, config: Config | None = None) -> Source:

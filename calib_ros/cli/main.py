@@ -112,7 +112,7 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 def _rig(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import configuration
-    from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
+    from calib_ros.cli.output import check_json, note, page, print_or_save, progress_bar
     from calib_ros.datasets.open import open_rig
     from calib_ros.datasets.rig import rig_yaml
     from calib_ros.io import check_output, write_atomically
@@ -124,11 +124,9 @@ def _rig(args: argparse.Namespace) -> int:
     before = None if args.before is None else load(args.before)
     config = configuration(args.config, args.seed)
     check_json(args.json)
-    if args.report is not None and "rig" not in extensions.names(extensions.PAGES):
-        raise BadInputError("--report needs calib_ros_check, which this installation leaves out")
+    write_page = page("rig", args.report)
     if args.write_rig is not None:
         check_output(args.write_rig, "--write-rig")
-    write_page = None if args.report is None else extensions.load(extensions.PAGES, "rig")(args.report)
     for path in args.out:
         check_out(path)
         check_output(path, "--out")
@@ -164,14 +162,12 @@ def _rig(args: argparse.Namespace) -> int:
 def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.inputs import open_named_source
     from calib_ros.cli.output import progress_bar
-    from calib_ros.datasets.bag_writer import write_bag
+    from calib_ros.datasets.bag_writer import write_bag, write_rig_bag
     from calib_ros.datasets.open import named_rig
     from calib_ros.datasets.source import frame_positions
 
     rig = named_rig(args.source) if args.camera is None else None
     if rig is not None:
-        from calib_ros.datasets.bag_writer import write_rig_bag
-
         if args.frames != "all":
             raise BadInputError(f"--frames {args.frames} does not go with a rig, which is written as a whole; make it shorter")
         with progress_bar("writing") as step:
@@ -191,12 +187,13 @@ def _replay(args: argparse.Namespace) -> int:
 
     from calib_ros.cli.calibrate import replay
     from calib_ros.cli.inputs import configuration, constraint_options, initial_of, open_named_source
+    from calib_ros.cli.output import page
     from calib_ros.result import CONVERGED, TENTATIVE
 
     config = configuration(args.config, constraints=constraint_options(args), preset_name=args.preset)
     args.initial = initial_of(args, config)
-    converged = False
-    for line in replay(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config):
+    write_film, converged = page("gif", args.gif), False
+    for line in replay(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config, write_film):
         print(json.dumps(line), flush=True)
         converged = line["status"] in (CONVERGED, TENTATIVE)
     return OK if converged else NOT_CONVERGED
@@ -231,13 +228,8 @@ def _export(args: argparse.Namespace) -> int:
 
 def _play(args: argparse.Namespace) -> int:
     from calib_ros.cli.output import progress_bar
+    from calib_ros.ros.bags import play
 
-    try:
-        from calib_ros.ros.bags import play
-    except ImportError as error:
-        raise CalibrationError(
-            f"playing needs ROS 2 ({error.name} is missing); source your ROS install or pip install 'calib_ros[ros]'"
-        ) from None
     options = args.rate, args.loop, args.clock, args.wait, args.follow
     with progress_bar("playing") as step:
         counts = play(args.bag, lambda text: print(text, file=sys.stderr), step, *options)

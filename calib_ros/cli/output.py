@@ -7,14 +7,16 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from calib_ros import se3
+from calib_ros import extensions, se3
 from calib_ros.config import MotionConfig
 from calib_ros.datasets.source import Source
+from calib_ros.errors import BadInputError
 from calib_ros.export import tf_command
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
@@ -186,6 +188,18 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
             bar.refresh()
 
         yield step
+
+
+PAGE_OPTIONS = {"rig": ("--report", "calib_ros_check"), "gif": ("--gif", "calib_ros_view")}
+
+
+def page(name: str, path: str | None) -> Any:
+    """What another package makes a page or picture at a path with; None without. BadInputError where the package is left out."""
+    if path is None:
+        return None
+    if name not in extensions.names(extensions.PAGES):
+        raise BadInputError("{} needs {}, which this installation leaves out".format(*PAGE_OPTIONS[name]))
+    return extensions.load(extensions.PAGES, name)(path)
 
 
 def check_json(path: str | None) -> None:

@@ -198,6 +198,7 @@ def test_not_converged_is_exit_code_1(bag: Path, quick: list[str], tmp_path: Pat
         (["replay", "{bag}", "--time-offset-ms", "-90000"], "-90 is out of range [-60, 60]"),
         (["calibrate", "{bag}", "--time-offset", "guess"], "'guess' is no number; give estimate, fixed or seconds"),
         (["replay", "{bag}", "--initial", "motion"], "calibrate --initial motion"),
+        (["replay", "{bag}", "--gif", "{tmp}"], "is a folder"),
         (["replay", "{bag}", "--rotation-only", "--bound", "tx=1"], "--bound tx=1 contradicts --rotation-only"),
         (["calibrate", "{bag}", "--objective", "magic"], "--objective"),
         (["convert", "{bag}", "{bag}"], "exists"),
@@ -317,7 +318,7 @@ def twist_of(result: dict[str, list[list[float]]], start: Path) -> np.ndarray:
 def test_replay_prints_a_line_per_estimate_and_keeps_constraints_between_them(
     bag: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    start, config = tmp_path / "start.json", tmp_path / "config.yaml"
+    start, config, film = (tmp_path / name for name in ("start.json", "config.yaml", "drive.gif"))
     Result(se3.perturb(open_dataset(str(bag)).reference, [1.2, -1, 0.8], [0.02, -0.01, 0.02]), "initial").save(start)
     config.write_text(yaml.safe_dump({**QUICK, "online": {"min_keyframes": 5}}))
     code, out, _ = run(capsys, "replay", str(bag), "--initial", "reference", "--config", str(config))
@@ -329,7 +330,7 @@ def test_replay_prints_a_line_per_estimate_and_keeps_constraints_between_them(
     assert lines[-1]["status"] == "tentative"  # as many keyframes again would confirm it
     assert lines[-1]["reference_error"]["rotation_deg"] < 0.3
 
-    arguments = ["--initial", str(start), "--config", str(config), "--fix", "tx,ty,tz", "--bound", "rx=0.2"]
+    arguments = ["--initial", str(start), "--config", str(config), "--fix", "tx,ty,tz", "--bound", "rx=0.2", "--gif", str(film)]
     code, out, err = run(capsys, "replay", str(bag), *arguments)
     assert code in (0, 1), err
     lines = [json.loads(line) for line in out.splitlines()]
@@ -338,6 +339,7 @@ def test_replay_prints_a_line_per_estimate_and_keeps_constraints_between_them(
         moved = twist_of(line, start)
         assert np.allclose(moved[3:], 0, atol=1e-9)
         assert abs(moved[0]) <= 0.2 + 1e-9
+    assert film.read_bytes().startswith(b"GIF")
 
 
 def test_constraints_go_into_the_configuration(tmp_path: Path) -> None:

@@ -7,12 +7,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
+from calib_ros import Config, result, se3
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.initial_guess import nominal
+from calib_ros_view.session.film import LOOK, STEPS, film
 from calib_ros_view.session.picture import COLORINGS, GAP, KINDS, UNSEEN, FramePicture, Look, colored_cloud, encoded
 
 CAMERA = Camera(np.array([[100.0, 0, 100], [0, 100.0, 50], [0, 0, 1]]), 200, 100)
@@ -95,6 +98,20 @@ def test_before_and_now():
 def test_looks_out_of_range_are_refused(wrong):
     with pytest.raises(BadInputError):
         Look(**wrong)
+
+
+def test_a_film_swings_from_wrong_to_right_and_is_small_enough(drive, street, tmp_path, monkeypatch):
+    monkeypatch.setattr("calib_ros_view.session.film.MOST_BYTES", 90_000)
+    poses = se3.perturb(drive.reference, [1, -1, 1], [0.1, 0, 0]), drive.reference, drive.reference
+    path = tmp_path / "drive.gif"
+    film(path)([(k, result.Extrinsic(result.Result(T, result.CONVERGED))) for k, T in enumerate(poses)], drive, Config())
+    assert path.stat().st_size <= 90_000
+    pictures = [np.array(own.convert("RGB"))[..., ::-1] for own in ImageSequence.Iterator(Image.open(path))]
+    assert len(pictures) == 3 + STEPS
+    for shown, right in ((pictures[1], 0), (pictures[1 + STEPS], 1)):
+        drawn = [FramePicture(street[1]).draw(T, None, replace(LOOK, width=shown.shape[1])) for T in poses[:2]]
+        off = [cv2.absdiff(own, np.ascontiguousarray(shown[: len(own)])).mean() for own in drawn]
+        assert off[right] < 0.95 * off[1 - right]
 
 
 # --- the cloud in the colours of the picture ------------------------------------------------------------------------------
