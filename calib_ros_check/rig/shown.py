@@ -38,7 +38,7 @@ NOT_ESTIMATED = "nothing is estimated: these are the priors; give a result of ca
 WIDTH, BOX, ROW, HIGH = 400, 152, 50, 38  # px of the graph: whole, a box with a name, from one to the next, a box's height
 LETTERS = 18  # of a name in its box; the whole is in the table
 BULGE = 55  # px, of an edge between two sensors of one column
-MARK_AT = 0.3  # of an edge from the camera on, where few others are
+MARK_AT = 0.2  # of an edge from the camera on, to the first LiDAR; to the next ones so much farther, so that marks stand apart
 PLAN, LABEL, LINE = 170, 132, 19  # px of the rig from above, of the names beside it, and of a line of these
 CSS = """
 .rig h2 { font-size: .95rem; font-weight: 600; line-height: 1.4; margin: 0 0 .3rem; padding: 0; border: 0; }
@@ -252,7 +252,8 @@ def _line(edge: EdgeShown, at: dict[str, tuple[float, float]]) -> str:
     side = BULGE if x == 0 else -BULGE  # into the middle
     a, b = (x + BOX if not same or x == 0 else x), (u if not same or x else u + BOX)
     path = f"M{a} {y:.1f}C{a + side} {y:.1f} {b + side} {v:.1f} {b} {v:.1f}" if same else f"M{a} {y:.1f}L{b} {v:.1f}"
-    share = 0.5 if same else MARK_AT
+    lanes = sorted({y for x, y in at.values() if x > 0})
+    share = 0.5 if same else MARK_AT * (1 + min(lanes.index(v), 2))
     i, j = (a + 0.75 * side, (y + v) / 2) if same else (a + share * (b - a), y + share * (v - y))
     mark = (
         f'<circle cx="{i:.1f}" cy="{j:.1f}" r="8"/><text class="sign" x="{i:.1f}" y="{j + 4.5:.1f}" text-anchor="middle">'
