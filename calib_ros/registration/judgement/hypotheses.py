@@ -96,7 +96,7 @@ def transforms(T: Transform) -> Iterator[Hypothesis]:
     yield Hypothesis(Cause.BODY_FRAME, f"{body}, and invert it, which is T_lidar_link", _BODY @ inverse)
     twice = "the rotation from the camera's body frame to its optical frame is applied twice; leave one out"
     yield Hypothesis(Cause.BODY_FRAME, twice, se3.inverse(_BODY) @ T)
-    yield Hypothesis(Cause.BODY_FRAME, f"{twice}, and invert the transform", se3.inverse(_BODY) @ inverse)
+    yield Hypothesis(Cause.BODY_FRAME, f"{twice}, and invert the transform", se3.inverse(_BODY) @ inverse, usual=True)
     quaternion = se3.quaternion_from_rotation(T[:3, :3])
     for how, shift in (("it has w first, and was read as x, y, z, w", -1), ("it was read with w first, but is x, y, z, w", 1)):
         R = se3.rotation_from_quaternion(np.roll(quaternion, shift))
