@@ -348,7 +348,7 @@ class Recalibrator:
         extrinsic = self._update_tracker(result, batch, force_search)
         # Beside others it is dear: as much as all keyframes take.
         if self.config.online.mode != CONTINUOUS or self.tracker.steady or self._scans is not None:
-            self.calibrator.objectives.free_memory()
+            self.calibrator.objectives.maps = None
         return extrinsic
 
     def _search_box(self, rounds: int | None = None) -> SearchBox:

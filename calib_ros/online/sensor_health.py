@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.frame import Frame, PointCloud
+from calib_ros.frame import Frame
 from calib_ros.result import Trouble
 
 SHRINK_FACTOR = 8  # px that make one: noise of a dark image averages out, houses and cars stay
@@ -60,7 +60,9 @@ class SensorHealth:
 
     def check(self, frame: Frame) -> SensorProblem | None:
         """The problem of the frame's image or scan, None if there is none. The camera comes first."""
-        problem = self._check_camera(frame) or self._check_lidar(frame.cloud)
+        if (problem := self._check_camera(frame)) is None:
+            returns, said = int(frame.cloud.finite_mask().sum()), "{} returns, usually {{:.0f}}"
+            problem = self._blind(SensorFault.LIDAR_BLIND, returns, BLIND_RETURNS, said.format(returns or "no"))
         self.faulty_frames = self.faulty_frames + 1 if problem else 0
         return problem
 
@@ -87,10 +89,6 @@ class SensorHealth:
         elif not same_cloud:  # a simulation at rest repeats both
             self._repeated_images += 1
         return self._repeated_images >= FROZEN_IMAGES
-
-    def _check_lidar(self, cloud: PointCloud) -> SensorProblem | None:
-        returns = int(cloud.finite_mask().sum())
-        return self._blind(SensorFault.LIDAR_BLIND, returns, BLIND_RETURNS, f"{returns or 'no'} returns, usually {{:.0f}}")
 
     def _blind(self, fault: SensorFault, value: float, share: float, said: str) -> SensorProblem | None:
         """The problem of a value that is none, or less than this share of what is usual; what stays becomes usual."""

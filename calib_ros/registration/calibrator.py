@@ -276,7 +276,7 @@ class Calibrator:
             result = found.result(self.config, lens if self._given is None else None, refusal, notes)
             if self.config.camera.intrinsics == REFINE and lens is not None:
                 result = replace(result, refined_camera=lens.refined_camera(stated, found.T, found.covariance))
-            self.objectives.keep_maps(objective)
+            self.objectives.maps = objective.edges.score.atlas
         except TooFewFeaturesError as error:
             result = insufficient(error, initial, len(features), notes)
         return replace(result, elapsed_s=time.perf_counter() - started)

@@ -270,11 +270,12 @@ def trust_region(box: SearchBox | None = None) -> tuple[float, float]:
 
 
 class ObjectiveMaker:
-    """Makes the configured objective of frames of one camera, as they were recorded; the maps of the last frames are kept."""
+    """Makes the configured objective of frames of one camera, as they were recorded. maps: of an objective that is done with,
+    whose memory is lent to the next one, mostly of the same frames; other threads meanwhile lay out their own."""
 
     def __init__(self, config: Config, camera: Camera) -> None:
         self.config, self._camera = config, camera
-        self._last: Atlas | None = None  # whose memory is lent to the next one; other threads meanwhile lay out their own
+        self.maps: Atlas | None = None
 
     def __call__(
         self,
@@ -292,7 +293,7 @@ class ObjectiveMaker:
         constraints = pose_constraints(anchor, config.constraints, max(len(features), 1))
         constraints = constraints.within_trust_region(T_prior, *trust_region(box))
         if atlas is None and features:
-            last, self._last = self._last, None
+            last, self.maps = self.maps, None
             atlas = Atlas([f.levels for f in features], features[0].camera, last)
         seen = self._seen_by_rows(features, T_prior if T_rows is None else T_rows)
         if other is None:
@@ -337,11 +338,3 @@ class ObjectiveMaker:
             time = np.nan_to_num(share) * readout_s  # beside the image as on its border, behind it as in its middle
             out[k] = replace(f, points=replace(f.points, xyz=moved(f.points.xyz, f.twist, -time).astype(np.float32)))
         return out
-
-    def keep_maps(self, objective: Objective) -> None:
-        """Keep the maps of an objective that is done with: the next one may be of mostly the same frames."""
-        self._last = objective.edges.score.atlas
-
-    def free_memory(self) -> None:
-        """Free them: as much as the maps of all frames take."""
-        self._last = None
