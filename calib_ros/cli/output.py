@@ -17,7 +17,6 @@ from calib_ros import extensions, se3
 from calib_ros.config import MotionConfig
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.export import tf_command
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
 from calib_ros.io import AsJson, check_output
@@ -125,6 +124,8 @@ def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""
     lines += _details(result)
     if not result.converged:
         return "\n".join(lines)  # nobody is to publish the start
+    from calib_ros.export import tf_command  # with what XML brings along
+
     return "\n".join([*lines, tf_command({(result.camera_frame, result.lidar_frame): result.T_camera_lidar}).rstrip()])
 
 
