@@ -13,6 +13,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.arrays import quantile
 from calib_ros.config import LidarConfig
 from calib_ros.lidar.range_image import JUMP_MIN, RangeImage
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose
@@ -94,25 +95,18 @@ def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
     """Edge points of a range image, of every kind that the scan allows."""
     cells = [*_side_edges(scan, config), _top_edges(scan, config)]
     if scan.layout == "rings":  # a cell of a scanner without rings may be empty by chance, which is no edge against the sky
-        fading = _grazed(scan)
-        cells += [*_sky_side_edges(scan, config, fading), _sky_top_edges(scan, config, fading)]
+        cells += _sky_edges(scan, config)
     if scan.reflectivity is not None:
         cells.append(_reflectivity_edges(scan, config))
     locate = between_points if scan.layout == "projection" else between_rays
     samples = [locate(scan, found) for found in cells]
-    xyz, index, strength = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    P, index, strength = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    xyz, strength = scan.pose.to_cloud(P).astype(np.float32), strength.astype(np.float32)
     kind = np.repeat(np.array([found.kind for found in cells], np.uint8), [len(own) for _, own, _ in samples])
-    spacing = float(np.median(-np.diff(scan.elevation))) if len(scan.elevation) > 1 else np.pi
-    return EdgePoints(
-        xyz,
-        strength.astype(np.float32),
-        kind,
-        spacing,
-        None if scan.cloud.time is None else scan.cloud.time[index],
-        None if scan.cloud.label is None else scan.cloud.label[index],
-        scan.pose,
-        scan.azimuth_step if scan.layout == "rings" else 0.0,
-    )
+    spacing = float(quantile(-np.diff(scan.elevation), 0.5)) if len(scan.elevation) > 1 else np.pi
+    time, label = (None if values is None else values[index] for values in (scan.cloud.time, scan.cloud.label))
+    step = scan.azimuth_step if scan.layout == "rings" else 0.0
+    return EdgePoints(xyz, strength, kind, spacing, time, label, scan.pose, step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +137,7 @@ def _side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
         jump = beside - expected
         with np.errstate(invalid="ignore"):
             mask = usable & (jump > JUMP_MIN) & (jump > SIDE_JUMP_RATIO * expected)
-        found.append(_cells(mask, EdgeKind.SIDE, side, _jump_strength(jump)))
+            found.append(_cells(mask, EdgeKind.SIDE, side, np.sqrt(np.clip(jump, 0, JUMP_SATURATION))))
     return found
 
 
@@ -169,36 +163,32 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     with np.errstate(invalid="ignore"):
         mask = _measured(scan, config) & (jump > np.maximum(JUMP_MIN, TOP_JUMP_RATIO * expected))
         mask &= ~(continued - R < np.maximum(JUMP_MIN, TOP_JUMP_RATIO * R))
-    return _cells(mask & ~np.isnan(_above(R, -1)), EdgeKind.TOP, 0, _jump_strength(jump))
+        strength = np.sqrt(np.clip(jump, 0, JUMP_SATURATION))
+    return _cells(mask & ~np.isnan(_above(R, -1)), EdgeKind.TOP, 0, strength)
 
 
-def _sky_side_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> list[EdgeCells]:
-    """Cells, but for fading ones (see _grazed), beside a gap of GAP_STEPS cells that is not the border of the field of view."""
-    empty = np.isnan(scan.range)
+def _sky_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
+    """Cells, but for those of surfaces that fade (see _grazed), beside a gap of GAP_STEPS cells that is not the border of the
+    field of view; and those above which CLEAR_RINGS rings have no return, straight up and one column to either side."""
+    empty, usable = np.isnan(scan.range), _measured(scan, config) & ~_grazed(scan)
     # Columns next to a sector without any return: the end of the field of view, or lost packets.
     covered = (scan.index >= 0).any(axis=0)
     near_gap = np.zeros_like(covered)
     for k in range(1, GAP_STEPS + 1):
         near_gap |= ~np.roll(covered, k) | ~np.roll(covered, -k)
-    usable = _measured(scan, config) & ~near_gap[None, :] & ~fading
     found = []
     for side in (1, -1):
-        gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, GAP_STEPS + 1)])
+        gap = np.roll(empty, -side, 1)
+        for k in range(2, GAP_STEPS + 1):
+            gap &= np.roll(empty, -side * k, 1)
         solid = ~np.roll(empty, side, 1) & ~np.roll(empty, 2 * side, 1)
-        found.append(_cells(usable & gap & solid, EdgeKind.SKY_SIDE, side))
-    return found
-
-
-def _sky_top_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> EdgeCells:
-    """Cells above which CLEAR_RINGS rings have no return, straight up and one column to either side. fading: see _grazed."""
-    empty = np.isnan(scan.range)
-    clear = np.ones_like(empty)
+        found.append(_cells(usable & ~near_gap & gap & solid, EdgeKind.SKY_SIDE, side))
+    clear = usable & ~np.isnan(_above(scan.range, -1))
+    clear[: CLEAR_RINGS - 1] = False  # nothing is measured above the top rings
     for rows in range(1, CLEAR_RINGS + 1):
         above = np.isnan(_above(scan.range, rows))
         clear &= above & np.roll(above, 1, 1) & np.roll(above, -1, 1)
-    mask = _measured(scan, config) & clear & ~np.isnan(_above(scan.range, -1))
-    mask[: CLEAR_RINGS - 1] = False  # nothing is measured above the top rings
-    return _cells(mask & ~empty & ~fading, EdgeKind.SKY_TOP, 0)
+    return [*found, _cells(clear & ~empty, EdgeKind.SKY_TOP, 0)]
 
 
 def _grazed(scan: RangeImage) -> Mask:
@@ -220,7 +210,7 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     """Reflectivity steps along a ring (lane markings, signs) where the range is smooth, away from the surface's border."""
     assert scan.reflectivity is not None
     R = scan.range
-    value = np.where(scan.index >= 0, scan.reflectivity[np.maximum(scan.index, 0)], np.nan)
+    value = np.append(scan.reflectivity, np.float32(np.nan)).take(scan.index)
     ahead, behind = 0.5 * (value + np.roll(value, -1, 1)), 0.5 * (np.roll(value, 1, 1) + np.roll(value, 2, 1))
     step, level = np.abs(ahead - behind), np.asarray(0.5 * (ahead + behind), np.float32)
     before = np.roll(R, 1, 1)
@@ -233,10 +223,12 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
         flat = np.maximum(np.abs(before - R), np.abs(np.roll(R, -1, 1) - R)) < REFLECTIVITY_MAX_JUMP
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
         usable = _measured(scan, config, REFLECTIVITY_MAX_RANGE) & flat
-        at_zero, slope = _reflectivity_noise(step[usable], level[usable])
+        some = np.flatnonzero(usable)
+        some = some[:: max(len(some) // NOISE_STEPS, 1)]
+        at_zero, slope = _reflectivity_noise(step.take(some), level.take(some))
         ratio = step / np.maximum(at_zero + slope * level, np.float32(LEAST_NOISE))
         counted = ratio[usable & ~np.isnan(ratio)]
-        unusual = max(ABOVE_NOISE, float(np.quantile(counted, 1 - UNUSUAL_SHARE))) if len(counted) else np.inf
+        unusual = max(ABOVE_NOISE, float(quantile(counted, 1 - UNUSUAL_SHARE))) if len(counted) else np.inf
         large = (ratio > unusual) | ((ratio > ABOVE_NOISE) & (step > REFLECTIVITY_STEP))
         mask = usable & large & peak & ~near
         strength = np.maximum(ratio * np.float32(USUAL_STRENGTH / unusual), step)
@@ -246,10 +238,13 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
 def _reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
     """Noise of a scan's reflectivity, by its steps (n,) and the mean reflectivities (n,) around them: at level 0, and its slope.
     The highest rising line below the median steps of parts of the levels: edges raise the medians, and nothing lowers them."""
-    every = max(len(steps) // NOISE_STEPS, 1)
-    known = np.flatnonzero(~np.isnan(steps[::every]) & ~np.isnan(levels[::every])) * every
-    parts = np.array_split(known[np.argsort(levels[known], kind="stable")], NOISE_PARTS)
-    medians = np.array([(np.median(levels[part]), np.median(steps[part])) for part in parts if len(part)]).reshape(-1, 2)
+    known = ~np.isnan(steps) & ~np.isnan(levels)
+    steps, levels = steps[known], levels[known] + np.float32(0)
+    # By level, equal ones as they come: bits of a level above a number are sorted ten times as fast as by a stable argsort.
+    bits = levels.view(np.uint32).astype(np.uint64) << np.uint64(32)
+    order = np.sort(bits + np.arange(len(bits), dtype=np.uint64)).astype(np.uint32)
+    parts = [part for part in np.array_split(order, NOISE_PARTS) if len(part)]
+    medians = np.array([[quantile(a[part], 0.5) for a in (levels, steps)] for part in parts]).reshape(-1, 2)
     x, y = medians[medians[:, 1] > 0].T  # where whole numbers hide the noise, they do not tell it
     if not len(x):
         return np.float32(0), np.float32(0)
@@ -268,14 +263,9 @@ def _reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32])
 
 
 def _cells(mask: Mask, kind: EdgeKind, side: int, strength: NDArray[np.float32] | None = None) -> EdgeCells:
-    row, column = np.nonzero(mask)
+    row, column = np.divmod(np.flatnonzero(mask), mask.shape[1])  # takes half the time of np.nonzero
     own = np.ones(len(row), np.float32) if strength is None else strength[row, column]
     return EdgeCells(row, column, kind, side, own)
-
-
-def _jump_strength(jump: NDArray[np.float32]) -> NDArray[np.float32]:
-    with np.errstate(invalid="ignore"):
-        return np.sqrt(np.clip(jump, 0, JUMP_SATURATION))
 
 
 def _measured(scan: RangeImage, config: LidarConfig, max_range: float = MAX_RANGE) -> Mask:
@@ -294,8 +284,8 @@ def _extrapolated(R: NDArray[np.float32], before: NDArray[np.float32], steps: ND
     horizon, R where `before` is empty."""
     # The inverse range is extrapolated, which is linear in small angles on a plane.
     with np.errstate(invalid="ignore", divide="ignore"):
-        inverse = 1 / R + np.fmin(1 / R - 1 / before, 0) * steps
-        return np.where(inverse <= 0, np.inf, 1 / inverse)
+        inverse = 1 / R
+        return np.asarray(1 / np.maximum(inverse + np.fmin(inverse - 1 / before, 0) * steps, 0))
 
 
 def _above(values: NDArray[np.float32], rows: int) -> NDArray[np.float32]:
@@ -305,8 +295,9 @@ def _above(values: NDArray[np.float32], rows: int) -> NDArray[np.float32]:
     return out
 
 
-# Points on edges, of which an upward edge may give several: (m, 3) float32, m, index (m,) into the cloud, and strength (m,).
-EdgeSamples = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
+# Points on edges, of which an upward edge may give several: (m, 3) in the scanner's frame, m, index (m,) into the cloud, and
+# strength (m,).
+EdgeSamples = tuple[NDArray[np.float64], NDArray[np.integer], NDArray[np.float32]]
 
 
 def between_rays(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
@@ -319,8 +310,8 @@ def between_rays(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
         P = _in_scanner(scan, index)
         angle = OUTWARD_SHIFT * scan.azimuth_step * found.side
         P += angle * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
-        return _samples(scan, P, index, found.strength)
-    parts = upward_parts(float(np.median(-np.diff(scan.elevation))) if len(scan.elevation) > 1 else 0.0)
+        return P, index, found.strength
+    parts = upward_parts(float(quantile(-np.diff(scan.elevation), 0.5)) if len(scan.elevation) > 1 else 0.0)
     part = np.tile(np.arange(parts), len(row))
     row, column, strength = (np.repeat(a, parts) for a in (row, column, found.strength / np.float32(parts)))
     index = scan.index[row, column]
@@ -330,17 +321,12 @@ def between_rays(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
     cones = np.vstack([2 * scan.cones[:1] - scan.cones[1:2], scan.cones])
     gap = cones[row] - cones[row + 1]  # to the next ring above
     P[:, 2] += share * (gap[:, 0] + gap[:, 1] * np.hypot(P[:, 0], P[:, 1]))
-    return _samples(scan, P, index, strength)
+    return P, index, strength
 
 
 def _in_scanner(scan: RangeImage, index: NDArray[np.integer]) -> NDArray[np.float64]:
     """Points of the cloud in the scanner's frame."""
-    return np.asarray(scan.pose.to_scanner(scan.cloud.xyz[index].astype(np.float64)))
-
-
-def _samples(scan: RangeImage, P: NDArray[np.float64], index: NDArray[np.integer], strength: NDArray[np.float32]) -> EdgeSamples:
-    """Samples at the points P (m, 3) of the scanner's frame."""
-    return scan.pose.to_cloud(P).astype(np.float32), index.astype(np.int32), strength
+    return np.asarray(scan.pose.to_scanner(scan.cloud.xyz.take(index, axis=0).astype(np.float64)))
 
 
 def upward_parts(spacing: float) -> int:
@@ -386,4 +372,4 @@ def between_points(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
         P[:, 2] = rho * np.tan(np.arctan2(P[:, 2], rho) + angle)
     else:
         P += (found.side * angle)[:, None] * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
-    return _samples(scan, P, outermost, found.strength)
+    return P, outermost, found.strength

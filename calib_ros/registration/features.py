@@ -126,9 +126,8 @@ class FeatureExtractor:
     def used(self) -> NDArray[np.bool_] | None:
         """(h, w) of the working image, False in what ``image.mask`` and ``image.ignored_boxes`` leave out; None = all is used.
         BadInputError if the mask cannot be read or does not fit the camera."""
-        used = used_pixels(self.config.image, self.source_camera.width, self.source_camera.height)
+        used, seen = used_pixels(self.config.image, self.source_camera.width, self.source_camera.height), self._rectify.seen()
         masked = None if used is None else np.asarray(self.working(used.astype(np.uint8) * 255) == 255)
-        seen = self._rectify.seen()
         shown = None if seen is None else np.asarray(self._shrunk(seen.astype(np.uint8) * 255) == 255)
         return shown & masked if shown is not None and masked is not None else (shown if masked is None else masked)
 
@@ -179,12 +178,10 @@ class FeatureExtractor:
         points = deskewed_edges(edges, still, self.config.motion)
         levels = self._levels(image, points, of=frame) if plain is None else plain.levels
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
-        facts = (self.camera, frame.stamp, frame.name, reflectivity, twist, by_azimuth)
-        features = FrameFeatures(points, levels, *facts)
-        if twist is None and not frame.compensated and self.config.motion.deskew != "off":
-            sweep_s = self.config.motion.scan_period_s * self.source_camera.field_deg / 720
-            features = replace(features, unknown_motion_s=sweep_s)
-        return features
+        unknown = twist is None and not frame.compensated and self.config.motion.deskew != "off"
+        unknown_s = self.config.motion.scan_period_s * self.source_camera.field_deg / 720 if unknown else 0.0
+        facts = (self.camera, frame.stamp, frame.name, reflectivity, twist, by_azimuth, unknown_s)
+        return FrameFeatures(points, levels, *facts)
 
     def _levels(
         self, image: NDArray[np.uint8], points: EdgePoints, semantic: Map | None = None, of: Frame | None = None
@@ -192,8 +189,7 @@ class FeatureExtractor:
         """Edge maps of a working image, no sharper than the scanner's edges are placed: evenly within a step. of: the frame whose
         maps other pairs of the camera may have made."""
         blunt = points.azimuth_step / np.sqrt(12)
-        focal = float(self.camera.K[0, 0])
-        make = partial(edge_levels, image, focal, semantic, EDGE_SHARE, self.used, self.across, blunt)
+        make = partial(edge_levels, image, float(self.camera.K[0, 0]), semantic, EDGE_SHARE, self.used, self.across, blunt)
         if of is None or self._pictures is None:
             return make()
         own = self.source_camera

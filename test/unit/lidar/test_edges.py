@@ -361,17 +361,12 @@ def test_edges_do_not_depend_on_the_order_of_points():
             assert np.abs(edges.xyz[by[0]] - expected.xyz[by[1]]).max() < 0.02
 
 
-def rain(cloud: PointCloud, share: float) -> PointCloud:
-    """The same cloud with drops in front of its surfaces."""
-    rng = np.random.default_rng(0)
-    factor = np.where(rng.random(len(cloud)) < share, rng.uniform(0.2, 0.8, len(cloud)), 1)
-    return PointCloud((cloud.xyz * factor[:, None]).astype(np.float32), None, cloud.ring)
-
-
 @pytest.mark.parametrize("rings", RINGS)
 def test_rain_makes_no_edges(rings):
     cloud = Spinner(**RINGS[rings]).scan([*AROUND, Plane((0, 0, 1), 4), Plane((0, 0, 1), -3)])
-    wet = rain(cloud, 0.01)
+    rng = np.random.default_rng(0)
+    factor = np.where(rng.random(len(cloud)) < 0.01, rng.uniform(0.2, 0.8, len(cloud)), 1)  # of drops in front of surfaces
+    wet = PointCloud((cloud.xyz * factor[:, None]).astype(np.float32), None, cloud.ring)
     drops = int(np.sum(np.abs(wet.xyz - cloud.xyz).max(axis=1) > 0.3))
     assert drops > 200
     # Two drops side by side are rare, and look like a thing.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import GROUND, Box, Plane, Spinner
 
+from calib_ros.arrays import quantile
 from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
@@ -213,3 +214,11 @@ def test_ring_numbers_of_any_size_are_sorted_from_the_top():
     rows, elevation = _rows_from_top(ring, np.array([0.1, 0.3, 0.3, -0.2, 0.1]))
     assert rows.tolist() == [1, 0, 0, 2, 1]
     assert elevation == pytest.approx([0.3, 0.1, -0.2])
+
+
+def test_quantiles_are_those_of_numpy():
+    rng = np.random.default_rng(0)
+    for n, dtype in itertools.product((1, 2, 7, 1000), (np.float32, np.float64)):
+        values = rng.normal(size=n).astype(dtype)
+        for share in (0.0, 0.25, 0.5, 0.95, 1.0):
+            assert quantile(values, share) == pytest.approx(np.quantile(values, share), rel=1e-6)

@@ -60,12 +60,6 @@ def points(seed: int, n: int = 900, spacing_deg: float = 0.4) -> EdgePoints:
     return EdgePoints(xyz.astype(np.float32), rng.uniform(0.2, 2, n).astype(np.float32), kind, float(np.deg2rad(spacing_deg)))
 
 
-def plain(xyz: np.ndarray, maps: list[EdgeLevel]) -> FrameFeatures:
-    """Points of the first kind, all as strong."""
-    p = EdgePoints(np.asarray(xyz, np.float32), np.ones(len(xyz), np.float32), np.zeros(len(xyz), np.uint8))
-    return FrameFeatures(p, maps, CAMERA, 0, "", True)
-
-
 def levels(seed: int, smoothness: float = 1.0) -> list[EdgeLevel]:
     rng = np.random.default_rng(1000 + seed)
     out = []
@@ -81,7 +75,8 @@ def frame(seed: int, smoothness: float = 1.0, **options) -> FrameFeatures:
 
 
 FRAMES = [frame(k) for k in range(3)]
-EMPTY = plain(np.zeros((0, 3)), FRAMES[1].levels)
+NO_POINTS = EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8))
+EMPTY = FrameFeatures(NO_POINTS, FRAMES[1].levels, CAMERA, 0, "", True)
 POSES = [
     se3.exp(np.array(xi)) @ nominal() for xi in ([0] * 6, [0.02, -0.03, 0.01, 0.1, -0.05, 0.2], [0, 0.2, -0.1, 0.3, 0.4, 0.5])
 ]
