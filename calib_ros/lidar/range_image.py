@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.arrays import quantile
 from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.rings import Angles, angles, azimuth_step, columns_of, even_rows, scan_rings
+from calib_ros.lidar.rings import Angles, angles, azimuth_step, by_ring, columns_of, even_rows, find_rings, scan_rings
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, hangs_upside_down, ring_cones
 
 Ranges = NDArray[np.float32]
@@ -66,17 +67,16 @@ class RangeImage:
 def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
     """Range image of a point cloud; the nearest return wins a cell. Raises TooFewFeaturesError for fewer than MIN_POINTS returns
     beyond ``config.min_range``."""
-    auto = config.scanner_pose == "auto"
-    given = None if auto else ScannerPose.given(config.scanner_position_m, config.scanner_rpy_deg)
+    given = None if config.scanner_pose == "auto" else ScannerPose.given(config.scanner_position_m, config.scanner_rpy_deg)
     pose, ring = given or CLOUD_FRAME, None
     cloud, own, distance = _beyond(cloud.finite(), pose, config.min_range)
+    seen = angles(own)
     if config.layout != "projection":
-        ring, pose = scan_rings(cloud, given)
+        ring, pose = scan_rings(cloud, seen) if given is None else (find_rings(cloud, *seen, own), given)
         if given is None and not pose.is_cloud_frame:
-            numbered = replace(cloud, ring=ring)
-            cloud, own, distance = _beyond(numbered, pose, config.min_range)
-            ring = cloud.ring
-    middle = float(np.median(distance[:: 1 + len(distance) // 4096]))
+            cloud, own, distance = _beyond(replace(cloud, ring=ring), pose, config.min_range)
+            ring, seen = cloud.ring, angles(own)
+    middle = float(quantile(distance[:: 1 + len(distance) // 4096], 0.5))
     if middle > FARTHEST_MEDIAN_M:
         raise TooFewFeaturesError(
             f"half of the points are {middle:.0f} m away or more, as if their coordinates were in millimetres, "
@@ -84,20 +84,21 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
         )
     if hangs_upside_down(own):
         pose, own = pose.turned_over(), own * np.array([1, -1, -1], np.float32)
-    azimuth, elevation = angles(own)
+        seen = angles(own)
     if ring is None and config.layout != "rings":
-        return _project(cloud, azimuth, elevation, distance, pose)
-    return _from_rings(cloud, own, even_rows(elevation) if ring is None else ring, azimuth, elevation, distance, pose)
+        return _project(cloud, *seen, distance, pose)
+    return _from_rings(cloud, own, even_rows(seen[1]) if ring is None else ring, seen, distance, pose)
 
 
 def _beyond(cloud: PointCloud, pose: ScannerPose, min_range: float) -> tuple[PointCloud, Ranges, Ranges]:
     """The points of a finite cloud at least min_range from the scanner; in its frame (n, 3), and their distances (n,)."""
     own = pose.to_scanner(cloud.xyz)
-    distance = np.sqrt(np.einsum("ij,ij->i", own, own))  # faster than its norm
+    x, y, z = np.ascontiguousarray(own.T)
+    distance = np.sqrt(x * x + y * y + z * z)  # faster than its norm
     keep = distance >= min_range
-    if int(keep.sum()) < MIN_POINTS:
-        raise _too_few(int(keep.sum()))
-    return (cloud, own, distance) if keep.all() else (cloud.select(keep), own[keep], distance[keep])
+    if (count := int(np.count_nonzero(keep))) < MIN_POINTS:
+        raise _too_few(count)
+    return (cloud, own, distance) if count == len(keep) else (cloud.select(keep), own[keep], distance[keep])
 
 
 def require_returns(cloud: PointCloud) -> None:
@@ -113,10 +114,10 @@ def reflectivity(intensity: NDArray[np.float32] | None) -> NDArray[np.float32] |
     if intensity is None or len(intensity) == 0:
         return None
     values = np.nan_to_num(intensity, nan=0.0, posinf=0.0, neginf=0.0)
-    high = float(np.percentile(values, 99.9))
-    if high <= float(values.min()):
+    low, high = values.min(), values.max()
+    if np.count_nonzero(values > low) <= 0.001 * (len(values) - 1):
         return None
-    full_scale = 1.0 if values.max() <= 1.5 else 255.0 if values.max() <= 256 else high
+    full_scale = 1.0 if high <= 1.5 else 255.0 if high <= 256 else float(quantile(values, 0.999))
     return np.asarray(np.clip(values / np.float32(full_scale), 0, 1), np.float32)
 
 
@@ -126,7 +127,7 @@ def isolated_returns(ranges: Ranges) -> Mask:
     limit = np.maximum(np.float32(JUMP_MIN), np.float32(SAME_SURFACE) * ranges)
     alone = ~_near(ranges, np.roll(ranges, 1, 1), limit) & ~_near(ranges, np.roll(ranges, -1, 1), limit)
     alone &= ~np.isnan(ranges)
-    row, column = np.nonzero(alone)
+    row, column = np.divmod(np.flatnonzero(alone), alone.shape[1])
     if not len(row):
         return alone
     # Few cells are left; their other neighbours are tested one by one.
@@ -151,29 +152,21 @@ def isolated_returns(ranges: Ranges) -> Mask:
 
 
 def _from_rings(
-    cloud: PointCloud,
-    own: Ranges,
-    ring: NDArray[np.int32],
-    azimuth: NDArray[np.floating],
-    elevation: NDArray[np.floating],
-    distance: NDArray[np.floating],
-    pose: ScannerPose,
+    cloud: PointCloud, own: Ranges, ring: NDArray[np.int32], seen: tuple[Angles, Angles], distance: Ranges, pose: ScannerPose
 ) -> RangeImage:
-    """own: the points (n, 3) in the scanner's frame."""
+    """own: the points (n, 3) in the scanner's frame, and their angles as seen from there."""
+    azimuth, elevation = seen
     row, row_elevation = _rows_from_top(ring, elevation)
     step = azimuth_step(row, azimuth)
     columns = max(min(round(2 * np.pi / step), most_cells(len(row)) // len(row_elevation)), 1)
     step = max(step, 2 * np.pi / (columns + 0.5))  # wider only where there would have been too many columns
     column = columns_of(row, azimuth, columns)
+    cell = row * np.intp(columns) + column
     ranges = np.full((len(row_elevation), columns), np.nan, np.float32)
     index = np.full(ranges.shape, -1, np.int32)
-    cell = row * np.intp(columns) + column
-    index.ravel()[cell] = np.arange(len(cell), dtype=np.int32)
-    shared = np.flatnonzero(np.isin(cell, cell[index.ravel()[cell] != np.arange(len(cell))]))
-    order = shared[np.argsort(-distance[shared], kind="stable")]  # later writes win: nearest last
-    index.ravel()[cell[order]] = order
-    hit = index >= 0
-    ranges[hit] = distance[index[hit]]
+    np.fmin.at(ranges.ravel(), cell, distance)
+    shown = np.flatnonzero(ranges.take(cell) == distance.astype(np.float32))
+    index.ravel()[cell[shown]] = shown
     index[isolated_returns(ranges)] = -1
     left, right = np.roll(ranges, 1, 1), np.roll(ranges, -1, 1)
     with np.errstate(invalid="ignore"):
@@ -185,14 +178,12 @@ def _from_rings(
 
 def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Ring numbers (n,) in any order -> row from the top (n,) and the median elevation of each row, rad."""
-    short = ring.astype(np.int16) if ring.min() >= -(2**15) and ring.max() < 2**15 else ring  # 16 bits sort in linear time
-    order = np.argsort(short, kind="stable")
-    names, first = np.unique(ring[order], return_index=True)
-    medians = np.array([np.median(part) for part in np.split(elevation[order], first[1:])])
+    order, starts = by_ring(ring)
+    medians = np.array([quantile(part, 0.5) for part in np.split(elevation[order], starts)], elevation.dtype)
     from_top = np.argsort(-medians, kind="stable")
-    row_of_name = np.empty(len(names), np.int32)
-    row_of_name[from_top] = np.arange(len(names), dtype=np.int32)
-    return row_of_name[np.searchsorted(names, ring)], medians[from_top]
+    row = np.empty(len(ring), np.int32)
+    row[order] = np.repeat(np.argsort(from_top), np.diff([0, *starts, len(ring)]))
+    return row, medians[from_top]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.arrays import quantile
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit, stays
 
@@ -29,6 +30,7 @@ CUT_BIN = float(np.deg2rad(0.5))  # rad; of the histogram of azimuths at which r
 STEP_POINTS = 30_000  # points enough to find the azimuth step
 PHASE_POINTS = 40_000  # that tell at which azimuths rings fire: hundreds of each
 MAX_COLUMNS = 16384
+MAX_NUMBERS = 2**16  # up to which ring numbers are counted, not sorted
 GAP_BINS = 25.0  # bins per unit of the logarithm of an azimuth gap: each 4 % wide
 DEFAULT_STEP = float(np.deg2rad(0.2))  # rad; if no ring has two points
 # Spread of rings in the scanner's own frame, rad, and as a share of their spacing: HDL-32E 0.12 deg, 0.09; de-skewed HDL-64E 0.10
@@ -41,17 +43,13 @@ FIELD_APART, RUNS_APART = 0.2, 0.5
 MUCH_SHARPER = 0.5  # share to which another pose of the scanner must lower the spread of the rings
 
 
-def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDArray[np.int32] | None, ScannerPose]:
+def scan_rings(cloud: PointCloud, seen: tuple[Angles, Angles]) -> tuple[NDArray[np.int32] | None, ScannerPose]:
     """Ring number of each point, (n,) int32, or None if the scan has no rings; and the pose of the scanner in the cloud's frame.
 
-    That is the cloud's frame itself, unless `given`, or unless another pose makes the rings cones. It may be known without the
-    rings.
+    That is the cloud's frame itself, unless another pose makes the rings cones. It may be known without the rings. seen: `angles`
+    of the points, in the cloud's frame.
     """
-    xyz = cloud.xyz
-    if given is not None:
-        own = given.to_scanner(xyz)
-        return find_rings(cloud, *angles(own), own), given
-    ring = find_rings(cloud, *angles(xyz))
+    xyz, ring = cloud.xyz, find_rings(cloud, *seen)
     if len(xyz) < FEWEST_POINTS:
         return ring, CLOUD_FRAME
     known = None if ring is None else ring_fit(xyz, ring)
@@ -59,7 +57,7 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
         in_own_frame = known.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * known.spacing)
         if in_own_frame or stays(xyz, ring, MUCH_SHARPER * known.spread):
             return ring, CLOUD_FRAME
-    for candidate, apart in ((_ring_field(cloud), FIELD_APART), (rings_by_order(*angles(xyz), posed=False), RUNS_APART)):
+    for candidate, apart in ((_ring_field(cloud), FIELD_APART), (rings_by_order(*seen, posed=False), RUNS_APART)):
         if candidate is not None:
             fit = fitted_pose(xyz, candidate)
             sharper = fit.spread < MUCH_SHARPER * ring_fit(xyz, candidate).spread
@@ -80,8 +78,8 @@ def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], S
     for _ in range(SETTLING_ROUNDS):
         own = pose.to_scanner(cloud.xyz)
         azimuth, elevation = angles(own)
-        ring = _ring_field(cloud)
-        if ring is not None and keeps_elevation(ring, elevation):
+        ring = _ring_field(cloud, elevation)
+        if ring is not None:
             return ring, pose
         runs = rings_by_order(azimuth, elevation, posed=False)
         fit = None if runs is None else fitted_pose(cloud.xyz, runs, pose)
@@ -98,7 +96,7 @@ def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], S
 
 def angles(xyz: NDArray[np.floating]) -> tuple[Angles, Angles]:
     """Azimuth and elevation (n,) in rad of points (n, 3) in the scanner's frame."""
-    x, y, z = xyz.T
+    x, y, z = np.ascontiguousarray(xyz.T)
     return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
 
 
@@ -110,14 +108,11 @@ def find_rings(
 
     azimuth, elevation: (n,) rad, and xyz: (n, 3) m, in the scanner's frame; by default that is the cloud's.
     """
-    ring = _ring_field(cloud)
     # Drivers of scanners without rings fill the field with laser or scan line numbers, each of which sweeps the whole view.
-    if ring is not None and keeps_elevation(ring, elevation):
-        return ring
-    by_order = rings_by_order(azimuth, elevation)
-    if by_order is not None:
-        return by_order
-    return rings_by_elevation(cloud.xyz if xyz is None else xyz, elevation)
+    ring = _ring_field(cloud, elevation)
+    if ring is None:
+        ring = rings_by_order(azimuth, elevation)
+    return rings_by_elevation(cloud.xyz if xyz is None else xyz, elevation) if ring is None else ring
 
 
 def ring_of_points(cloud: PointCloud, azimuth: Angles, elevation: Angles) -> NDArray[np.int32]:
@@ -133,31 +128,29 @@ def even_rows(elevation: Angles) -> NDArray[np.int32]:
     return np.asarray(np.clip((elevation - low) / height, 0, EVEN_ROWS - 1), np.int32)
 
 
-def keeps_elevation(ring: NDArray[np.int32], elevation: Angles) -> bool:
-    """Whether most rings have a nearly constant elevation, compared with the whole scan."""
-    compact = np.unique(ring, return_inverse=True)[1].astype(np.int32)
-    return _ring_spread(compact, elevation) <= MAX_RING_SPREAD * _mean_deviation(elevation)
-
-
 def rings_by_order(azimuth: Angles, elevation: Angles, posed: bool = True) -> NDArray[np.int32] | None:
     """Rings as runs of monotonic azimuth, (n,) int32; None if the points are not stored ring after ring. Of the starts tried, the
     one whose runs spread least in elevation wins. posed: False = as seen from a wrong pose."""
-    turn = np.diff(azimuth)
+    turn, whole = np.diff(azimuth), azimuth.dtype.type(2 * np.pi)
     turn -= (2 * np.pi * np.rint(turn / (2 * np.pi))).astype(turn.dtype)
-    sign = 1.0 if np.count_nonzero(turn > 0) >= np.count_nonzero(turn < 0) else -1.0
-    if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn):
+    forward, backward = np.count_nonzero(turn > 0), np.count_nonzero(turn < 0)
+    sign = 1.0 if forward >= backward else -1.0
+    if min(forward, backward) > MAX_BACKWARD_SHARE * len(turn):
         return None
     starts = [0.0, np.pi, float(azimuth[0]) - sign * 1e-3]
     every, best = max(len(azimuth) // HISTOGRAM_POINTS, 1) | 1, None
     if posed:
-        least = MAX_RUN_SPREAD * _mean_deviation(elevation)
+        least = MAX_RUN_SPREAD * float(np.abs(elevation - elevation.mean()).mean())
     else:
         step, least = np.abs(np.diff(elevation)), np.inf
         starts.append(_cut(azimuth, step, sign * float(np.median(np.abs(turn)))))
     for start in starts:
-        angle = np.mod(sign * (azimuth - start), 2 * np.pi)
+        angle = sign * (azimuth - start)
+        angle -= whole * (angle >= whole)  # within 0..2 pi, to the same bits as by np.mod, which takes five times as long
+        while angle.min() < 0:
+            angle += whole * (angle < 0)
         span = float(np.ptp(angle))
-        ring = np.concatenate([[0], np.cumsum(np.diff(angle) < -0.5 * span)]).astype(np.int32)
+        ring = np.cumsum(np.diff(angle, prepend=angle[:1]) < -0.5 * span, dtype=np.int32)
         if not (MIN_RINGS <= int(ring[-1]) + 1 <= MAX_RINGS and span >= 0.1):
             continue
         # From a wrong pose the spread does not tell, since a start half a turn aside mixes evenly; but runs end where the
@@ -179,9 +172,27 @@ def _cut(azimuth: Angles, step: Angles, turn: float) -> float:
     return float(np.median(near) - 0.5 * turn)
 
 
-def _ring_field(cloud: PointCloud) -> NDArray[np.int32] | None:
-    """The driver's ring field, if it may number rings."""
-    return cloud.ring if cloud.ring is not None and 2 <= len(np.unique(cloud.ring)) <= MAX_RINGS else None
+def _ring_field(cloud: PointCloud, elevation: Angles | None = None) -> NDArray[np.int32] | None:
+    """The driver's ring field, if it may number rings, and if most of them have a nearly constant elevation (n,), where given,
+    compared with the whole scan."""
+    ring = cloud.ring
+    if ring is None:
+        return None
+    low, high = int(ring.min()), int(ring.max())
+    place = ring - low if high - low < MAX_NUMBERS else np.unique(ring, return_inverse=True)[1].astype(np.int32)
+    if not 2 <= np.count_nonzero(np.bincount(place)) <= MAX_RINGS:
+        return None
+    if elevation is None:
+        return ring
+    every, whole = max(len(ring) // HISTOGRAM_POINTS, 1) | 1, float(np.abs(elevation - elevation.mean()).mean())
+    return ring if _ring_spread(place[::every], elevation[::every]) <= MAX_RING_SPREAD * whole else None
+
+
+def by_ring(ring: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Order of the points (n,) ring after ring, as stored within each; and where in it the second and further rings begin."""
+    short = ring.astype(np.int16) if ring.min() >= -(2**15) and ring.max() < 2**15 else ring  # 16 bits sort in linear time
+    order = np.argsort(short, kind="stable")
+    return order, np.flatnonzero(np.diff(ring.take(order))) + 1
 
 
 def rings_by_elevation(xyz: NDArray[np.floating], elevation: Angles) -> NDArray[np.int32] | None:
@@ -204,43 +215,41 @@ def azimuth_step(row: NDArray[np.int32], azimuth: NDArray[np.floating]) -> float
     """Most frequent azimuth difference of neighbours in a ring, rad. row: (n,) ring of each point, azimuth: (n,) rad."""
     every = max(len(row) // STEP_POINTS, 1)
     some = row % every == 0
-    if not some.any():
-        some = np.ones(len(row), bool)
-    row, azimuth = row[some], azimuth[some]
-    order = np.lexsort((azimuth, row))
-    gap = np.diff(azimuth[order])
-    gap = gap[(np.diff(row[order]) == 0) & (gap > 2 * np.pi / MAX_COLUMNS)]
+    if some.any():
+        row, azimuth = row[some], azimuth[some]
+    order, starts = by_ring(row)
+    gap = np.concatenate([np.diff(np.sort(part)) for part in np.split(azimuth[order], starts)])
+    gap = gap[gap > 2 * np.pi / MAX_COLUMNS]
     if not len(gap):
         return DEFAULT_STEP
     level = np.rint(np.log(gap / gap.min()) * GAP_BINS).astype(np.intp)
     count = np.convolve(np.bincount(level), [1, 1, 1], "same")
-    usual = gap[np.abs(level - count.argmax()) <= 4]
-    return float(np.median(usual))
+    return float(quantile(gap[np.abs(level - count.argmax()) <= 4], 0.5))
 
 
 def columns_of(row: NDArray[np.int32], azimuth: NDArray[np.floating], columns: int) -> NDArray[np.intp]:
     """Column of each point, (n,), such that the firings of its ring fall on cell centres."""
     # On cell borders they would by rounding share one cell and leave the next empty, across which no edge is seen.
-    turn = azimuth.astype(np.float64) * columns
+    place = azimuth.astype(np.float64) * (columns / (2 * np.pi))
     every = max(len(row) // PHASE_POINTS, 1) | 1  # odd: a power of two would take the same lasers of every firing
-    some, rows = row[::every], int(row.max(initial=0)) + 1
-    rings = np.bincount(some, np.cos(turn[::every]), rows) + 1j * np.bincount(some, np.sin(turn[::every]), rows)
+    some, rows = row[::every].astype(np.intp), int(row.max(initial=0)) + 1
+    angle = (2 * np.pi * (place[::every] - np.rint(place[::every]))).astype(np.float32)
+    rings = np.bincount(some, np.cos(angle), rows) + 1j * np.bincount(some, np.sin(angle), rows)
     # Relative to the mean phase of all rings, so that rings which fire together stay in the same columns.
     common = np.angle(rings.sum())
     phase = common + np.angle(rings * np.exp(-1j * common))
-    return np.asarray(np.rint((turn - phase[row]) / (2 * np.pi) + columns // 2).astype(np.intp) % columns)
-
-
-def _mean_deviation(elevation: Angles) -> float:
-    return float(np.abs(elevation - np.mean(elevation)).mean())
+    place += columns // 2 - (phase / (2 * np.pi)).take(row)
+    return np.asarray(np.rint(place, out=place).astype(np.intp) % columns)
 
 
 def _ring_spread(ring: NDArray[np.int32], elevation: Angles) -> float:
     """Mean absolute deviation of the elevation in the ring of the median point, rad."""
     count = np.bincount(ring)
     mean = np.bincount(ring, elevation) / np.maximum(count, 1)
-    deviation = np.bincount(ring, np.abs(elevation - mean[ring])) / np.maximum(count, 1)
-    return float(np.median(np.repeat(deviation, count)))
+    deviation = np.bincount(ring, np.abs(elevation - mean.take(ring))) / np.maximum(count, 1)
+    order = np.argsort(deviation)
+    middle = np.searchsorted(np.cumsum(count[order]), [(len(ring) - 1) // 2, len(ring) // 2], "right")
+    return float(deviation[order[middle]].mean())
 
 
 def _histogram_peaks(elevation: Angles) -> NDArray[np.int32] | None:

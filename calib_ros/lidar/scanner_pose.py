@@ -29,7 +29,7 @@ GROUND_THICKNESS, GROUND_PLANES, MAX_SLOPE_DEG = 0.15, 64, 35.0  # m; planes tri
 CONE_POINTS = 40_000  # points that are enough for the cones of all rings
 FIT_STEPS = 25
 NEAR_M, NEAR_DEG = 0.5, 0.5  # of the cloud's frame
-FIT_DONE = 1e-5  # rad and m; a smaller step ends the fit
+FIT_DONE, NEAR_DONE = 1e-5, 1e-3  # rad and m; a smaller step ends the fit, and one that only tells near from far
 CENTRE_SIGMA, MAX_CENTRE = 3.0, 8.0  # m; how far from the origin a scanner may be: what the scan leaves open, and the limit
 MAX_STEP_M, MAX_STEP_RAD = 1.0, 0.3  # of one step of the fit
 MIN_SCALE = 1e-4  # rad; no laser is pointed better
@@ -176,7 +176,7 @@ def stays(xyz: NDArray[np.floating], ring: NDArray[np.int32], spread: float) -> 
     """Whether the fit of rings (n,) of points (n, 3) stays near the cloud's frame, with more than this spread: compensated scans
     are blurred, but not seen from elsewhere."""
     P, row = _sample(xyz, ring, FIRST_POINTS)
-    fit = _measured(P, row, _gauss_newton(P, row, CLOUD_FRAME))
+    fit = _measured(P, row, _gauss_newton(P, row, CLOUD_FRAME, NEAR_DONE))
     return bool(np.linalg.norm(fit.pose.centre) < NEAR_M and fit.pose.tilt_deg < NEAR_DEG and fit.spread > spread)
 
 
@@ -184,8 +184,9 @@ def ring_cones(row: NDArray[np.int32], xyz: NDArray[np.floating], rows: int) -> 
     """Cone z = offset + slope * distance from the axis, fitted to the points (n, 3) of each row -> (rows, 2), offset m and slope.
     Its apex need not be the origin of the cloud: the lasers of an HDL-64E sit 0.12 m to 0.21 m above it."""
     every = max(len(row) // CONE_POINTS, 1) | 1
-    if every > 1 and len(np.unique(row[::every])) == rows:
+    if every > 1 and np.bincount(row[::every], minlength=rows).all():
         row, xyz = row[::every], xyz[::every]
+    row = row.astype(np.intp)
     z = xyz[:, 2].astype(np.float64)
     rho = np.hypot(xyz[:, 0], xyz[:, 1]).astype(np.float64)
     weight = 1 / np.maximum(rho, 0.1)  # errors of tilted rays grow with the distance
@@ -213,7 +214,7 @@ def _sample(xyz: NDArray[np.floating], ring: NDArray[np.int32], points: int) -> 
     return xyz[::every].astype(np.float64), row.astype(np.intp).ravel()
 
 
-def _gauss_newton(P: Floats, row: NDArray[np.intp] | None, start: ScannerPose) -> ScannerPose:
+def _gauss_newton(P: Floats, row: NDArray[np.intp] | None, start: ScannerPose, done: float = FIT_DONE) -> ScannerPose:
     """The pose at which the elevations of the points (n, 3) of each row are equal; without rows, of neighbours (`_against`)."""
     R, c = start.rotation, start.centre
     for _ in range(FIT_STEPS):
@@ -239,7 +240,7 @@ def _gauss_newton(P: Floats, row: NDArray[np.intp] | None, start: ScannerPose) -
         c = np.clip(c + step[:3], -MAX_CENTRE, MAX_CENTRE)
         axis = R @ np.array([step[4], -step[3], 1.0])
         R = upright(axis / np.linalg.norm(axis))
-        if np.abs(step).max() < FIT_DONE:
+        if np.abs(step).max() < done:
             break
     return ScannerPose(c, R)
 
