@@ -37,7 +37,7 @@ MIN_SIGMA = 0.8  # px; with less blur, pixel noise dominates the gradient of the
 LOCAL_MEAN, LOCAL_OFFSET = 3.0, 0.3
 # Maps have mean 0 and deviation 1. One pixel of an edge in 2000 reaches 45 deviations; rounding is noise of 0.0006 of one.
 UNIT, LARGEST = 1 / 512, 63.0
-SMALLEST_BLUR, MIN_SHRUNK = 2.0, 8  # px of a shrunk image: sigma at least, and its sides
+SMALLEST_BLUR, MIN_SHRUNK = 1.65, 8  # px of a shrunk image: sigma at least, and its sides
 
 
 @dataclass(frozen=True, eq=False)
