@@ -163,5 +163,5 @@ def test_the_command_estimates_a_rig_with_two_lidars(tmp_path: Path, capsys: pyt
         assert data["sensors"][name]["reference_error"]["rotation_deg"] < 0.15
     assert "lidar_right" in capsys.readouterr().out
     page = Path(out["--report"]).read_text()
-    assert (page.count("<svg"), page.count("data:image/jpeg;base64,")) == (2, 1)
+    assert (page.count("<svg"), page.count("data:image/jpeg;base64,")) == (2, 2)  # before and after
     assert "lidar_left_to_front_optical" in Path(out["--out"]).read_text()
