@@ -302,6 +302,7 @@ def parse(text: str, what: str) -> Result:
         if not math.isfinite((offset or 0.0) + (offset_sigma or 0.0)):
             raise ValueError("time_offset_s")
         frames, elapsed = int(data.get("frames_used") or 0), float(data.get("elapsed_s") or 0)
+        listed = data["frames"] if isinstance(data.get("frames"), list) else []
     except (TypeError, ValueError, OverflowError):
         raise BadInputError(f"{what}: covariance, score, frames_used, elapsed_s and time_offset_s must be numbers") from None
     if not 0 <= frames < 2**32:  # what a message can hold
@@ -324,6 +325,7 @@ def parse(text: str, what: str) -> Result:
         time_offset_sigma_s=offset_sigma,
         stamping=_stamping(data, what),
         refined_camera=None if data.get("refined_camera") is None else RefinedCamera.from_dict(data["refined_camera"], what),
+        frame_names=tuple(str(own["name"]) for own in listed if isinstance(own, dict) and "name" in own),
     )
 
 

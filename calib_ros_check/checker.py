@@ -157,11 +157,12 @@ class Checker:
         """The verdict about what the scenes show; None if nothing matches beyond chance."""
         optima: list[Matrix] = []
         both = [look(self._calibrator, features, box, inputs, optima) for box in (None, NEAR)]
-        near = max((own for own in both if own is not None), key=match_of, default=None)
+        matches = [(own.evidence.z_score if own.evidence else -np.inf, own) for own in both if own is not None]
+        z_score, near = max(matches, key=lambda own: own[0], default=(-np.inf, None))
         # What is off by more than NEAR is as rare as something mixed up, and is looked for afterwards.
         given = self._judge.as_given(features, inputs.T, optima)
         # Where the scenes match beyond doubt, only a picture can be another one: a transform would lead elsewhere.
-        undoubted = near is not None and match_of(near) >= UNDOUBTED_Z
+        undoubted = z_score >= UNDOUBTED_Z
         tolerance, watch = inputs.tolerance, Progress(inputs.progress, "causes")
         asked = Question(features, inputs.T, None, inputs.as_taken, inputs.vehicle_frames, True, undoubted, near is None, watch)
         one = self._judge.explain(asked, given, tolerance.deg, tolerance.m)
@@ -333,8 +334,3 @@ def look(
     if result.refusal is RefusalCode.WRONG_TIMES and result.evidence is not None:  # an optimum that matches for all that
         return result if result.evidence.p_value <= calibrator.config.refine.max_p_value else None
     return result if result.converged else None
-
-
-def match_of(result: Result) -> float:
-    """z-score of a match."""
-    return result.evidence.z_score if result.evidence is not None else -np.inf

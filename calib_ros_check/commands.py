@@ -34,7 +34,7 @@ class Check:
         command.add_argument("source", nargs="+", help=f"{SOURCE}; several, or a folder of recordings, are a fleet")
         add_camera_and_topics(command)
         command.add_argument(
-            "--extrinsic",
+            *("--extrinsic", "--initial"),
             default="reference",
             metavar="WHAT",
             help="what is checked: reference = of the source (default), tf = the static transforms of a bag, or a result file",

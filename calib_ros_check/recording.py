@@ -81,6 +81,9 @@ def check_source(
     T = extrinsic_of(source, path, options.extrinsic, frames[0])
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
+    made = () if options.extrinsic in (REFERENCE, TF) else result.load(options.extrinsic).frame_names
+    if {frame.name for frame in frames} <= {*made}:
+        notes.append("the extrinsic was made from these frames, which cannot refute it: check it on others, by --frames")
     found = replace(
         found,
         notes=(*getattr(source, "remarks", ()), *notes, *found.notes),

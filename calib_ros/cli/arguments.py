@@ -23,11 +23,6 @@ def per_axis(text: str) -> Three:
     return x, y, z
 
 
-def axis_names(text: str) -> list[str]:
-    """'rx,tz' -> names."""
-    return [_axis(part, text) for part in text.split(",")]
-
-
 def axis_values(text: str) -> list[tuple[str, float]]:
     """'ty=0.1,rx=2' -> names and numbers that are not negative."""
     out = []
@@ -111,11 +106,11 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
     _frames_and_start(command)
     for option, unit in (("--search-deg", "deg"), ("--search-m", "m")):
         command.add_argument(
-            option, type=per_axis, metavar="S[,S,S]", help=f"half width of the search box, {unit}; both 0 = refine only"
+            option, type=per_axis, metavar="S[,S,S]", help=f"half width, {unit}, from nominal 10, 0.5, else 3, 0.3; 0 = refine"
         )
     _constraints(command)
     command.add_argument(
-        "--objective", choices=["fast", *names(OBJECTIVES)], help="score to maximise (default fast); thesis = eq. 3.12"
+        "--objective", choices=["fast", *names(OBJECTIVES)], help="score (default fast); thesis = eq. 3.12, see --preset"
     )
     command.add_argument(
         "--intrinsics",
@@ -247,9 +242,8 @@ def _constraints(command: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--rotation-only", action="store_true", help="keep the camera's position in the LiDAR frame; estimate only its rotation"
     )
-    group.add_argument(
-        "--fix", type=axis_names, action="extend", default=[], metavar="AXES", help="fix these axes, for example rx,tz"
-    )
+    names_of = lambda text: [_axis(part, text) for part in text.split(",")]  # noqa: E731
+    group.add_argument("--fix", type=names_of, action="extend", default=[], metavar="AXES", help="fix these axes, as in rx,tz")
     group.add_argument(
         "--bound",
         type=axis_values,

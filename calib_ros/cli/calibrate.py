@@ -27,7 +27,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import AUTO, BY_CLASSES, GUESSES, MOTION, nominal_start
 from calib_ros.registration.search.constraints import NOMINAL_BOX, Axes, SearchBox
-from calib_ros.result import FRAMES, Cause, Extrinsic, RefusalCode, Result
+from calib_ros.result import FRAMES, INITIAL, WIDER, Cause, Extrinsic, RefusalCode, Result
 
 
 def calibrate(
@@ -88,8 +88,8 @@ def next_command(result: Result, source: Source, config: Config, args: argparse.
         return "", ""
     if wrong is RefusalCode.WORSE_THAN_START and initial not in ("nominal", *GUESSES):
         return again(args.given, f"--extrinsic {shlex.quote(initial)}", "check")
-    if initial == "nominal" and source.reference is not None and result.cause is None:
-        return again(args.given, "--initial reference")
+    if initial == "nominal" and result.cause is None and (source.reference is not None or wrong.options == WIDER):
+        return again(args.given, "--initial auto" if source.reference is None else "--initial reference")
     if wrong is Cause.NOT_RECTIFIED and source.camera.said_rectified:
         return again(args.given, "--no-rectified")
     if wrong.options == FRAMES:
@@ -184,6 +184,8 @@ def replay(
                 "drift": extrinsic.normalised_innovation,
                 **result.to_dict(),
             }
+    if status == INITIAL:
+        note(f"no estimate: {len(recalibrator.keyframes)} of {len(positions)} frames became keyframes; try calib-ros calibrate")
     if recalibrator.motion.missing:
         note(recalibrator.motion.missing)
     if write_film is not None:

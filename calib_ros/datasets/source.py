@@ -17,7 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.accumulation import Accumulator, Stamped
 from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
 
-FRAMES_ADVICE = "give all, a list like 0,4,8 or a range like 0:100:5"
+FRAMES_ADVICE = "give all, a list like 0,4,8 or a range like 0:100:5, by position from 0, not by name"
 CACHED_CLOUDS, SCANS_PER_S = 4, 20
 RUN_S, ENOUGH = 5.0, 0.8  # s of frames from which motion is estimated, and the share of it that is enough
 CENTRES = (0.5, 0.2, 0.8, 0.0, 1.0)  # around which of the chosen frames, as shares of their number
@@ -192,6 +192,8 @@ def selected(text: str) -> slice | list[int]:
                 raise ValueError
             return slice(*parts)
         listed = [int(part) for part in text.split(",")]
+        if any(part.strip() != str(k) for part, k in zip(text.split(","), listed, strict=True)):  # 000004 is a name
+            raise ValueError
     except ValueError:
         raise BadInputError(f"--frames {text}: {FRAMES_ADVICE}") from None
     twice = [k for k in listed if listed.count(k) > 1]

@@ -140,11 +140,6 @@ class KeyframeBuffer:
         share_new = min(self.newest_among(chosen, self.unfused) / max(len(chosen), 1), 1.0)
         return Batch(chosen, self.generation, new, self.unfused, share_new)
 
-    def give_back(self, batch: Batch) -> None:
-        """The estimate ended without a result: what was new still is."""
-        if batch.generation == self.generation:
-            self.new += batch.new
-
     def replace(self, before: FrameFeatures, after: FrameFeatures) -> None:
         """Put other features in the place of a keyframe's, if it is still there."""
         self.features = deque((after if f is before else f for f in self.features), self.features.maxlen)

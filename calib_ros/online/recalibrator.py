@@ -340,7 +340,8 @@ class Recalibrator:
             result = self.first_guess.explained(result, self.calibrator, (batch.features, box, progress), names)
         except Cancelled:
             with self._lock:
-                self.keyframes.give_back(batch)
+                if batch.generation == self.keyframes.generation:  # what was new still is
+                    self.keyframes.new += batch.new
                 self.schedule.cancel_estimate()
                 self._keyframes_fit = self._keyframes_fit and fitted
             raise

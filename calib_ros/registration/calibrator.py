@@ -338,6 +338,7 @@ class Calibrator:
         refine = self.config.refine
         as_taken = self.pictures_of(frames) if frames else None
         box = None if box is None or box.is_empty else box
+        stated = stated and bool(result.initial[:3, 3].any())  # a camera at the LiDAR's very place is a guess
         asked = Question(features, result.initial, box, as_taken, stated=stated, progress=Progress(progress, "causes"))
         given = self.judge.as_given(features, result.initial, optima)
         found = self.judge.explain(asked, given, refine.tolerance_deg, refine.tolerance_m)
