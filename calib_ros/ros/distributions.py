@@ -7,11 +7,11 @@ from importlib.metadata import version
 from rclpy.utilities import get_rmw_implementation_identifier
 
 try:
-    from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 except ImportError:  # Humble
-    from rclpy.qos_event import SubscriptionEventCallbacks, UnsupportedEventTypeError
+    from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 
-__all__ = ["SubscriptionEventCallbacks", "UnsupportedEventTypeError"]
+__all__ = ["PublisherEventCallbacks", "SubscriptionEventCallbacks", "UnsupportedEventTypeError"]
 
 IRON, KILTED = 4, 8  # the first major version of rclpy; ROS_DISTRO, which wheels do not set, would not tell
 # How middlewares other than Fast DDS get large messages whole, by a part of the identifier; what none names is a DDS as well.

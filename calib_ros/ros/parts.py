@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -21,6 +20,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.extensions import NodeService
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.distributions import PublisherEventCallbacks
 from calib_ros.ros.parameters import Parameters
 
 # Of the executor: in the first one coroutines whose promise is done return, in the second one what they left to do is done.

@@ -183,7 +183,7 @@ class AdaptiveSubscription:
         except UnsupportedEventTypeError:
             text = "this middleware does not report lost messages: only gaps in the stamps tell of them"
             self._node.get_logger().info(text, once=True)
-            return subscribe(event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+            return subscribe()
 
     def _on_lost(self, event: Any) -> None:
         self._lost += event.total_count_change
