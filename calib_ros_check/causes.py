@@ -10,7 +10,6 @@ from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import ESTIMATE
-from calib_ros.intrinsics import CENTRE
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.judgement.hypotheses import MIXED_UP, Hypothesis, distorts
 from calib_ros.registration.judgement.lens import LensEstimate
@@ -70,11 +69,14 @@ def lens_findings(lens: LensEstimate | None, fault: Refusal | None, why_not: str
         return findings(of_cameras(camera), CauseState.NOT_JUDGED, why_not)
     if fault is None:
         return findings(of_cameras(camera), CauseState.EXCLUDED, "no other camera matches clearly better")
+    return instead(_lens_finding(fault, CauseState.FOUND, str(fault)), of_cameras(camera))
+
+
+def _lens_finding(fault: Refusal, state: CauseState, message: str) -> CauseFinding:
     names = {"focal": "focal", "aspect": "aspect", "u": "u_px", "v": "v_px"}
     values = {names[name]: value for name, value in fault.figures.items() if name in names}
-    values["barrel"] = -fault.figures.get("radial", 0.0)
     assert fault.cause is not None
-    return instead(CauseFinding(fault.cause, CauseState.FOUND, str(fault), values), of_cameras(camera))
+    return CauseFinding(fault.cause, state, message, values | {"barrel": -fault.figures.get("radial", 0.0)})
 
 
 def explained(hypothesis: Hypothesis, camera: Camera) -> tuple[CauseFinding, ...]:
@@ -100,21 +102,19 @@ def possible_causes(camera: Camera) -> tuple[Cause, ...]:
     return tuple(cause for cause in Cause if cause is not Cause.ALREADY_RECTIFIED or distorts(camera))
 
 
-def centre_finding(lens: LensEstimate, T: Transform, tolerance: Tolerance) -> CauseFinding | None:
-    """A principal point so far off that explains the frames as well as a rotation from the extrinsic T (4, 4) does."""
-    if lens.instead is None:
+def lens_for_mount(lens: LensEstimate, T: Transform, tolerance: Tolerance, camera: Camera) -> CauseFinding | None:
+    """A lens that takes the place of an error of the extrinsic T (4, 4), which the frames do not tell apart: off as lenses are,
+    or by its principal point, however far. camera: as it is claimed."""
+    change, T_instead = lens.expected
+    if not tolerance.covers(T, T_instead) and lens.instead is not None:
+        change, T_instead, loss = lens.instead
+        if loss > PARAMETER_PENALTY:
+            return None
+    if not tolerance.covers(T, T_instead):
         return None
-    change, T_instead, loss = lens.instead
-    if loss > PARAMETER_PENALTY or not tolerance.covers(T, T_instead):
-        return None
-    found = {own.name: own.unit * float(value) for own, value in zip(lens.unknowns, change, strict=True)}
-    u_px, v_px = (found[name] for name in CENTRE)
-    moved = ((u_px, "right", "left"), (v_px, "down", "up"))
-    words = " and ".join(
-        f"a principal point {abs(px):.0f} px further {more if px > 0 else less}" for px, more, less in moved if round(px)
-    )
-    message = f"{words} explains the frames as well as the rotation: they do not tell the two apart"
-    return CauseFinding(Cause.PRINCIPAL_POINT, CauseState.POSSIBLE, message, {"u_px": u_px, "v_px": v_px})
+    effects = lens.moves * change / np.repeat([np.deg2rad(tolerance.deg), tolerance.m], 3)[:, None]
+    other = lens.wrong(int(np.linalg.norm(effects, axis=0).argmax()), change, camera)
+    return _lens_finding(other, CauseState.POSSIBLE, other.told)
 
 
 def complete(judged: Sequence[CauseFinding], camera: Camera) -> tuple[CauseFinding, ...]:

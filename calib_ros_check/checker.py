@@ -42,12 +42,12 @@ from calib_ros_check.causes import (
     OFF,
     OTHER_FITS,
     PARAMETER_PENALTY,
-    centre_finding,
     clock_finding,
     complete,
     explained,
     findings,
     lens_findings,
+    lens_for_mount,
     possible_causes,
 )
 from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
@@ -201,15 +201,14 @@ class Checker:
             found, score, C, shared, whole = other.T, other.score, None, None, None
             causes = explained(other.hypothesis, self.camera)
             clocks = NOT_THE_CLOCKS if clocks.state is CauseState.FOUND else clocks
-        elif lens is not None and (fault is not None or not inputs.tolerance.covers(inputs.T, found)):
-            seen, T = lens.seen(score)
-            if fault is not None or inputs.tolerance.covers(inputs.T, T):  # a usual lens explains it
-                score, found = seen, refined(seen, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0]
-                shared = lens.left_open
-                C = whole = covariance_of(score, found) + shared
-            elif clocks.state is not CauseState.FOUND:
-                own = centre_finding(lens, inputs.T, inputs.tolerance)
-                causes = tuple(own if own is not None and own.cause is finding.cause else finding for finding in causes)
+        elif lens is not None and fault is not None:
+            score, T = lens.seen(score)
+            found = refined(score, T, unlimited(T), NEAR_LEVELS, TOLERANCE_DEG)[0]
+            shared = lens.left_open
+            C = whole = covariance_of(score, found) + shared
+        elif lens is not None and clocks.state is not CauseState.FOUND and not inputs.tolerance.covers(inputs.T, found):
+            own = lens_for_mount(lens, inputs.T, inputs.tolerance, self.camera)
+            causes = tuple(own if own is not None and own.cause is finding.cause else finding for finding in causes)
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *causes)
         blamed, right = any(own.state is CauseState.FOUND for own in causes), inputs.tolerance.covers(inputs.T, found)
@@ -255,9 +254,8 @@ class Checker:
         if result.refusal is RefusalCode.WRONG_TIMES and result.optimum is not None:
             again = self._calibrator.estimate(features, result.optimum, None, inputs.progress)
             optimum = again.T_camera_lidar if again.converged else result.optimum
-            result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
-            whole, shared = again.covariance_with_intrinsics, again.shared_covariance
-            result = replace(result, covariance_with_intrinsics=whole, shared_covariance=shared)
+            names = ("covariance", "covariance_with_intrinsics", "shared_covariance")
+            result = replace(result, T_camera_lidar=optimum, **{name: getattr(again, name) for name in names})
         return features, result, finding
 
     def _lens_instead(

@@ -58,7 +58,8 @@ class Tolerance:
 class Deviation:
     """An error of the extrinsic, along an axis or in all.
 
-    error: its median, low and high: where it lies with 95 %; deg, or m. NaN where nothing is known. words: for people.
+    error: its median; low and high: where it lies with 95 %, and where the estimate alone has it; deg, or m. NaN where nothing is
+    known. words: for people.
     """
 
     name: str

@@ -96,13 +96,16 @@ def judge(
     limits = np.array([np.deg2rad(tolerance.deg)] * 3 + [tolerance.m] * 3)
     sizes = np.stack([np.linalg.norm(samples[:, :3], axis=1), np.linalg.norm(samples[:, 3:], axis=1)], axis=1)
     p_within = float((sizes <= limits[[0, 3]]).all(axis=1).mean())
-    # Axes share the scale of the prior; what is known of one must not stand for another that the scenes do not show.
+    # Axes share the scale of the prior; what is known of one must not stand for another that the scenes do not show. And what is
+    # rare in advance must not hide an error that is seen.
     own = C if shared is None else deviation(T_checked, T_estimated, covariance - shared)[1]
     shown = np.sqrt(np.maximum(np.diag(own), 0)) <= limits
-    axes = tuple(_deviation(name, samples[:, k], limits[k], DEGREES[k], bool(shown[k])) for k, name in enumerate(AXES))
-    rotation = _deviation("rotation", sizes[:, 0], limits[0], DEGREES[0], bool(shown[:3].all()))
-    translation = _deviation("translation", sizes[:, 1], limits[3], 1.0, bool(shown[3:].all()))
-    return Judgement(verdict_of(p_within, bool(shown.all())), p_within, rotation, translation, axes)
+    seen = np.r_[error, np.linalg.norm(error[:3]), np.linalg.norm(error[3:])]
+    names, bounds = (*AXES, "rotation", "translation"), np.r_[limits, limits[[0, 3]]]
+    known = np.r_[shown, shown[:3].all(), shown[3:].all()] & (np.abs(seen) <= bounds)
+    units, drawn = np.r_[DEGREES, DEGREES[[0, 3]]], np.hstack([samples, sizes])
+    *axes, rotation, translation = (_deviation(*own) for own in zip(names, drawn.T, seen, bounds, units, known, strict=True))
+    return Judgement(verdict_of(p_within, bool(known.all())), p_within, rotation, translation, tuple(axes))
 
 
 def undecided(judgement: Judgement) -> Judgement:
@@ -113,10 +116,11 @@ def undecided(judgement: Judgement) -> Judgement:
     return Judgement(opened[judgement.verdict], judgement.p_within, rotation, translation, tuple(axes))
 
 
-def verdict_of(p_within: float, shown: bool = True) -> CheckVerdict:
-    """The verdict by the probability that an error is within the tolerance. shown: its standard deviation is less than that."""
+def verdict_of(p_within: float, known: bool) -> CheckVerdict:
+    """The verdict by the probability that an error is within the tolerance. known: the estimate alone is so, and its standard
+    deviation is less than that."""
     if p_within >= CONFIDENCE:
-        return CheckVerdict.PASS if shown else CheckVerdict.INCONCLUSIVE
+        return CheckVerdict.PASS if known else CheckVerdict.INCONCLUSIVE
     return CheckVerdict.FAIL if p_within <= ACCUSATION else CheckVerdict.INCONCLUSIVE
 
 
@@ -174,10 +178,12 @@ def posterior_samples(error: Matrix, C: Matrix, tolerance: Tolerance, freedom: f
     return np.asarray(means[component] + np.einsum("nij,nj->ni", roots[component], normal))
 
 
-def _deviation(name: str, samples: Matrix, limit: float, unit: float, shown: bool) -> Deviation:
+def _deviation(name: str, samples: Matrix, seen: float, limit: float, unit: float, known: bool) -> Deviation:
+    """seen: by the estimate alone, which lies in the interval as well."""
     tail = (1 - INTERVAL) / 2
-    low, error, high = (float(x) for x in unit * np.quantile(samples, [tail, 0.5, 1 - tail]))
-    verdict, is_angle = verdict_of(float((np.abs(samples) <= limit).mean()), shown), name[0] == "r"
+    low, error, high = unit * np.quantile(samples, [tail, 0.5, 1 - tail])
+    low, error, high = float(min(low, unit * seen)), float(error), float(max(high, unit * seen))
+    verdict, is_angle = verdict_of(float((np.abs(samples) <= limit).mean()), known), name[0] == "r"
     # Direction and size of the error along an axis; what is claimed is described, not what is true.
     if name not in AXES:
         words = f"off by {amount(error, is_angle)} ({amount(low, is_angle)} to {amount(high, is_angle)})"
@@ -203,12 +209,13 @@ def reason_of(
     # The axes that fail, or else those that are inconclusive; the largest first.
     by_verdict = ([own for own in judgement.axes if own.verdict is v] for v in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE))
     worst = sorted(next(filter(None, by_verdict), []), key=lambda own: -abs(own.error) * (1.0 if own.name[0] == "r" else 5.0))
+    others = [f"or else {own.message}" for own in possible]
     if judgement.verdict is CheckVerdict.FAIL:
         both = (f"{own.name} {own.words}" for own in (judgement.rotation, judgement.translation))
         first, *axes = [own.words for own in worst] or both
-        return joined([f"{first}: estimate anew", *axes, f"more than {tolerance}", *(f"or else {o.message}" for o in possible)])
+        return joined([f"{first}: estimate anew", *axes, f"more than {tolerance}", *others])
     names = ", ".join(f"{own.name} {own.words}" for own in worst) or judgement.sizes
-    return joined([f"not known to within {tolerance}: {MORE_FRAMES}", names])
+    return joined([f"not known to within {tolerance}: {MORE_FRAMES}", names, *others])
 
 
 def amount(value: float, is_angle: bool) -> str:

@@ -48,7 +48,7 @@ class ThesisScore:
         self.n_frames, self.n_levels = len(features), len(self.thesis.smoothing)
         self.frame_weights = _frame_weights(weights, len(features))
         self._frames = [self._near(f, T_prior) for f in features]
-        found = sum(len(f.xyz) for f in self._frames)
+        found = sum(len(xyz) for xyz, *_ in self._frames)
         if found < MIN_POINTS:
             raise TooFewFeaturesError(
                 f"only {found} points near the image in {len(features)} frames (need {MIN_POINTS}); "
@@ -57,11 +57,12 @@ class ThesisScore:
         self._maps = FastEdgeMaps(self.camera.height, self.camera.width, self.thesis)
         self._kept: dict[bytes, list[Shown]] = {}
 
-    def _near(self, features: ThesisFeatures, T_prior: Matrix) -> _FramePoints:
+    def _near(self, features: ThesisFeatures, T_prior: Matrix) -> tuple[Map, Map, PointLevels]:
+        """Points of a frame near the image, their W D, and levels."""
         keep = near_image(features.points.xyz, T_prior, self.camera, MARGIN)
         points = features.points.select(keep)
         matched = points.weight(self.thesis.min_depth) * normalized_discontinuity(points.discontinuity)
-        return _FramePoints(points.xyz, matched, features.map_levels.select(keep))
+        return points.xyz, matched, features.map_levels.select(keep)
 
     def leave_out(self, frames: NDArray[np.intp]) -> None:
         """Leave out frames (m,): their w_j becomes 0."""
@@ -83,11 +84,11 @@ class ThesisScore:
         return self._kept[key]
 
     def _shown(self, j: int, T: Matrix) -> Shown:
-        frame, K = self._frames[j], self.camera.K
+        (xyz, matched, levels), K = self._frames[j], self.camera.K
         M = (K @ T[:3]).astype(np.float32)
-        u, v, points = self._maps.visible(M[:, :3] @ frame.xyz.T + M[:, 3:])
+        u, v, points = self._maps.visible(M[:, :3] @ xyz.T + M[:, 3:])
         pixels = v.astype(np.intp) * self.camera.width + u
-        return Shown(pixels, points, frame.matched[points] + self._maps(u, v, points, frame.levels))
+        return Shown(pixels, points, matched[points] + self._maps(u, v, points, levels))
 
     def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
         """J_j (n_frames,) at T_camera_lidar (4, 4), normalised if so configured; 0 for a frame without a point in the image."""
@@ -108,11 +109,11 @@ class ThesisScore:
         Points hidden at T stay hidden; edge maps are interpolated, standardised and at all resolutions of image.edges.SIGMAS.
         """
         xyz, weight, frame = [], [], []
-        for j, (own, (_, points, edges)) in enumerate(zip(self._frames, self.shown(T), strict=True)):
+        for j, ((near, *_), (_, points, edges)) in enumerate(zip(self._frames, self.shown(T), strict=True)):
             some = np.flatnonzero(edges > 0)
             if not len(some):
                 continue
-            xyz.append(own.xyz[points[some]])
+            xyz.append(near[points[some]])
             weight.append(edges[some].astype(np.float64) * (self.frame_weights[j] / edges[some].sum(dtype=np.float64)))
             frame.append(np.full(len(some), j, np.int32))
         if not xyz:
@@ -142,14 +143,6 @@ class Shown(NamedTuple):
     pixels: NDArray[np.intp]
     points: NDArray[np.intp]
     edges: Map
-
-
-class _FramePoints(NamedTuple):
-    """Points of a frame near the image. matched: their W D."""
-
-    xyz: Map
-    matched: Map
-    levels: PointLevels
 
 
 def _frame_weights(weights: Sequence[float] | None, n: int) -> Matrix:

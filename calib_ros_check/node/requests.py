@@ -28,14 +28,9 @@ from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance
 NO_PAIR = "no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'"
 NO_KEYFRAME = "no keyframe to check by yet: wait for images and clouds, or drive on"
 NO_VEHICLE_FRAMES = "whether the points are in another frame of the vehicle was not tried: /tf_static is not read, or has none"
-NO_PICTURES = (
-    "whether the image is rectified already, or CameraInfo is of another image size, was not tried: keyframes have no pictures; "
-    "check a recording with 'calib-ros check'"
-)
-NO_FISHEYE = (
-    "whether the image is an unrectified fisheye's was not tried: keyframes have no pictures; check a recording with 'calib-ros "
-    "check'"
-)
+NO_PICTURES = "whether {} was not tried: keyframes have no pictures; check a recording with 'calib-ros check'"
+NO_CAMERA = NO_PICTURES.format("the image is rectified already, or CameraInfo is of another image size,")
+NO_FISHEYE = NO_PICTURES.format("the image is an unrectified fisheye's")
 NO_CLASSES = "classes were not used: no keyframe has any yet"
 
 
@@ -112,7 +107,7 @@ def check_keyframes(
     inputs = CheckInputs(T, request.tolerance, classified, None, vehicle_frames or {}, progress)
     result = checker.check_features([features.plain or features for features in chosen], inputs)
     untried = [] if vehicle_frames else [NO_VEHICLE_FRAMES]
-    untried += [NO_PICTURES] if distorts(recalibrator.camera) else []
+    untried += [NO_CAMERA] if distorts(recalibrator.camera) else []
     untried += [NO_FISHEYE] if recalibrator.camera.is_pinhole and result.cause is None else []
     notes = [] if result.verdict is CheckVerdict.PASS else untried
     in_doubt = result.T_estimated is None

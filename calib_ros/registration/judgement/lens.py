@@ -166,11 +166,6 @@ class LensEstimate:
     instead: tuple[Matrix, Transform, float] | None = None
 
     @cached_property
-    def usual(self) -> Matrix:
-        """Standard deviations (n,) in advance."""
-        return np.array([own.usual for own in self.unknowns])
-
-    @cached_property
     def sigma(self) -> Matrix:
         """Standard deviations (n,) by the scenes alone."""
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.information))))
@@ -179,10 +174,11 @@ class LensEstimate:
     def explanations(self) -> list[LensHypothesis]:
         """All ways in which it may be wrong, the most probable first: each unknown is plainly wrong as rarely as it says."""
         found, n, off = [], len(self.unknowns), self.change - self.centre
+        usual = np.array([own.usual for own in self.unknowns])
         rarity = np.array([np.log(own.rare / (1 - own.rare)) for own in self.unknowns])
         for wrong in product((False, True), repeat=n):
             mask = np.array(wrong)
-            prior = np.where(mask, np.hypot(GROSS, self.usual), self.usual)
+            prior = np.where(mask, np.hypot(GROSS, usual), usual)
             covariance = np.asarray(np.linalg.inv(self.information + np.diag(prior**-2.0)), float)
             mean = covariance @ (self.information @ self.change + self.centre / prior**2)
             # What the scenes show differs from what is expected by their noise and as far as this explanation has it.
@@ -268,28 +264,33 @@ class LensEstimate:
         shown = abs(self.change[k]) > ACCUSING * self.sigma[k] and ratio > np.log(1 / doubt - 1)
         # Nor does what the score hardly gains by: its top may be narrower than the way to it is high.
         if shown and self._exceeds(2 * self.gain, ACCUSED):
-            return self._wrong(k, best.mean, camera)
+            return self.wrong(k, best.mean, camera)
         if sum(off) <= OPEN_PROBABILITY:
             return None
         most = self.explanations[int(np.argmax(off))]
         k = int(np.linalg.norm(moves * most.mean, axis=0).argmax())
         if sum(off) >= 1 - doubt and self._exceeds(2 * self.gain, ACCUSED):
-            return self._wrong(k, most.mean, camera)
+            return self.wrong(k, most.mean, camera)
         own = self.unknowns[k]
         return left_open(own.name, own.unit * self.change[k], own.unit * self.sigma[k], min(sum(off), 1 - 1e-9), deg, m)
 
-    def _wrong(self, k: int, change: Matrix, camera: Camera) -> Refusal:
+    def wrong(self, k: int, change: Matrix, camera: Camera) -> Refusal:
         """It is off by this change (n,), of which the unknown k matters most."""
         own, values = self.unknowns[k], {own.name: float(value) for own, value in zip(self.unknowns, change, strict=True)}
         removed = bool(abs(own.stated + change[k]) < 0.5 * abs(own.stated))
         # By how many standard deviations of the scenes and in advance together.
-        deviations = float(abs(self.change[k] - self.centre[k]) / np.hypot(self.sigma[k], self.usual[k]))
+        deviations = float(abs(self.change[k] - self.centre[k]) / np.hypot(self.sigma[k], own.usual))
         return wrong_intrinsics(own.name, values, camera, removed, deviations)
+
+    @property
+    def expected(self) -> tuple[Matrix, Transform]:
+        """The change (n,) that is expected by now, and the extrinsic (4, 4) there."""
+        mean = self.posterior[0]
+        return mean, se3.exp(self.moves @ (mean - self.change)) @ self.T
 
     def seen(self, score: PointScore) -> tuple[PointScore, Transform]:
         """A score as it is by the lens that is expected by now, and the extrinsic (4, 4) there."""
-        mean = self.posterior[0]
-        T = se3.exp(self.moves @ (mean - self.change)) @ self.T
+        mean, T = self.expected
         P = _seeing(score, self.unknowns)(T, mean)[0].points
         back = se3.inverse(T).astype(np.float32)
         return score.with_points(back[:3, :3] @ P + back[:3, 3:]), T

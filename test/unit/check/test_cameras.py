@@ -16,7 +16,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros.registration.judgement.hypotheses import fisheyes, other_lenses, rectified_otherwise, resized, turned_over
 from calib_ros.result import CONVERGED, Cause, Result
 from calib_ros_check.causes import KNOW_CLOCKS, clock_finding
-from calib_ros_check.checker import Checker
+from calib_ros_check.checker import Checker, CheckInputs
 from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
@@ -39,9 +39,9 @@ def checked(frames, camera, truth):
     return Checker(camera, QUICK).check([replace(frame, camera=camera) for frame in frames], truth)
 
 
-def halved(camera):
-    """With the intrinsics of an image of half the size."""
-    return replace(camera, K=camera.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]]))
+def scaled(camera, focal, centre=1.0):
+    """With other intrinsics; 0.5 and 0.5 are those of an image of half the size."""
+    return replace(camera, K=camera.K * np.array([[focal, 1, centre], [1, focal, centre], [1, 1, 1]]))
 
 
 @pytest.mark.parametrize(
@@ -86,9 +86,8 @@ def test_raw_images_that_are_taken_for_rectified_are_to_be_taken_as_raw():
     camera = Camera(np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]]), 640, 240)
     for said, cure in ((True, "--no-rectified, or image_is_rectified: false to the node"), (False, "take the rectified topic")):
         own = replace(camera, said_rectified=said)
-        found = [
-            guess for guess in (*other_lenses(np.eye(4), own), *fisheyes(np.eye(4), own)) if guess.cause is Cause.NOT_RECTIFIED
-        ]
+        guesses = *other_lenses(np.eye(4), own), *fisheyes(np.eye(4), own)
+        found = [guess for guess in guesses if guess.cause is Cause.NOT_RECTIFIED]
         assert len(found) > 2
         assert all(cure in guess.message for guess in found)
 
@@ -107,7 +106,7 @@ def test_what_is_not_known_of_the_clocks_comes_with_what_to_do(count, why):
 
 def test_intrinsics_of_half_the_image_size_are_named_with_the_factor(drive):
     frames, truth = drive
-    result = checked(frames, halved(frames[0].camera), truth)
+    result = checked(frames, scaled(frames[0].camera, 0.5, 0.5), truth)
     assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 
@@ -126,22 +125,33 @@ def test_a_distorted_camera_of_another_size_is_named(drive):
     at = cv2.undistortPoints(grid, lens.K, lens.D, P=lens.K).reshape(lens.height, lens.width, 2).astype(np.float32)
     pictures = [replace(frame, image=cv2.remap(frame.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)) for frame in frames]
     assert checked(pictures, lens, truth).verdict is CheckVerdict.PASS
-    result = checked(pictures, halved(lens), truth)
+    result = checked(pictures, scaled(lens, 0.5, 0.5), truth)
     assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 
 
 def test_a_principal_point_that_looks_like_a_rotation_is_possible(drive):
     frames, truth = drive
-    camera = frames[0].camera
-    K = camera.K.copy()
-    K[0, 2] += 20.0
-    result = checked(frames, replace(camera, K=K), truth)
+    K = np.add(frames[0].camera.K, [[0, 0, 20.0], [0, 0, 0], [0, 0, 0]])
+    result = checked(frames, replace(frames[0].camera, K=K), truth)
     found = {finding.cause: finding for finding in result.causes}[Cause.PRINCIPAL_POINT]
     assert result.verdict is CheckVerdict.FAIL
     assert found.state in (CauseState.FOUND, CauseState.POSSIBLE)
     assert found.values["u_px"] == pytest.approx(-20.0, abs=6.0)
     assert "principal point" in result.reason
+
+
+def test_a_lens_that_nobody_stated_makes_no_extrinsic_right(drive, monkeypatch):
+    frames, truth = drive
+    checker = Checker(scaled(frames[0].camera, 1.008), QUICK)
+    features = [checker._calibrator.extract(replace(frame, camera=checker.camera)) for frame in frames]
+    T = checker._calibrator.estimate(features, truth).T_camera_lidar
+    lens = checker._judge.lens(checker._judge.score(features, T), T, 1.0, None)
+    monkeypatch.setattr(checker, "_lens", lambda *_: (lens, None))
+    result = checker.check_features(features, CheckInputs(lens.expected[1], Tolerance(0.5, 0.05)))
+    found = {finding.cause: finding for finding in result.causes}[Cause.FOCAL_LENGTH]
+    assert (result.verdict, found.state) == (CheckVerdict.INCONCLUSIVE, CauseState.POSSIBLE), result.reason
+    assert f"or else {found.message}" in result.reason
 
 
 @pytest.mark.slow
@@ -151,7 +161,7 @@ def test_wrong_intrinsics_of_a_fisheye_are_named(fisheye):
     camera = frames[0].camera
     right = checked(frames, camera, truth)
     assert right.verdict is CheckVerdict.PASS, right.reason
-    longer = checked(frames, replace(camera, K=camera.K * np.array([[1.04, 1, 1], [1, 1.04, 1], [1, 1, 1]])), truth)
+    longer = checked(frames, scaled(camera, 1.04), truth)
     assert longer.cause is Cause.FOCAL_LENGTH, longer.reason
     unrectified = checked(frames, Camera(camera.K, camera.width, camera.height), truth)
     assert unrectified.cause is Cause.NOT_RECTIFIED, unrectified.reason

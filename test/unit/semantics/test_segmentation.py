@@ -435,10 +435,8 @@ def turned(frame: Frame, yaw_deg: float) -> Frame:
     return replace(frame, cloud=cloud, reference=frame.reference @ se3.from_parts(R.T, np.zeros(3)), twist=None)
 
 
-# Of centroids a shorter one is test_calibrate_from_a_semantic_start.
-@pytest.mark.parametrize("method", ["semantic", pytest.param("centroids", marks=pytest.mark.slow)])
-def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive, method):
-    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}, "initial": {"method": method}}), **SOURCE)
+def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}, **GUESSED}), **SOURCE)
     frames = [turned(f, -115) for f in drive]
     truth = frames[0].reference
     assert se3.rotation_error_deg(nominal(), truth) > 100
