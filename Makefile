@@ -22,7 +22,7 @@ help:
 	@echo "make test ROOM=lidar    all tests of one room: a folder below test/, or a module such as config"
 	@echo "make test PYTEST_ARGS='-k deskew -x'    further arguments of pytest"
 	@echo "make test-all           everything, with long scenarios and the laboratory"
-	@echo "make bench              speed of each stage"
+	@echo "make bench [BASE=X]     CPU time of commands and node, beside commit X"
 	@echo "make compare BASE=main  is the working tree better or worse than a commit? Paired, with intervals; SETS=, TRIALS=, TIP="
 	@echo "make lint               ruff and mypy"
 	@echo "make docs               the documentation site in site/"
@@ -55,7 +55,7 @@ test-all: env
 	$(PYTEST) $(PYTEST_ARGS)
 
 bench: env
-	$(VENV)/bin/python -m benchmarks.bench
+	$(VENV)/bin/python -m benchmarks.bench $(if $(BASE),--base $(BASE))
 
 SETS ?=
 TRIALS ?= 1

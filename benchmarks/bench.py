@@ -1,171 +1,167 @@
-"""Speed: features, classes, scores, calibration, the thesis's objective. CPU times, medians.
+"""What commands, their parts and the node cost in CPU time and memory, beside another version.
 
-    python -m benchmarks.bench [SOURCE] [--only PART]
+    make bench [BASE=COMMIT]
+    python -m benchmarks.bench [SOURCE] [--base COMMIT] [--runs 5] [--only STAGE ...]
 
-SOURCE: by default the synthetic drive; a KITTI folder or a bag gives real frames.
+SOURCE: with a reference extrinsic; by default the synthetic drive. Its frames, and the same with what is wrong, are written as
+bags once. Every run is a process of its own, of both versions in turn, and counts as the kernel counts it. Printed are the
+least, the median and the most of the runs, and the ratio of the medians.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import subprocess
 import sys
-import time
-import tracemalloc
+import tempfile
 from collections.abc import Callable, Sequence
-from functools import partial
-from itertools import cycle, islice
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
+from tqdm import tqdm
 
+from benchmarks.compare import WORKING_TREE, environment, side
+from benchmarks.compare_sets import ROOT
+from benchmarks.records import markdown
 from calib_ros import se3
-from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.datasets.source import Source
+from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.classes import CLOUD, IMAGE
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, points_in_reach
-from calib_ros.registration.objective import FastScore
-from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_thesis.config import thesis_of
-from calib_ros_thesis.maps import complete_depth, complete_fast, far_level
-from calib_ros_thesis.score import ThesisScore, registration_maps
 
-FRAMES = 20
-REPEATS = 5
-PARTS = ["classes", "cost", "thesis"]
-COUNTS = (1, 5, 10, 20, 50, 100)
-PER_FRAME = "features, per frame"
-SEARCH = "search in 10 deg / 0.5 m"
-MEMORY = "MB that a refinement takes, beside the keyframes"
-Costs = dict[str, list[float]]  # step -> CPU ms for each of COUNTS
-
-
-def cpu_ms(run: Callable[[], Any], repeat: int) -> float:
-    """Median CPU time of a call in ms, after one call to warm up."""
-    run()
-    times = []
-    for _ in range(repeat):
-        start = time.process_time()
-        run()
-        times.append(time.process_time() - start)
-    return 1e3 * float(np.median(times))
+FRAMES, RUNS, BAD_INPUT = 10, 5, 2
+OFF = ([6.0, -5.0, 4.0], [0.3, -0.25, 0.2])  # deg, m: the start is this far off the reference
+LONGER = 1.03  # the focal length that is wrong
+COMMAND = ["-m", "calib_ros"]
+NODE = ["-m", "benchmarks.node_cost", "--settle", "45", "--seconds", "40", "--bare"]
+# Its last line is the figure of the stage, in s.
+FEATURES = """
+import sys, time
+from calib_ros import Calibrator
+from calib_ros.datasets import open_dataset
+source = open_dataset(sys.argv[1])
+frames = [source[k] for k in range(len(source))]
+calibrator = Calibrator(frames[0].camera)
+calibrator.extract(frames[0])
+began = time.process_time()
+for frame in frames:
+    calibrator.extract(frame)
+print((time.process_time() - began) / len(frames))
+"""
 
 
-def told(label: str, ms: float, note: str = "") -> None:
-    """Print a figure."""
-    print(f"{label:<64} {ms:9.3f} ms  {note}".rstrip(), flush=True)
+class Altered:
+    """A source with something done to its frames."""
+
+    def __init__(self, source: Source, alter: Callable[[int, Frame], Frame]) -> None:
+        self._source, self._alter = source, alter
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._source, name)
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self._alter(index, self._source[index])
 
 
-def classes(frames: list[Frame], reference: np.ndarray) -> None:
-    """Of one frame: all of its points, and those that may come into view."""
-    calibrator = Calibrator(frames[0].camera)
-    frame, segmentation = frames[0], calibrator.segmentation
-    box = SearchBox(10.0, 0.5)
-    told("classes of one frame, the network", cpu_ms(lambda: segmentation(frame, kinds=[IMAGE]), REPEATS))
-    told("classes of one frame, all points", cpu_ms(lambda: segmentation(frame, kinds=[CLOUD]), REPEATS))
-    points = points_in_reach(frame, calibrator.extract, reference, box)
-    told(
-        "classes of one frame, points that may come into view",
-        cpu_ms(lambda: segmentation(frame, kinds=[CLOUD], points=points), REPEATS),
-        f"within {box.reach[0]:g} deg / {box.reach[1]:g} m",
-    )
+def bags(source: Source, folder: Path) -> dict[str, str]:
+    """FRAMES evenly spread frames: right ones, mirrored images, another focal length, and scans of other scenes."""
+    chosen = np.linspace(0, len(source) - 1, min(FRAMES, len(source))).round().astype(int).tolist()
+    K, half = source.camera.K.copy(), len(source) // 2
+    K[[0, 1], [0, 1]] *= LONGER
+    longer = replace(source.camera, K=K)
+    kinds: dict[str, Callable[[int, Frame], Frame]] = {
+        "right": lambda k, frame: frame,
+        "mirrored": lambda k, frame: replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1])),
+        "longer": lambda k, frame: replace(frame, camera=longer),
+        "chance": lambda k, frame: replace(frame, cloud=source[(k + half) % len(source)].cloud),
+    }
+    return {name: str(write_bag(Altered(source, alter), folder / name, positions=chosen)) for name, alter in kinds.items()}
 
 
-def cost_of_frames(frames: Sequence[Frame], reference: NDArray[np.float64]) -> Costs:
-    """CPU times of every step for COUNTS frames; where there are fewer, they come again."""
-    calibrator = Calibrator(frames[0].camera)
-    costs: Costs = {}
-    calibrator.extract(frames[0])
-    unique: list[FrameFeatures] = []
-    for n in COUNTS:
-        began = time.process_time()
-        unique = [calibrator.extract(frame) for frame in islice(cycle(frames), n)][: len(frames)]
-        costs.setdefault(PER_FRAME, []).append(1e3 * (time.process_time() - began) / n)
-    for n in COUNTS:
-        # The same objects again: only the atlas of the score holds maps for every frame, about 9 MB each.
-        features = list(islice(cycle(unique), n))
-        for step, ms in _steps(calibrator, features, reference).items():
-            costs.setdefault(step, []).append(ms)
-    return costs
-
-
-def _steps(calibrator: Calibrator, features: list[FrameFeatures], reference: NDArray[np.float64]) -> dict[str, float]:
-    level = FastScore(features, reference, Config().score).at(-1)
-    repeat = max(200 // len(features), 9)
-    start = se3.perturb(reference, np.full(3, 0.5), np.full(3, 0.05))
-    tracemalloc.start()
-    calibrator.estimate(features, start)
-    peak_mb = tracemalloc.get_traced_memory()[1] / 1e6
-    tracemalloc.stop()
-    far = se3.perturb(reference, np.full(3, 5.0), np.full(3, 0.25))
+def stages(source: Source, folder: Path) -> dict[str, list[str]]:
+    """What is run, as arguments of Python."""
+    bag, start, right = bags(source, folder), folder / "start.json", folder / "right.json"
+    assert source.reference is not None
+    for path, T in ((start, se3.perturb(source.reference, *OFF)), (right, source.reference)):
+        path.write_text(json.dumps({"T_camera_lidar": T.tolist()}))
+    search = ["--initial", str(start), "--search-deg", "10", "--search-m", "0.5"]
+    check = ["--extrinsic", str(right)]
     return {
-        "one score": cpu_ms(partial(level.value, reference), repeat),
-        "one score with slope": cpu_ms(partial(level.linearise, reference), repeat),
-        "refinement": cpu_ms(partial(calibrator.estimate, features, start), 3),
-        MEMORY: peak_mb,
-        SEARCH: cpu_ms(partial(calibrator.estimate, features, far, SearchBox(10.0, 0.5)), 1),
+        "imports": ["-c", "from calib_ros import Calibrator, Recalibrator, SearchBox"],
+        "features of a frame": ["-c", FEATURES, bag["right"]],
+        "calibrate": [*COMMAND, "calibrate", bag["right"], *search],
+        "calibrate, mirrored": [*COMMAND, "calibrate", bag["mirrored"], *search],
+        "calibrate, nothing matches": [*COMMAND, "calibrate", bag["chance"], *search],
+        "calibrate, with intrinsics": [*COMMAND, "calibrate", bag["right"], *search, "--intrinsics", "refine"],
+        "check, right": [*COMMAND, "check", bag["right"], *check],
+        "check, other focal length": [*COMMAND, "check", bag["longer"], *check],
+        "check, nothing matches": [*COMMAND, "check", bag["chance"], *check],
+        "node at rest": NODE,
     }
 
 
-def slope(ms: Sequence[float]) -> float:
-    """Of log cost over log frames: 1 = in proportion to the frames, 0 = the same for any number."""
-    return float(np.polyfit(np.log(COUNTS), np.log(ms), 1)[0])
+def measured(arguments: Sequence[str], tree: Path) -> dict[str, float]:
+    """Figures of a run by the packages of a tree, by their units. CalibrationError where it cannot be made."""
+    own, of = ([*arguments, "--packages", str(tree)], ROOT) if arguments == NODE else (arguments, tree)
+    with tempfile.TemporaryFile() as told:
+        process = subprocess.Popen([sys.executable, *own], cwd=of, env=environment(of), stdout=told, stderr=told)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        told.seek(0)
+        lines = told.read().decode(errors="replace").strip().splitlines()
+    if process.returncode == BAD_INPUT or (process.returncode and arguments[:2] != COMMAND):
+        raise CalibrationError(f"{' '.join(arguments)} of {tree}: {lines[-1:]}")
+    if arguments == NODE:
+        cells = lines[-1].strip("| ").split(" | ")
+        return {"cores": float(np.mean([float(share) for share in cells[1].split()])), "MB": float(cells[-2].split(",")[0])}
+    return {"CPU s": float(lines[-1]) if FEATURES in arguments else usage.ru_utime + usage.ru_stime}
 
 
-def cost_table(costs: Costs) -> str:
-    """As Markdown."""
-    lines = [f"| CPU ms of one core; frames: | {' | '.join(map(str, COUNTS))} | slope |", "|---" * (len(COUNTS) + 2) + "|"]
-    for step, ms in costs.items():
-        lines.append(
-            f"| {step} | {' | '.join(f'{value:.3g}' if value < 100 else f'{value:.0f}' for value in ms)} | {slope(ms):.2f} |"
-        )
-    return "\n".join(lines)
-
-
-def thesis(frame: Frame, reference: np.ndarray) -> None:
-    """Eq. 3.12: features, density completion, one evaluation written out, fast and with its edges attached."""
-    config = Config.from_dict({"refine": {"objective": "thesis"}})
-    extract = FeatureExtractor(frame.camera, config)
-    told("thesis: features of one frame", cpu_ms(lambda: extract(frame), 5))
-    features = extract(frame)
-    maps = registration_maps(features.own, reference, thesis_of(config))
-    sparse, far = maps.lidar.sparse_reflectivity, far_level(thesis_of(config))
-    height, width = sparse.shape
-    size = f"{width}x{height}; IP-Basic takes about 7 ms for a KITTI map"
-    told("thesis: depth map completed, written out", cpu_ms(lambda: complete_depth(sparse, far), 25), size)
-    told("thesis: depth map completed, fast", cpu_ms(lambda: complete_fast(sparse, far + 1), 25), size)
-    score = ThesisScore([features.own], reference, config)
-    written_out = cpu_ms(lambda: registration_maps(features.own, reference, thesis_of(config)).edge_registration_score(), 25)
-    fast = cpu_ms(lambda: score.at(-1).value(reference), 25)
-    attached = score.attached(reference).at(-1)
-    told("thesis: eq. 3.12 of one frame, written out", written_out)
-    told("thesis: eq. 3.12 of one frame, fast", fast, f"{written_out / fast:.1f} times faster")
-    told("thesis: the same with edges attached to the points", cpu_ms(lambda: attached.value(reference), 200))
+def rows_of(name: str, by_tree: Sequence[Sequence[dict[str, float]]]) -> list[list[str]]:
+    """Of a stage, from the runs of each version: least, median and most, and the ratio of the medians of two."""
+    rows = []
+    for unit in by_tree[0][0]:
+        values = np.array([[run[unit] for run in runs] for runs in by_tree])
+        medians = np.median(values, axis=1)
+        cells = [f"{own.min():.3g} {middle:.3g} {own.max():.3g}" for own, middle in zip(values, medians, strict=True)]
+        rows.append([name, unit, *cells, *([f"{medians[1] / medians[0]:.2f}"] if len(values) > 1 else [])])
+    return rows
 
 
 def main() -> int:
-    """Run the benchmarks on the source named on the command line."""
+    """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", nargs="?", default=f"synthetic:frames={FRAMES}", help="as for calib-ros (default synthetic)")
-    parser.add_argument("--only", choices=PARTS, action="append", help="run this part only; may be given again")
+    parser.add_argument("source", nargs="?", default="synthetic:frames=20", help="as for calib-ros (default synthetic)")
+    parser.add_argument("--base", metavar="COMMIT", help="the version beside which this one is measured")
+    parser.add_argument("--runs", type=int, default=RUNS, metavar="N", help=f"of every stage (default {RUNS})")
+    parser.add_argument("--only", nargs="+", metavar="STAGE", help="stages whose names begin so")
     args = parser.parse_args()
-    parts = args.only or PARTS
-    source = open_dataset(args.source)
-    if source.reference is None:
-        parser.error(f"{source.name} states no reference extrinsic; give KITTI, a bag with /tf_static, or synthetic")
-    print(f"{source.name}, {min(FRAMES, len(source))} frames")
-    chosen = np.linspace(0, len(source) - 1, min(FRAMES, len(source))).round().astype(int)
-    frames = [source[int(i)] for i in chosen]
-    cv2.setNumThreads(1)
-    if "classes" in parts:
-        classes(frames, source.reference)
-    if "cost" in parts:
-        print(cost_table(cost_of_frames(frames, source.reference)))
-    if "thesis" in parts:
-        thesis(frames[0], source.reference)
+    if args.runs < 1:
+        parser.error("--runs must be at least 1")
+    try:
+        source = open_dataset(args.source)
+        if source.reference is None:
+            parser.error(f"{source.name} states no reference extrinsic; give KITTI, a bag with /tf_static, or synthetic")
+        with tempfile.TemporaryDirectory(prefix="calib_ros_bench_") as folder:
+            asked = stages(source, Path(folder))
+            chosen = [name for name in asked if not args.only or name.startswith(tuple(args.only))]
+            trees = [side(commit) for commit in ([args.base] if args.base else []) + [WORKING_TREE]]
+            rows: list[list[str]] = []
+            for name in tqdm(chosen, disable=not sys.stderr.isatty()):
+                runs = [[measured(asked[name], tree) for tree in trees] for _ in range(args.runs)]
+                rows += rows_of(name, list(zip(*runs, strict=True)))
+    except CalibrationError as error:
+        parser.error(str(error))
+    print(f"{source.name}: least, median and most of {args.runs} runs")
+    print(markdown(["stage", "unit", *([args.base, "this", "this / base"] if args.base else ["this"])], rows))
     return 0
 
 

@@ -284,10 +284,11 @@ class Driver:
 
 
 @contextmanager
-def process_of(command: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Ended by SIGINT afterwards."""
+def process_of(command: list[str], log: Path, packages: Path | None = None) -> Iterator[subprocess.Popen[bytes]]:
+    """Ended by SIGINT afterwards. packages: a folder with those of another version."""
+    env = os.environ if packages is None else {**os.environ, "PYTHONPATH": str(packages)}
     with log.open("wb") as file:
-        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(command, env=env, stdout=file, stderr=subprocess.STDOUT)
     try:
         yield process
         process.send_signal(signal.SIGINT)
@@ -358,7 +359,7 @@ def measure(run: Run, folder: Path, args: argparse.Namespace) -> list[str]:
     rclpy.init()
     try:
         with ExitStack() as stack:
-            processes = [stack.enter_context(process_of(node, log))]
+            processes = [stack.enter_context(process_of(node, log, args.packages))]
             if args.bare:
                 processes.append(stack.enter_context(process_of(bare, folder / "bare.log")))
             driver = Driver(types, processes, args.soak)
@@ -383,6 +384,7 @@ def main() -> int:
     parser.add_argument("--bare", action="store_true", help="measure a bare subscriber as well")
     parser.add_argument("--soak", action="store_true", help="look for leaks and lost answers")
     parser.add_argument("-p", action="append", default=[], dest="given", metavar="NAME:=VALUE", help="a parameter of the node")
+    parser.add_argument("--packages", type=Path, metavar="FOLDER", help="with another version, whose node is measured")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="keep bags and logs here; reuses the bags")
     args = parser.parse_args()
     use_large_message_profile()

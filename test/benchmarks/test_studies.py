@@ -180,8 +180,8 @@ def test_a_soak_names_leaks_lost_answers_and_tracebacks() -> None:
 
 def test_figures_are_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     source = "synthetic:frames=2,width=320,height=160,rings=16"
-    monkeypatch.setattr(sys, "argv", ["bench", source, "--only", "classes"])
+    monkeypatch.setattr(sys, "argv", ["bench", source, "--runs", "1", "--only", "imports", "features"])
     assert bench.main() == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("classes of one frame")]
-    assert len(lines) == 3
-    assert all(float(line[64:].split()[0]) > 0 for line in lines)
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if "CPU s" in line]
+    assert [row[0] for row in rows] == ["| imports", "| features of a frame"]
+    assert all(0 < float(row[2].split()[1]) < 60 for row in rows)
