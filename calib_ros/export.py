@@ -107,11 +107,11 @@ def xyz_rpy(T: Transform) -> list[float]:
     return [float(v) + 0.0 for v in (*T[:3, 3], roll, pitch, yaw)]  # + 0: no "-0.0" in files that people read
 
 
-def tf_command(poses: Edges) -> str:
-    """The line that publishes a pose."""
+def tf_command(poses: Edges, text: Callable[[float], str] = repr) -> str:
+    """The line that publishes a pose. text: of a number, by default with every bit."""
     (((parent, child), T),) = poses.items()
-    values = [*T[:3, 3], *se3.quaternion_from_rotation(T[:3, :3])]
-    numbers = " ".join(f"--{n} {v}" for n, v in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), map(_number, values), strict=True))
+    values = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*T[:3, 3], *se3.quaternion_from_rotation(T[:3, :3])), strict=True)
+    numbers = " ".join(f"--{name} {text(float(value) + 0.0)}" for name, value in values)
     frames = f"--frame-id {shlex.quote(parent)} --child-frame-id {shlex.quote(child)}"
     return f"ros2 run tf2_ros static_transform_publisher {numbers} {frames}\n"
 

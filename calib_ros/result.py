@@ -122,13 +122,14 @@ class Evidence:
 
     z_score: of the score, in standard deviations of the null distribution. decoy_z_score: of the best optimum in the mirrored
     image; None where there was no doubt. p_value: of z_score against the decoy. disagreement: of halves of the data, squared, in
-    units of what their covariances let expect.
+    units of what their covariances let expect. scenes: how many different ones the frames are worth; 0 = not known.
     """
 
     z_score: float
     decoy_z_score: float | None
     p_value: float
     disagreement: float
+    scenes: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,7 +92,7 @@ def summary(checked: Checked, command: tuple[str, str] = ("", "")) -> str:
     lines += [f"{axis.name}  {axis.verdict.value:<12}  {axis.words}" for axis in result.axes]
     # What the frames do not tell. A cause that was found is the reason of the verdict.
     untold = [own for own in result.causes if own.state is CauseState.NOT_JUDGED and result.T_estimated is not None]
-    lines += [f"{finding.cause.value}: {finding.message}" for finding in untold]
+    lines += [f"{own.cause.value}: {'not judged' if result.verdict is CheckVerdict.PASS else own.message}" for own in untold]
     last = f"{result.frames_used} of {len(result.frame_names)} frames, {result.cpu_s:.1f} s of CPU"
     return "\n  ".join([*lines, *result.notes, last])
 

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import (
-    MARGIN,
-    MIN_POINTS,
-    PointScore,
-    near_image,
-    nearest_per_pixel,
-    project,
-)
+from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, PointScore, near_image, nearest_per_pixel, project
 from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import EdgeMaps, FastEdgeMaps, PointLevels, edge_maps

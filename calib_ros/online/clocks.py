@@ -12,7 +12,7 @@ from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.monitor import MIN_TWIST
-from calib_ros.registration.covariance import unobservable_directions
+from calib_ros.registration.covariance import open_directions
 from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.joint import at_stamping, clocks_are_estimated, restamped
 from calib_ros.registration.judgement.clocks import SIGNIFICANT_Z, STAMP_SCATTER_S
@@ -110,7 +110,7 @@ class ClockEvidence:
             """Could an offset of the clocks that nobody has noticed, of this standard deviation, have moved the estimate? Where
             the vehicle always moves alike, an offset looks like another mount."""
             covariance = np.outer(direction, direction) * seconds**2
-            return bool(unobservable_directions(covariance, config.tracker.max_sigma_deg, config.tracker.max_sigma_m))
+            return bool(open_directions(covariance, config.tracker.max_sigma_deg, config.tracker.max_sigma_m))
 
         matters = sigma > 0 and leaves_open(largest)
         noticed = matters and (largest / sigma) ** 2 - 1 >= NOTICED**2  # by how much less is known of the offset in advance

@@ -22,7 +22,7 @@ from calib_ros.config import Config
 from calib_ros.config.online import MANUAL
 from calib_ros.online.sensor_health import SensorFault
 from calib_ros.online.tracker import NOTHING, Confirmations
-from calib_ros.registration.covariance import unobservable_directions
+from calib_ros.registration.covariance import open_directions
 from calib_ros.registration.estimate import largest_sigmas
 from calib_ros.result import BLINDED, CONVERGED, MOVED, REFUSED, SUSPECT, TENTATIVE, RefusalCode, Result
 
@@ -93,7 +93,7 @@ def need(result: Result, config: Config) -> Need | None:
         return None
     # Units of what is wanted, so that rotations and shifts compare.
     unit, names = np.repeat([math.radians(deg), m], 3), []
-    for direction in unobservable_directions(covariance, deg, m):
+    for direction in open_directions(covariance, deg, m):
         shares = {axis: sigma / unit[axis] for axis, sigma in zip(direction.axes, direction.sigma, strict=True)}
         names += [AXES[axis] for axis in sorted(shares, key=lambda axis: -shares[axis])]
     variance = float(np.linalg.eigvalsh(covariance / np.outer(unit, unit))[-1])

@@ -17,7 +17,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, ShiftNoise, shift_evidence
 from calib_ros.online.glance import EVERY_S
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.covariance import REGIONS, covariance, disagreement, distance, effective_frames, effective_points
+from calib_ros.registration.covariance import REGIONS, covariance, disagreement, distance, effective_points, scenes_of
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.judgement.clocks import STAMP_SCATTER_S, at_offset
 from calib_ros.registration.score.chance import HIGHEST_DECOY_Z, null_distribution
@@ -279,7 +279,7 @@ def measure_shift(
         return ShiftTest(1.0, np.zeros(6), 0.0, False)
     shift = se3.log(X @ se3.inverse(T))
     known = np.zeros((6, 6)) if spread is None else spread
-    freedom, together = REGIONS * effective_frames(score), C + known  # see noise_level: its prior makes up for the unknowns
+    freedom, together = REGIONS * scenes_of(score), C + known  # see noise_level: its prior makes up for the unknowns
     squared, axes = distance(shift, together)
     together *= scale
     p_value = _p_value(shift, together, freedom)

@@ -16,7 +16,7 @@ from calib_ros.online.clocks import ClockEvidence
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.pose_filter import KNOWN_Z, SAME_S, OffsetFilter, PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
-from calib_ros.registration.covariance import unobservable_directions
+from calib_ros.registration.covariance import open_directions
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, pose_constraints
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
@@ -311,7 +311,7 @@ class Tracker:
             limits = pose_constraints(self.initial.T_camera_lidar, self.config.constraints, 1).limits
             self.filter.T = limits.clip(self.filter.T)
         config, covariance = self.config.tracker, self.filter.covariance
-        weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)  # more scenes would help there
+        weak = open_directions(covariance, config.max_sigma_deg, config.max_sigma_m)  # more scenes would help there
         if estimate.shared_covariance is not None:
             covariance = covariance + estimate.shared_covariance
         whole = estimate.covariance_with_intrinsics

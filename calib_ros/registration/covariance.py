@@ -162,7 +162,7 @@ def noise_level(score: PointScore, T: Transform, bread: Matrix, axes: NDArray[np
     fewer = FEW_POINTS / effective_points(score)
     if fewer * len(frames) > 1:
         pooled = max(pooled, usual * fewer * len(frames) * max(fewer, 1))
-    return pooled * len(frames) / effective_frames(score)
+    return pooled * len(frames) / scenes_of(score)
 
 
 def noise_of(score: PointScore, T: Transform, limits: Limits) -> float:
@@ -176,7 +176,7 @@ def effective_points(score: PointScore) -> float:
     return 1 / max(float(np.sum(np.square(score.weights, dtype=np.float64))), 1e-12)
 
 
-def effective_frames(score: PointScore) -> float:
+def scenes_of(score: PointScore) -> float:
     """How many independent frames those of a score are worth, 1..n: n^2 / sum of all correlations of their edge maps, as for the
     mean of correlated measurements."""
     frames = score.frames
@@ -189,12 +189,12 @@ def effective_frames(score: PointScore) -> float:
 def freedom(score: PointScore) -> float:
     """Degrees of freedom of the noise of a score: the regions of all frames that show different places, with those that the usual
     noise counts for, less the unknowns."""
-    return REGIONS * effective_frames(score) + USUAL_CELLS - UNKNOWNS - 1
+    return REGIONS * scenes_of(score) + USUAL_CELLS - UNKNOWNS - 1
 
 
 def shows_noise(score: PointScore) -> bool:
     """Whether there are scenes enough to tell noise from what is wrong in one of them."""
-    return effective_frames(score) >= INDEPENDENT
+    return scenes_of(score) >= INDEPENDENT
 
 
 def shows_lens(score: PointScore) -> bool:
@@ -232,7 +232,7 @@ class Direction:
         return " with ".join(f"{AXIS_NAMES[k]} ({size if shown else 'unknown'})" for k, shown, size in sizes)
 
 
-def unobservable_directions(covariance: Covariance, max_deg: float, max_m: float) -> list[Direction]:
+def open_directions(covariance: Covariance, max_deg: float, max_m: float) -> list[Direction]:
     """Directions known less well than max_deg or max_m (standard deviations), the least known first; empty if there are none.
 
     covariance: (6, 6). A direction may couple axes: pitch looks like a vertical shift where all edges are equally far.

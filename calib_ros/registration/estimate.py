@@ -20,7 +20,7 @@ from calib_ros.config.sensors import FARTHEST_OFFSET_S, MAX_OFFSET_S
 from calib_ros.errors import CalibrationError
 from calib_ros.intrinsics import RefinedCamera, change_between
 from calib_ros.registration.classes import consistency_score
-from calib_ros.registration.covariance import Direction, covariance, disagreement, fused, inflation, unobservable_directions
+from calib_ros.registration.covariance import Direction, covariance, disagreement, fused, inflation, open_directions, scenes_of
 from calib_ros.registration.features import views_of
 from calib_ros.registration.joint import Optimised, estimates_offset
 from calib_ros.registration.judgement.clocks import Effect, offset_effect, refuse_clocks, with_known_motion
@@ -223,7 +223,7 @@ def observable_pose(
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         constraints = replace(constraints, limits=limits)
         C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
-    unobservable = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
+    unobservable = open_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
     if not unobservable:
         return T, C + np.diag(held), ()
     deg, m = box.reach if box is not None else (0.0, 0.0)
@@ -273,7 +273,7 @@ def evidence_of(config: Config, objective: Objective, alignment: Alignment, sear
         box = SearchBox(min(deg, SearchBox.MAX_DEG), min(m, SearchBox.MAX_M))
         decoy_z = search_decoy(score, alignment.T, box, config.search, limits)
     halves = disagreement(objective.smooth_score(alignment.T), alignment.T, limits)
-    return Evidence(z_score, decoy_z, p_value(z_score, decoy_z, rounds), halves)
+    return Evidence(z_score, decoy_z, p_value(z_score, decoy_z, rounds), halves, scenes_of(score))
 
 
 def refusal_of(found: Estimate, config: Config, camera: Camera, searched: bool, progress: Progress) -> Refusal | None:
@@ -383,7 +383,7 @@ def check_uncertainty(covariance: Covariance, tolerance_deg: float, tolerance_m:
     limits = largest_sigmas(tolerance_deg, tolerance_m)
     if max(np.rad2deg(np.linalg.norm(sigma[:3])) / limits[0], np.linalg.norm(sigma[3:]) / limits[1]) <= np.sqrt(3):
         return None
-    told = ", ".join(map(str, unobservable_directions(covariance, *limits)[:2])) + " (standard deviations)"
+    told = ", ".join(map(str, open_directions(covariance, *limits)[:2])) + " (standard deviations)"
     return refused(RefusalCode.TOO_UNCERTAIN, told, tolerance_deg=tolerance_deg, tolerance_m=tolerance_m)
 
 

@@ -16,18 +16,7 @@ from scipy.stats import mannwhitneyu
 
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.methods.edges import fitted, probability_right
-from calib_ros_evaluation.report.table import (
-    NONE,
-    Rows,
-    Table,
-    centimetres,
-    degrees,
-    figures,
-    interval,
-    number,
-    percent,
-    plural,
-)
+from calib_ros_evaluation.report.table import NONE, Rows, Table, centimetres, degrees, figures, interval, number, percent, plural
 from calib_ros_evaluation.results import END, SET, SUCCESS_DEG, SUCCESS_M, THESIS_THRESHOLD, Results, Trust
 
 Matrix = NDArray[np.float64]

@@ -16,14 +16,7 @@ from calib_ros.registration.initial_guess import MAX_DISTANCE_M, MAX_TILT_DEG, a
 from calib_ros.registration.score.chance import EvenPoints
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros_semantics.first_guess.centroids import agreed_poses, find_pairs
-from calib_ros_semantics.first_guess.score import (
-    AROUND_DEG,
-    distinct,
-    label_score,
-    local_optimum,
-    refine_positions,
-    select_views,
-)
+from calib_ros_semantics.first_guess.score import AROUND_DEG, distinct, label_score, local_optimum, refine_positions, select_views
 from calib_ros_semantics.first_guess.view import ClassView
 
 Matrix = NDArray[np.float64]

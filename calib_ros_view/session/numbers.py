@@ -22,7 +22,7 @@ from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.covariance import Direction, covariance, unobservable_directions
+from calib_ros.registration.covariance import Direction, covariance, open_directions
 from calib_ros.registration.features import FrameFeatures, at_time_offset, usable_frames
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.atlas import Atlas
@@ -184,7 +184,7 @@ class FrameScores:
             score = self._score(T, left_out, time_offset_s)
             found, _ = refined(score, T, Limits(T, REACH), LEVELS, TOLERANCE_DEG)
             C = covariance(score, found)
-            unobservable = tuple(unobservable_directions(C, UNKNOWN_DEG, UNKNOWN_M))
+            unobservable = tuple(open_directions(C, UNKNOWN_DEG, UNKNOWN_M))
             return Known(found, se3.log(found @ se3.inverse(T)), C, unobservable)
 
     def _score(self, T: Matrix, left_out: Collection[int], time_offset_s: float) -> PointScore:

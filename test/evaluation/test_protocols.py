@@ -20,15 +20,7 @@ from calib_ros.errors import BadInputError
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, SourceSummary
 from calib_ros_evaluation.experiments.trial import run_jobs
-from calib_ros_evaluation.protocols.definitions import (
-    BORER,
-    PROTOCOLS,
-    SINGLE_FRAME,
-    UNICALIB,
-    Protocol,
-    Size,
-    displacement,
-)
+from calib_ros_evaluation.protocols.definitions import BORER, PROTOCOLS, SINGLE_FRAME, UNICALIB, Protocol, Size, displacement
 from calib_ros_evaluation.protocols.trials import (
     COLUMNS,
     INCONCLUSIVE,

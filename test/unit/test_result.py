@@ -109,8 +109,8 @@ def test_the_format_is_the_documented_one():
     assert first <= second
     bare = Result(T, CONVERGED).to_dict()
     assert (bare["frames"], bare["starts"], bare["evidence"]) == ([], None, None)
-    evidence = Evidence(7.3, 3.5, 0.003, 1.2)
-    told = {"z_score": 7.3, "decoy_z_score": 3.5, "p_value": 0.003, "disagreement": 1.2}
+    evidence = Evidence(7.3, 3.5, 0.003, 1.2, 2.5)
+    told = {"z_score": 7.3, "decoy_z_score": 3.5, "p_value": 0.003, "disagreement": 1.2, "scenes": 2.5}
     assert replace(RESULT, evidence=evidence).to_dict()["evidence"] == told
     unseen = replace(RESULT, intrinsics={"focal_length_share": IntrinsicEstimate(0.0, math.inf, False)})
     assert unseen.to_dict()["intrinsics"] == {"focal_length_share": {"value": 0.0, "sigma": None, "observable": False}}

@@ -18,7 +18,7 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
-from calib_ros.registration.covariance import REGIONS, disagreement, effective_frames, inflation, noise_of
+from calib_ros.registration.covariance import REGIONS, disagreement, inflation, noise_of, scenes_of
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.judgement.refusal import GROSSLY, OPEN_PROBABILITY, SIGNIFICANCE, Refusal, left_open, wrong_times
 from calib_ros.registration.score.point_score import PointScore
@@ -273,7 +273,7 @@ def refuse_clocks(
     """
     if not limits.open_axes.any() or not twists.any():
         return None
-    freedom = max(REGIONS * effective_frames(score) - 7, 1.0)  # of the noise, regions of frames less the unknowns
+    freedom = max(REGIONS * scenes_of(score) - 7, 1.0)  # of the noise, regions of frames less the unknowns
     value, effect = _profiled(score.subset(POINTS, np.random.default_rng(0)), T, twists, limits, inflated)
     sigma = float(1 / np.sqrt(effect.information)) if effect.information > 0 else np.inf  # by the scenes alone
     turn, shift = (float(np.linalg.norm(part)) for part in np.split(effect.direction, 2))

@@ -24,16 +24,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import CameraConfig
 from calib_ros.intrinsics import ASPECT, CENTRE, COEFFICIENTS, FOCAL, RADIAL, IntrinsicEstimate, RefinedCamera, changed
 from calib_ros.lens import PERSPECTIVE
-from calib_ros.registration.covariance import (
-    NO_NOISE,
-    REGIONS,
-    STEP,
-    disagreement,
-    effective_frames,
-    inflation,
-    inverse_above,
-    noise_of,
-)
+from calib_ros.registration.covariance import NO_NOISE, REGIONS, STEP, disagreement, inflation, inverse_above, noise_of, scenes_of
 from calib_ros.registration.judgement.refusal import GROSSLY, OPEN_PROBABILITY, SIGNIFICANCE, Refusal, left_open, wrong_intrinsics
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.chance import EvenPoints
@@ -360,7 +351,7 @@ def estimate_lens(
         # Such that the move to the optimum is included: farther away than a step, the score bends otherwise (Broyden 1965).
         missing, weighed = se3.log(T @ se3.inverse(T_given)) - moves @ change, information @ change
         moves = moves + np.outer(missing, weighed) / (float(change @ weighed) + 1)
-    freedom = max(REGIONS * effective_frames(score) - 6 - n, 1.0)
+    freedom = max(REGIONS * scenes_of(score) - 6 - n, 1.0)
     centre, gain = as_it_is if centre is None else centre, max(higher - lower, 0.0) / noise
     at, by, value = ends[-1]
     instead = None if turned is None else (by, at, (higher - value) / noise)

@@ -501,7 +501,7 @@ def test_summary_reports_deskewing(street: list) -> None:
     assert motion(street, MotionConfig()).endswith("in all frames, 2.9 to 3.0 m/s")
     moved = motion(street[:3] + still[:1], MotionConfig(time_offset_s=-0.004))
     assert moved.endswith("in 3 of 4 frames, 3.0 to 3.0 m/s, time offset -4 ms")
-    assert "not known; the time offset has no effect" in motion(still, MotionConfig(time_offset_s=0.01))
+    assert "m/s); the time offset has no effect" in motion(still, MotionConfig(time_offset_s=0.01))
     assert "compensated already" in motion([replace(frame, compensated=True) for frame in still], MotionConfig())
     assert "motion.deskew: off" in motion(street, MotionConfig(deskew="off"))
 

@@ -19,10 +19,10 @@ from calib_ros.registration.covariance import (
     FEW_POINTS,
     USUAL_NOISE,
     covariance,
-    effective_frames,
     effective_points,
     inverse_curvature,
     noise_level,
+    scenes_of,
 )
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
@@ -238,7 +238,7 @@ def test_frames_of_few_points_are_less_certain():
     bread = inverse_curvature(score, nominal(), axes)
     enough, few = (noise_level(s, nominal(), bread, axes) for s in (score, some))
     assert effective_points(some) < 130
-    least = USUAL_NOISE / effective_frames(some) * FEW_POINTS * 4 / effective_points(some)
+    least = USUAL_NOISE / scenes_of(some) * FEW_POINTS * 4 / effective_points(some)
     assert few >= 0.99 * least * FEW_POINTS / effective_points(some)
     assert few > 5 * enough
 
@@ -247,10 +247,10 @@ def test_doubled_frames_are_no_more_certain_and_others_are():
     """Frames of one place repeat their errors."""
     two, others = [peaked(d, k) for k, d in enumerate((-2, 2))], [peaked(d, k + 2) for k, d in enumerate((-2, 2))]
     single, doubled, four = (FastScore(f, nominal(), CONFIG) for f in (two, two * 2, two + others))
-    assert effective_frames(doubled) == pytest.approx(effective_frames(single), rel=1e-4)
-    assert effective_frames(FastScore([two[0]] * 3, nominal(), CONFIG)) == pytest.approx(1)
-    assert 1.5 < effective_frames(single) <= 2
-    assert 2 < effective_frames(four) <= 4
+    assert scenes_of(doubled) == pytest.approx(scenes_of(single), rel=1e-4)
+    assert scenes_of(FastScore([two[0]] * 3, nominal(), CONFIG)) == pytest.approx(1)
+    assert 1.5 < scenes_of(single) <= 2
+    assert 2 < scenes_of(four) <= 4
     assert np.diag(noise_of(doubled)) == pytest.approx(np.diag(noise_of(single)), rel=0.25)
     assert np.trace(noise_of(four)[:3, :3]) < 0.75 * np.trace(noise_of(single)[:3, :3])
 

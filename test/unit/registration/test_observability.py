@@ -11,7 +11,7 @@ from calib_ros.config import CameraConfig, Config, ConstraintsConfig, RefineConf
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.covariance import free_axes, fused, unobservable_directions
+from calib_ros.registration.covariance import free_axes, fused, open_directions
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.search.constraints import SearchBox
@@ -29,7 +29,7 @@ def diagonal(deg: list[float], m: list[float]) -> np.ndarray:
 
 
 def names(C: np.ndarray) -> list[str]:
-    return list(map(str, unobservable_directions(C, 0.25, 0.05)))
+    return list(map(str, open_directions(C, 0.25, 0.05)))
 
 
 def test_every_axis_has_its_name():

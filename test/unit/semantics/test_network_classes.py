@@ -21,14 +21,7 @@ from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import UNLABELLED, PointCloud
 from calib_ros.frame import SemanticClass as C
 from calib_ros.registration.classes import CLOUD, IMAGE
-from calib_ros_semantics.models.cloud_classes import (
-    BONNETAL,
-    CENET,
-    RANGE_FIRST,
-    XYZ_FIRST,
-    classes_of_points,
-    range_view,
-)
+from calib_ros_semantics.models.cloud_classes import BONNETAL, CENET, RANGE_FIRST, XYZ_FIRST, classes_of_points, range_view
 from calib_ros_semantics.models.labels import (
     CAMVID,
     CITYSCAPES,
