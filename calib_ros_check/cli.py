@@ -90,9 +90,9 @@ def summary(checked: Checked, command: tuple[str, str] = ("", "")) -> str:
     result = checked.result
     lines = first_lines(result.verdict.value, result.reason, command)
     lines += [f"{axis.name}  {axis.verdict.value:<12}  {axis.words}" for axis in result.axes]
-    # What the frames do not tell. A cause that was found is the reason of the verdict.
+    end = "; " if result.verdict is CheckVerdict.PASS else "\n"  # after a pass without what to do
     untold = [own for own in result.causes if own.state is CauseState.NOT_JUDGED and result.T_estimated is not None]
-    lines += [f"{own.cause.value}: {'not judged' if result.verdict is CheckVerdict.PASS else own.message}" for own in untold]
+    lines += [f"{own.cause.value}: {own.message.partition(end)[0]}" for own in untold]
     last = f"{result.frames_used} of {len(result.frame_names)} frames, {result.cpu_s:.1f} s of CPU"
     return "\n  ".join([*lines, *result.notes, last])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -102,8 +103,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     limits = args.search_deg, args.search_m
     result = calibrate(source, args.frames, args.initial, args.yaw_deg, config, *limits, args.overlay)
     told = advice(result, source, config), next_command(result, source, config, args)
-    unsaved = "\nnot saved: --json FILE writes it, and calib-ros check --extrinsic FILE judges it"
-    print_or_save(result, summary(result, *told) + unsaved * (result.converged and not args.json), args.json)
+    unsaved, file = "" if args.json else "not saved: --json FILE writes it; ", shlex.quote(args.json or "FILE")
+    then = f"\n{unsaved}calib-ros check {shlex.quote(args.source)} --extrinsic {file} judges it, best by other scenes (--frames)"
+    print_or_save(result, summary(result, *told) + then * (result.converged and args.json != "-"), args.json)
     if args.camera_info is not None and result.converged and result.refined_camera is not None:
         write_atomically(args.camera_info, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())
     elif args.camera_info is not None:
