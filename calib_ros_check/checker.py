@@ -171,8 +171,7 @@ class Checker:
             off = is_only_off(one, tolerance.deg, tolerance.m)
             told = findings(MIXED_UP, CauseState.EXCLUDED, OFF) if off else explained(one.hypothesis, self.camera)
             known = Result(one.T, CONVERGED, frames_used=len(features), evidence=Evidence(one.z_score, None, np.nan, np.nan))
-            T_corrected = inputs.T if off else one.hypothesis.T
-            return self._judged(inputs, one, covariance_of(one.score, one.T), known, told, T_corrected)
+            return self._judged(inputs, one, covariance_of(one.score, one.T), known, told, inputs.T if off else one.hypothesis.T)
         found = near or look(self._further, features, FAR, inputs, optima)
         if found is None and inputs.classified is not None:
             # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.

@@ -17,12 +17,14 @@ from calib_ros.datasets.source import Source, WithMotion, frame_positions, sprea
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.online.clocks import with_clocks
+from calib_ros.registration.judgement.refusal import joined
 from calib_ros.registration.progress import Callback
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, Tolerance
 
 REFERENCE, TF = "reference", "tf"
 FRAMES = 10  # of a recording, unless said otherwise
+OWN = "by the frames that it was made from, which cannot refute it: name others by --frames"
 
 
 @dataclass(frozen=True)
@@ -81,11 +83,10 @@ def check_source(
     T = extrinsic_of(source, path, options.extrinsic, frames[0])
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
-    made = () if options.extrinsic in (REFERENCE, TF) else result.load(options.extrinsic).frame_names
-    if {frame.name for frame in frames} <= {*made}:
-        notes.append("the extrinsic was made from these frames, which cannot refute it: check it on others, by --frames")
+    made = {*(() if options.extrinsic in (REFERENCE, TF) else result.load(options.extrinsic).frame_names)}
     found = replace(
         found,
+        reason=joined([OWN if {frame.name for frame in frames} <= made else "", found.reason]),
         notes=(*getattr(source, "remarks", ()), *notes, *found.notes),
         camera_frame=source.camera_frame,
         lidar_frame=source.lidar_frame,

@@ -19,7 +19,7 @@ from calib_ros.frame import PointCloud
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.registration.judgement.hypotheses import axis_rotations, distinct_poses, mix_ups
 from calib_ros.registration.judgement.judge import FEW_FRAMES, NEAR, Candidate, Question
-from calib_ros.result import REFUSED, Cause, Evidence, RefusalCode, Result
+from calib_ros.result import CONVERGED, REFUSED, Cause, Evidence, RefusalCode, Result
 from calib_ros_check.checker import Checker, CheckInputs, look
 from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
 
@@ -277,7 +277,11 @@ def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
     files = tmp_path / "check.json", tmp_path / "new" / "check.html"
     assert main.main(["check", SOURCE, "--frames", "0,2", "--json", str(files[0]), "--report", str(files[1])]) == 0
     assert capsys.readouterr().out.startswith("pass: ")
-    assert json.loads(files[0].read_text())["verdict"] == "pass"
+    found = json.loads(files[0].read_text())
+    assert found["verdict"] == "pass"
+    Result(np.array(found["T_estimated"]), CONVERGED, frame_names=tuple(found["frames"]), frame_scores=(1.0, 1.0)).save(files[0])
+    assert main.main(["check", SOURCE, "--frames", "0,2", "--extrinsic", str(files[0])]) == 0
+    assert capsys.readouterr().out.startswith("pass: by the frames that it was made from, which cannot refute it")
     page = files[1].read_text()
     assert "data:image/jpeg;base64," in page
     assert 'src="http' not in page
