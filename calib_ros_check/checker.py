@@ -57,7 +57,7 @@ Classified = Callable[[Sequence[int]], Sequence[FrameFeatures]]  # of the frames
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
-NOT_JUDGED = "one scene does not tell, nor do unrolled pictures of wide lenses"
+NOT_JUDGED = "too few different scenes, or a very wide lens"
 NOT_THE_CLOCKS = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
 NOTHING_MATCHES = "nothing matches beyond chance, near or far"
 

@@ -78,8 +78,8 @@ def next_command(args: argparse.Namespace, checked: Checked) -> tuple[str, str]:
         return again(given, "--no-rectified")
     if cause is Cause.ALREADY_RECTIFIED or (cause is not None and not cause.options):
         return again(given, cause.options, "" if cause.options else "view")
-    start = "reference" if args.extrinsic == TF else shlex.quote(args.extrinsic)
-    start = "nominal" if result.rotation.error > SearchBox.MAX_DEG else start
+    far, named = result.rotation.error > SearchBox.MAX_DEG, shlex.quote(args.extrinsic)
+    start = "nominal" if far else "reference" if args.extrinsic == TF else named
     seconds = next((own.values["seconds"] for own in result.causes if own.cause is cause and "seconds" in own.values), 0.0)
     options = "" if cause is None else cause.options.format(seconds=checked.config.motion.time_offset_s + seconds)
     return again(given, f"--initial {start} {options}".strip(), "calibrate")
@@ -90,11 +90,12 @@ def summary(checked: Checked, command: tuple[str, str] = ("", "")) -> str:
     result = checked.result
     lines = first_lines(result.verdict.value, result.reason, command)
     lines += [f"{axis.name}  {axis.verdict.value:<12}  {axis.words}" for axis in result.axes]
-    end = "; " if result.verdict is CheckVerdict.PASS else "\n"  # after a pass without what to do
     untold = [own for own in result.causes if own.state is CauseState.NOT_JUDGED and result.T_estimated is not None]
-    lines += [f"{own.cause.value}: {own.message.partition(end)[0]}" for own in untold]
-    last = f"{result.frames_used} of {len(result.frame_names)} frames, {result.cpu_s:.1f} s of CPU"
-    return "\n  ".join([*lines, *result.notes, last])
+    for message in dict.fromkeys(own.message for own in untold):
+        names = ", ".join(own.cause.value for own in untold if own.message == message)
+        lines.append(f"{names}: not judged, {message}")
+    lines += [*result.notes, f"{result.frames_used} of {len(result.frame_names)} frames, {result.cpu_s:.1f} s of CPU"]
+    return "\n  ".join(lines)
 
 
 def rig_summary(found: RigCheck) -> str:
@@ -161,6 +162,5 @@ def fleet_summary(fleet: Fleet) -> str:
 
 
 def _first(lines: Sequence[str], what: str) -> list[str]:
-    more = len(lines) - SHOWN
-    rest = [f"and {more} more{what}, see the table{'s' if what else ''}"] if more > 0 else []
+    rest = [f"and {len(lines) - SHOWN} more{what}, see the table{'s' if what else ''}"] if len(lines) > SHOWN else []
     return [f"  {line}" for line in [*lines[:SHOWN], *rest]]

@@ -109,10 +109,10 @@ def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""
     lines += [f"advice: {advice}"] if advice else []
     kept = "" if result.converged else ", the start"
     lines.append(f"T_{result.camera_frame}_{result.lidar_frame}{kept}  {pose(result.T_camera_lidar)}")
-    for inexact, C in (("", result.covariance), (", unless the intrinsics are exact", result.covariance_with_intrinsics)):
+    for lens, C in (("as stated", result.covariance), ("off as usual", result.covariance_with_intrinsics)):
         if C is not None:
             rx, ry, rz, x, y, z = np.sqrt(np.diag(C)) * ([np.rad2deg(1.0)] * 3 + [100.0] * 3)
-            lines.append(f"1 sigma{inexact}: rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg, x {x:.1f} y {y:.1f} z {z:.1f} cm")
+            lines.append(f"1 sigma, intrinsics {lens}: rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg, x {x:.1f} y {y:.1f} z {z:.1f} cm")
     if result.refined_camera is not None:
         lines.append(refined_words(result.refined_camera))
     if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
