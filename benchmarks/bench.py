@@ -34,10 +34,10 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 
-FRAMES, RUNS, BAD_INPUT = 10, 5, 2
+FRAMES, BAD_INPUT = 10, 2
 OFF = ([6.0, -5.0, 4.0], [0.3, -0.25, 0.2])  # deg, m: the start is this far off the reference
 LONGER = 1.03  # the focal length that is wrong
-COMMAND = ["-m", "calib_ros"]
+COMMAND, TRACEBACK = ["-m", "calib_ros"], "Traceback (most recent call last):"
 NODE = ["-m", "benchmarks.node_cost", "--settle", "45", "--seconds", "40", "--bare"]
 # Its last line is the figure of the stage, in s.
 FEATURES = """
@@ -117,7 +117,7 @@ def measured(arguments: Sequence[str], tree: Path) -> dict[str, float]:
         process.returncode = os.waitstatus_to_exitcode(status)
         told.seek(0)
         lines = told.read().decode(errors="replace").strip().splitlines()
-    if process.returncode == BAD_INPUT or (process.returncode and arguments[:2] != COMMAND):
+    if process.returncode == BAD_INPUT or (process.returncode and (arguments[:2] != COMMAND or TRACEBACK in lines)):
         raise CalibrationError(f"{' '.join(arguments)} of {tree}: {lines[-1:]}")
     if arguments == NODE:
         cells = lines[-1].strip("| ").split(" | ")
@@ -141,11 +141,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", nargs="?", default="synthetic:frames=20", help="as for calib-ros (default synthetic)")
     parser.add_argument("--base", metavar="COMMIT", help="the version beside which this one is measured")
-    parser.add_argument("--runs", type=int, default=RUNS, metavar="N", help=f"of every stage (default {RUNS})")
+    parser.add_argument("--runs", type=int, default=5, metavar="N", choices=range(1, 100), help="of every stage (default 5)")
     parser.add_argument("--only", nargs="+", metavar="STAGE", help="stages whose names begin so")
     args = parser.parse_args()
-    if args.runs < 1:
-        parser.error("--runs must be at least 1")
     try:
         source = open_dataset(args.source)
         if source.reference is None:
@@ -153,8 +151,10 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="calib_ros_bench_") as folder:
             asked = stages(source, Path(folder))
             chosen = [name for name in asked if not args.only or name.startswith(tuple(args.only))]
+            if not chosen:
+                parser.error(f"--only {' '.join(args.only)}: no stage begins so; there are {'; '.join(asked)}")
             trees = [side(commit) for commit in ([args.base] if args.base else []) + [WORKING_TREE]]
-            rows: list[list[str]] = []
+            rows = list[list[str]]()
             for name in tqdm(chosen, disable=not sys.stderr.isatty()):
                 runs = [[measured(asked[name], tree) for tree in trees] for _ in range(args.runs)]
                 rows += rows_of(name, list(zip(*runs, strict=True)))

@@ -184,4 +184,4 @@ def test_figures_are_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert bench.main() == 0
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if "CPU s" in line]
     assert [row[0] for row in rows] == ["| imports", "| features of a frame"]
-    assert all(0 < float(row[2].split()[1]) < 60 for row in rows)
+    assert all(float(row[2].split()[1]) > 0 for row in rows)
