@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -53,15 +55,25 @@ def check_one(args: argparse.Namespace) -> int:
     check_json(args.json)
     found: CheckResult | RigCheck
     write: Callable[[str], None]
+    told = [("", 0.0)]  # stages at each of their reports, and the CPU time of the process, s
+
+    def stage(name: str, share: float, step: Callable[[float], None]) -> None:
+        told.append((name, time.process_time()))
+        step(share)
+
     if args.rig is None:
         with progress_bar("reading ") as reading, progress_bar("checking") as step:
-            checked = check_source(args.source[0], options, reading, lambda stage, share: step(share), note)
+            read, doing = partial(stage, "reading", step=reading), partial(stage, step=step)
+            checked = check_source(args.source[0], options, read, doing, note)
         text = summary(checked, next_command(args, checked))
         found, write = checked.result, partial(write_report, checked=checked)
     else:
         with progress_bar("checking") as step:
-            found = check_recording(args.source[0], options, lambda text, share: step(share))
+            found = check_recording(args.source[0], options, partial(stage, step=step))
         text, write = rig_summary(found), partial(write_rig_check, found=found, config=options.config)
+    if args.verbose:
+        runs = [(name, list(own)) for name, own in groupby(pairwise(told), key=lambda own: own[1][0])]
+        text += "\n  CPU: " + ", ".join(f"{name} {(own[-1][1][1] - own[0][0][1]) / told[-1][1]:.0%}" for name, own in runs)
     print_or_save(found, text, args.json)
     if args.report is not None:
         write(args.report)
@@ -112,8 +124,8 @@ def rig_summary(found: RigCheck) -> str:
 
 def check_many(args: argparse.Namespace) -> int:
     """Check a fleet and say what was found; returns the exit code, see `Fleet.exit_code`."""
-    for option in ("json", "report"):
-        if getattr(args, option) is not None:
+    for option in ("json", "report", "verbose"):
+        if getattr(args, option) not in (None, False):
             raise BadInputError(f"--{option} is for one recording; the page and the tables of a fleet are written into --out")
     if args.frames:
         selected(args.frames)

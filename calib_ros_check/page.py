@@ -27,8 +27,7 @@ DARK = (
 STYLE = (
     f":root {{ {LIGHT} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {DARK} }} }}"
     + """
-* { box-sizing: border-box; }
-html { scroll-behavior: smooth; }
+* { box-sizing: border-box; } html { scroll-behavior: smooth; }
 body {
   margin: 0 auto; max-width: 1500px; padding: 1.5rem clamp(.8rem, 3vw, 2.5rem) 4rem; color: var(--ink);
   background: var(--paper); font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
@@ -38,41 +37,29 @@ h2 { font-size: 1.3rem; margin: 3rem 0 .2rem; padding-top: 1rem; border-top: 2px
 h2 span, figcaption span { color: var(--soft); font-weight: 400; margin-right: .35rem; }
 a { color: var(--accent); }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; margin: 0; }
-dt { color: var(--soft); }
-dd { margin: 0; overflow-wrap: anywhere; }
+dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 .intro { color: var(--soft); margin: 0 0 1rem; }
 nav {
   display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); gap: .5rem 1.5rem; margin: 1.5rem 0;
 }
 nav ol { list-style: none; margin: .2rem 0 0; padding: 0; font-size: .88rem; }
-nav > div > a { font-weight: 600; }
-nav a { text-decoration: none; }
-nav a:hover { text-decoration: underline; }
+nav > div > a { font-weight: 600; } nav a { text-decoration: none; } nav a:hover { text-decoration: underline; }
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr)); gap: 1.2rem; align-items: start; }
 figure {
   margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 8px; overflow: hidden;
   scroll-margin-top: 1rem; min-width: 0;
 }
-figure:target { outline: 2px solid var(--accent); }
-figure.wide { grid-column: 1 / -1; }
+figure:target { outline: 2px solid var(--accent); } figure.wide { grid-column: 1 / -1; }
 figure img { display: block; width: 100%; height: auto; background: #181818; }
-figcaption { padding: .6rem .9rem .8rem; font-size: .93rem; }
-figcaption b { display: block; }
+figcaption { padding: .6rem .9rem .8rem; font-size: .93rem; } figcaption b { display: block; }
 .scroll { overflow-x: auto; padding: .8rem .9rem 0; }
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .2rem 1.2rem .2rem 0; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { color: var(--soft); font-weight: 600; }
-details { margin: 1rem 0; }
-summary { cursor: pointer; color: var(--accent); }
-pre {
-  overflow-x: auto; font-size: .82rem; background: var(--card); border: 1px solid var(--line); padding: .8rem;
-  border-radius: 8px;
-}
-@media (max-width: 600px) {
-  dl { grid-template-columns: 1fr; gap: 0; }
-  dt { margin-top: .4rem; }
-  nav ol { column-count: 2; }
-}
+details { margin: 1rem 0; } summary { cursor: pointer; color: var(--accent); }
+pre { overflow-x: auto; font-size: .82rem; background: var(--card); border: 1px solid var(--line); }
+pre { padding: .8rem; border-radius: 8px; }
+@media (max-width: 600px) { dl { grid-template-columns: 1fr; gap: 0; } dt { margin-top: .4rem; } nav ol { column-count: 2; } }
 """
 )
 

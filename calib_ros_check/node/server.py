@@ -122,13 +122,12 @@ def fill_response(response: Check.Response, outcome: CheckOutcome) -> None:
     frames = (result.camera_frame, result.lidar_frame, result.data_stamp)
     response.success, response.message = True, f"{result.verdict.value}: {result.reason}"
     response.verdict = VERDICTS[result.verdict]
-    for finding in result.causes:
-        if finding.cause is result.cause:
-            response.cause, response.cause_message = finding.cause.value, finding.message
     response.p_within = float(result.p_within)
     response.rotation, response.translation = deviation_message(result.rotation), deviation_message(result.translation)
     response.axes = [deviation_message(axis) for axis in result.axes]
     for own in result.causes:
+        if own.cause is result.cause:
+            response.cause, response.cause_message = own.cause.value, own.message
         values = {"value_names": list(own.values), "values": np.array(list(own.values.values()), float)}
         response.causes.append(CauseFindingMsg(cause=own.cause.value, state=STATES[own.state], message=own.message, **values))
     response.checked = transform_message(result.T_checked, *frames)

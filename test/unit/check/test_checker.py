@@ -53,8 +53,7 @@ def checker(made):
 def test_an_extrinsic_within_the_tolerance_passes(drive, checker, deg, tolerance):
     frames, truth = drive
     result = checker.check(frames, se3.perturb(truth, [0, deg, 0], [0, 0, 0]), tolerance)
-    assert result.verdict is CheckVerdict.PASS, result.reason
-    assert result.cause is None
+    assert (result.verdict, result.cause) == (CheckVerdict.PASS, None), result.reason
     assert result.p_within > 0.9
     assert [axis.name for axis in result.axes] == ["rx", "ry", "rz", "tx", "ty", "tz"]
     json.loads(result.dumps())
@@ -79,8 +78,7 @@ def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypa
     missed = Result(truth, REFUSED, "missed", refusal=RefusalCode.NOT_SIGNIFICANT)
     monkeypatch.setattr(checker._calibrator, "estimate", lambda *_: missed)
     result = checker.check(frames, se3.perturb(truth, [2.0, 0, 0], [0, 0, 0]))
-    assert result.verdict is CheckVerdict.FAIL, result.reason
-    assert result.cause is None
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, None), result.reason
     assert {own.name for own in result.axes if own.verdict is CheckVerdict.FAIL} == {"rx"}
 
 
@@ -89,9 +87,8 @@ def test_further_looks_are_at_half_the_p_value_whatever_the_clocks(drive, monkey
     """The limit is 0.01, which holds for an optimum that is refused for its time stamps as well."""
     frames, truth = drive
     checker = Checker(frames[0].camera, QUICK)
-    late = Result(
-        truth, REFUSED, "late", refusal=RefusalCode.WRONG_TIMES, evidence=Evidence(5.0, None, p_value, 1.0), optimum=truth
-    )
+    doubt = Evidence(5.0, None, p_value, 1.0)
+    late = Result(truth, REFUSED, "late", refusal=RefusalCode.WRONG_TIMES, evidence=doubt, optimum=truth)
     for calibrator in (checker._calibrator, checker._further):
         monkeypatch.setattr(calibrator, "estimate", lambda *_: late)
     inputs, optima = CheckInputs(truth, Tolerance()), []
@@ -280,8 +277,10 @@ def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
     found = json.loads(files[0].read_text())
     assert found["verdict"] == "pass"
     Result(np.array(found["T_estimated"]), CONVERGED, frame_names=tuple(found["frames"]), frame_scores=(1.0, 1.0)).save(files[0])
-    assert main.main(["check", SOURCE, "--frames", "0,2", "--extrinsic", str(files[0])]) == 0
-    assert capsys.readouterr().out.startswith("pass: by the frames that it was made from, which cannot refute it")
+    assert main.main(["check", SOURCE, "--frames", "0,2", "--extrinsic", str(files[0]), "--verbose"]) == 0
+    reason, *_, stages = capsys.readouterr().out.splitlines()
+    assert reason.startswith("pass: by the frames that it was made from, which cannot refute it")
+    assert [own.split()[0] for own in stages.split(": ")[1].split(", ")] == ["reading", "features", "search", "causes"]
     page = files[1].read_text()
     assert "data:image/jpeg;base64," in page
     assert 'src="http' not in page

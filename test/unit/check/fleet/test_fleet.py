@@ -143,6 +143,7 @@ def test_a_folder_of_recordings_from_the_command_line(drive, street_bag: Path, b
     ("given", "message"),
     [
         (["--report", "x.html"], "--report is for one recording"),
+        (["--verbose"], "--verbose is for one recording"),
         (["--workers", "0"], "--workers 0: give at least 1"),
         (["--out", ""], "--out is given without a name"),
         (["--scheduler", "tcp://host"], "no Dask scheduler answers at 'tcp://host'"),
