@@ -57,7 +57,7 @@ Classified = Callable[[Sequence[int]], Sequence[FrameFeatures]]  # of the frames
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
-NOT_JUDGED = "too few different scenes, or a very wide lens"
+WIDER = (1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0)  # times the tolerance, for what does not pass
 NOT_THE_CLOCKS = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
 NOTHING_MATCHES = "nothing matches beyond chance, near or far"
 
@@ -192,7 +192,7 @@ class Checker:
         turned = None if se3.rotation_error_deg(inputs.T, found) <= inputs.tolerance.deg else inputs.T
         lens, fault = self._lens(score, found, result, inputs, turned)
         shared, whole = result.shared_covariance, result.covariance_with_intrinsics
-        causes = lens_findings(lens, fault, NOT_JUDGED, self.camera)
+        causes = lens_findings(lens, fault, "too few different scenes, or a very wide lens", self.camera)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
         other = None if fault is not None else self._another_fisheye(score, found, inputs, offset)
@@ -292,10 +292,13 @@ class Checker:
         judgement = judge(T, found.T, C, tolerance, freedom(found.score), shared)
         if judgement.verdict is CheckVerdict.FAIL:  # what another lens may be to blame for is not the mount's
             judgement = judge(T, found.T, whole, tolerance, freedom(found.score), shared)
-        told = C if shared is None else C - shared  # by the scenes themselves
-        if judgement.verdict is CheckVerdict.FAIL and not is_off(found, told, T, tolerance):
+        if judgement.verdict is CheckVerdict.FAIL and not is_off(found, C if shared is None else C - shared, T, tolerance):
             judgement = undecided(judgement)
         cause, evidence = next((own for own in causes if own.state is CauseState.FOUND), None), result.evidence
+        opened = judgement.verdict is CheckVerdict.INCONCLUSIVE and cause is None
+        wider = [Tolerance(min(k * tolerance.deg, 90.0), min(k * tolerance.m, 10.0)) for k in WIDER if opened]
+        verdicts = (judge(T, found.T, C, own, freedom(found.score), shared).verdict for own in wider)
+        at = next((own for own, by in zip(wider, verdicts, strict=True) if by is CheckVerdict.PASS), None)
         return CheckResult(
             **vars(judgement) | {"verdict": judgement.verdict if cause is None else CheckVerdict.FAIL},
             reason=reason_of(judgement, tolerance, cause, [own for own in causes if own.state is CauseState.POSSIBLE]),
@@ -311,6 +314,7 @@ class Checker:
             z_score=evidence.z_score if evidence else np.nan,
             p_value=evidence.p_value if evidence else np.nan,
             frames_used=result.frames_used,
+            notes=() if at is None else (f"passes from {at} on",),
         )
 
 

@@ -35,10 +35,9 @@ body {
 h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 1rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.3rem; margin: 3rem 0 .2rem; padding-top: 1rem; border-top: 2px solid var(--line); }
 h2 span, figcaption span { color: var(--soft); font-weight: 400; margin-right: .35rem; }
-a { color: var(--accent); }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; margin: 0; }
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
-.intro { color: var(--soft); margin: 0 0 1rem; }
+.intro { color: var(--soft); margin: 0 0 1rem; } a { color: var(--accent); }
 nav {
   display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); gap: .5rem 1.5rem; margin: 1.5rem 0;
 }

@@ -91,8 +91,7 @@ def check_keyframes(
 ) -> CheckOutcome:
     """Check an extrinsic by the keyframes; of the recalibrator nothing changes.
 
-    progress, vehicle_frames: as of `Checker.check`; without frames of the vehicle none are tried. CalibrationError if there is
-    no keyframe.
+    progress, vehicle_frames: as of `Checker.check`; None = no frames are tried. CalibrationError without keyframes.
     """
     started, cpu = time.perf_counter(), cpu_time()
     kept, config, current = recalibrator.snapshot()
@@ -110,8 +109,7 @@ def check_keyframes(
     untried += [NO_CAMERA] if distorts(recalibrator.camera) else []
     untried += [NO_FISHEYE] if recalibrator.camera.is_pinhole and result.cause is None else []
     notes = [] if result.verdict is CheckVerdict.PASS else untried
-    in_doubt = result.T_estimated is None
-    notes += [NO_CLASSES] if in_doubt and recalibrator.segmentation.active and not has_classes else []
+    notes += [NO_CLASSES] if result.T_estimated is None and recalibrator.segmentation.active and not has_classes else []
     result = replace(
         result,
         notes=(*result.notes, *notes),

@@ -209,10 +209,7 @@ def test_algorithm_6_compares_with_the_last_keyframe() -> None:
 def test_cost_of_features_and_of_a_whole_estimate() -> None:
     costs = [("nid", 1, 5.0, 2.0, 9.0), ("ours", 3, 20.0, 0.5, 10.0)]
     found = tables.cost(Results({"ours": "Ours"}, table(*(trial(cpu_s=c) for c in (1.0, 2.0, 9.0))), costs=costs))
-    assert found.rows == [
-        ["nid", "1", "5.00", "2.00", "9.00", "–", "–"],
-        ["ours", "3", "20.0", "0.500", "10.0", "2.50", "100"],
-    ]
+    assert found.rows == [["nid", "1", "5.00", "2.00", "9.00", "–", "–"], ["ours", "3", "20.0", "0.500", "10.0", "2.50", "100"]]
 
 
 @pytest.mark.parametrize(("value", "text"), [(1234.5, "1234"), (12.34, "12.3"), (0.1, "0.100"), (0.00234, "0.00234"), (0, "0")])

@@ -173,8 +173,5 @@ def test_configurations_of_former_versions_still_load():
     for name in ("tracker.drift_deg", "semantics.witness", "search.distinct", "search.climbed", "search.refined"):
         assert sum(name in text and "no effect any more" in text for text in told) == 1
     assert config == Config.from_dict(
-        {
-            "online": {"pair_tolerance_s": 0.05, "max_load": 1.0},
-            "search": {"seed": 7, "rounds": 8, "starts": 2048},
-        }
+        {"online": {"pair_tolerance_s": 0.05, "max_load": 1.0}, "search": {"seed": 7, "rounds": 8, "starts": 2048}}
     )

@@ -94,10 +94,7 @@ def test_a_middleware_that_reports_no_losses_is_named_once(monkeypatch, capfd, s
 def test_a_driver_on_cyclone_dds_is_received(street_bag, drive, street):
     driver = [sys.executable, Path(__file__).parents[2] / "support/cyclone_driver.py", street_bag]
     start = start_parameters(drive.reference)
-    with (
-        Peer(**start, reliability="reliable", online__mode="manual") as peer,
-        subprocess.Popen(driver) as process,
-    ):
+    with Peer(**start, reliability="reliable", online__mode="manual") as peer, subprocess.Popen(driver) as process:
         counts = peer.pipeline.pairing.synchronizer.counts
         assert process.wait(120) == 0
         peer.until(lambda: counts.pairs == len(street), "all pairs")

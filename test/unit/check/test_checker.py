@@ -20,7 +20,7 @@ from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.registration.judgement.hypotheses import axis_rotations, distinct_poses, mix_ups
 from calib_ros.registration.judgement.judge import FEW_FRAMES, NEAR, Candidate, Question
 from calib_ros.result import CONVERGED, REFUSED, Cause, Evidence, RefusalCode, Result
-from calib_ros_check.checker import Checker, CheckInputs, look
+from calib_ros_check.checker import WIDER, Checker, CheckInputs, look
 from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
 
 pytestmark = pytest.mark.usefixtures("rendered_once")
@@ -169,6 +169,15 @@ def test_a_mount_that_is_far_off_is_no_cloud_in_the_body_frame(drive, checker):
     link = se3.inverse(BODY) @ truth
     moved = [replace(f, cloud=replace(f.cloud, xyz=se3.transform(link, f.cloud.xyz).astype(np.float32))) for f in frames]
     assert checker.check(moved, checked).cause is Cause.CLOUD_FRAME
+
+
+@pytest.mark.parametrize(("deg", "m"), [(0.02, 0.005), (0.03, 0.02)])
+def test_what_does_not_pass_tells_by_which_tolerance_it_does(drive, checker, deg, m):
+    (frames, truth), wider = drive, [Tolerance(k * deg, k * m) for k in WIDER]
+    result = checker.check(frames, truth, Tolerance(deg, m))
+    assert result.verdict is CheckVerdict.INCONCLUSIVE, result.reason
+    at = next(own for own in wider if f"passes from {own} on" in result.notes)
+    assert checker.check(frames, truth, at).verdict is CheckVerdict.PASS
 
 
 def test_pictures_of_elsewhere_are_inconclusive_and_none_are_bad_input(drive, checker):

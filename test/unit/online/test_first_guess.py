@@ -18,11 +18,7 @@ from calib_ros.result import INSUFFICIENT, InitialSource
 
 CONFIG = update(
     QUICK,
-    {
-        "initial": {"method": "motion"},
-        "online": {"min_keyframes": 4, "similarity_threshold": 1.0},
-        "monitor": {"enabled": False},
-    },
+    {"initial": {"method": "motion"}, "online": {"min_keyframes": 4, "similarity_threshold": 1.0}, "monitor": {"enabled": False}},
 )
 
 

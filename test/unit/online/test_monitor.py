@@ -87,11 +87,7 @@ def test_right_extrinsic_is_confirmed(scene, n):
 
 @pytest.mark.parametrize(
     ("by", "deg", "m"),
-    [
-        (HALF_DEG, 0.52, 0.0),
-        (([0, 0, 0], [0.06, -0.05, 0.06]), 0.0, 0.1),
-        (([1.2, 1.2, 1.0], [0, 0, 0]), 1.97, 0.0),
-    ],
+    [(HALF_DEG, 0.52, 0.0), (([0, 0, 0], [0.06, -0.05, 0.06]), 0.0, 0.1), (([1.2, 1.2, 1.0], [0, 0, 0]), 1.97, 0.0)],
     ids=["0.5 deg", "10 cm", "2 deg"],
 )
 def test_wrong_extrinsic_is_detected(scene, by, deg, m):

@@ -193,9 +193,7 @@ def test_blind_sensors_are_reported_and_make_no_keyframes(drive, start, truth):
 
 BEFORE, AFTER = 7, 6
 GUARDED = replace(
-    CONFIG,
-    search=replace(CONFIG.search, rotation_deg=3.0),
-    online=replace(CONFIG.online, min_keyframes=3, buffer_size=8),
+    CONFIG, search=replace(CONFIG.search, rotation_deg=3.0), online=replace(CONFIG.online, min_keyframes=3, buffer_size=8)
 )
 
 

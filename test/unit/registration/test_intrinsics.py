@@ -50,8 +50,7 @@ def calibrated(scene: Scene, seen_by: Camera, box: SearchBox | None = BOX, confi
 
 
 @pytest.mark.parametrize(
-    ("focal", "u", "v", "says"),
-    [(0.03, 0, 0, "shorter"), (-0.04, 0, 0, "longer"), (0, 16, 0, "further to the left")],
+    ("focal", "u", "v", "says"), [(0.03, 0, 0, "shorter"), (-0.04, 0, 0, "longer"), (0, 16, 0, "further to the left")]
 )
 def test_wrong_intrinsics_are_refused_and_named(scene, focal, u, v, says):
     result = calibrated(scene, wrong(scene.camera, focal, u, v))
