@@ -20,7 +20,7 @@ from calib_ros_check.outcome import CauseFinding, CauseState, Tolerance
 OF_CAMERAS = (Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.OTHER_CAMERA, Cause.NOT_RECTIFIED, Cause.ALREADY_RECTIFIED)
 OTHER_FITS = "another cause fits better"
 AS_GIVEN = "the extrinsic matches as it is given"
-OFF = "the extrinsic is off"
+OFF = "turned or shifted, the extrinsic matches"
 SIGNIFICANT_SIGMAS = 3.0  # of an offset of the clocks: a right extrinsic must hardly ever fail by one
 REPORTED_SIGMAS = 2.0  # of the interval in a message
 PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart

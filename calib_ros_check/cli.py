@@ -35,6 +35,8 @@ SHOWN = 20  # changes, and errors, that are printed; all are in the tables
 
 def options_of(args: argparse.Namespace) -> CheckOptions:
     """How to check, as given on the command line. BadInputError for a tolerance out of range."""
+    if args.overlay is not None:
+        raise BadInputError(f"--overlay {args.overlay} is of calibrate: check has its pictures on a page, by --report HTML")
     as_given = ("extrinsic", "camera", "image_topic", "points_topic", "camera_info_topic", "clock", "incomplete", "rectified")
     given = {name: getattr(args, name) for name in as_given} | {"frames": args.frames or "", "rig": args.rig or ""}
     return CheckOptions(**given, config=configuration(args.config), tolerance=Tolerance(args.tolerance_deg, args.tolerance_m))

@@ -47,6 +47,7 @@ class Check:
         command.add_argument("--json", metavar="FILE", help="write the result as JSON; - = to standard output")
         command.add_argument("--report", metavar="HTML", help="write a page: size of the error, other causes, pictures")
         command.add_argument("--verbose", action="store_true", help="say what the stages took of the CPU time")
+        command.add_argument("--overlay", help=argparse.SUPPRESS)
         group = command.add_argument_group(
             "fleets", "Several recordings, or a folder of them: a table, a page, and which vehicles changed."
         )

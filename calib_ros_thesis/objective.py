@@ -86,9 +86,8 @@ class ThesisObjective:
     def remark(self) -> str:
         """What the semantic edges of 3.4.2 are, where they are not of Segment Anything in all frames."""
         blended = {f.own.blended for f in self.edges.features}
-        if OF_CLASSES in blended:
-            return f"semantic edges are borders of classes, since there are no masks of Segment Anything: {SET_MASKS}"
-        return "" if blended == {OF_MASKS} else f"no semantic edges, neither of Segment Anything nor of classes: {SET_MASKS}"
+        ran = "gradients and borders of classes, without" if OF_CLASSES in blended else "gradients alone, without classes or"
+        return "" if blended == {OF_MASKS} else f"eq. 3.12 ran on {ran} masks of Segment Anything: {SET_MASKS}"
 
     def value(self, T: Matrix) -> float:
         """J at the last smoothing; with edges attached once per level, the smooth score of those attached at T."""

@@ -71,7 +71,7 @@ def calibrate(
         camera_frame=source.camera_frame,
         lidar_frame=source.lidar_frame,
         reference_error=None if reference is None else se3.error(reference, result.T_camera_lidar),
-        motion=motion(chosen, config.motion),
+        motion=motion(chosen, config.motion, moving_source.unknown),
     )
     if overlay is not None:
         shown = chosen[len(chosen) // 2]

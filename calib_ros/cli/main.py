@@ -105,7 +105,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     told = advice(result, source, config), next_command(result, source, config, args)
     unsaved, file = "" if args.json else "not saved: --json FILE writes it; ", shlex.quote(args.json or "FILE")
     then = f"\n{unsaved}{again(args.given, f'--extrinsic {file} --frames OTHERS', 'check')[1]} judges it, by other scenes"
-    print_or_save(result, summary(result, *told) + then * (result.converged and args.json != "-"), args.json)
+    print_or_save(result, summary(result, *told, args.initial) + then * (result.converged and args.json != "-"), args.json)
     if args.camera_info is not None and result.converged and result.refined_camera is not None:
         write_atomically(args.camera_info, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())
     elif args.camera_info is not None:

@@ -49,19 +49,20 @@ def pose(T: NDArray[np.float64]) -> str:
     return f"x {x:.3f} y {y:.3f} z {z:.3f} m, looking along the LiDAR's +x but for rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg"
 
 
-def motion(frames: Sequence[Frame], config: MotionConfig) -> str:
-    """How the motion of the vehicle was compensated, in one line."""
+def motion(frames: Sequence[Frame], config: MotionConfig, unknown: str = "") -> str:
+    """How the motion of the vehicle was compensated, in one line. unknown: why it is, where it is not known."""
     if config.deskew == "off":
         return "points stay where they were measured (motion.deskew: off)"
     speeds = [float(np.linalg.norm(twist[3:])) for f in frames if (twist := used_twist(f, config)) is not None]
     if speeds:
         offset = f", time offset {1000 * config.time_offset_s:g} ms" if config.time_offset_s else ""
         where = "all" if len(speeds) == len(frames) else f"{len(speeds)} of {len(frames)}"
+        offset += f"; not in others: {unknown}" if where != "all" and unknown else ""
         return f"points moved to the moment of the image in {where} frames, {min(speeds):.1f} to {max(speeds):.1f} m/s{offset}"
     unused = "; the time offset has no effect" if config.time_offset_s else ""
     if all(f.compensated for f in frames):
         return f"the source's clouds are compensated already{unused}"
-    return f"points stay where they were measured, the vehicle's velocity is not known (1 cm per ms at 10 m/s){unused}"
+    return f"points stay where they were measured (1 cm per ms at 10 m/s): {unknown or 'no velocity is known'}{unused}"
 
 
 def again(given: Sequence[str], options: str, command: str = "") -> tuple[str, str]:
@@ -96,8 +97,8 @@ def first_lines(status: str, reason: str, command: tuple[str, str] = ("", "")) -
     return [line, *([f"next: {whole}"] if whole not in ("", told) else []), *rest]
 
 
-def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", "")) -> str:
-    """What `calib-ros calibrate` prints. advice: what to add. command: of `again`."""
+def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""), initial: str = "nominal") -> str:
+    """What `calib-ros calibrate` prints. advice: what to add. command: of `again`. initial: as of --initial."""
     score = f"score {result.score:.3f}, " if np.isfinite(result.score) else ""
     scenes = result.evidence.scenes if result.evidence else 0.0
     alike = f" of about {scenes:.1f} different scenes" if 0 < scenes < ALIKE * result.frames_used else ""
@@ -109,7 +110,7 @@ def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""
     lines += [f"advice: {advice}"] if advice else []
     kept = "" if result.converged else ", the start"
     lines.append(f"T_{result.camera_frame}_{result.lidar_frame}{kept}  {pose(result.T_camera_lidar)}")
-    for lens, C in (("as stated", result.covariance), ("off as usual", result.covariance_with_intrinsics)):
+    for lens, C in (("as stated", result.covariance), ("off as usual (camera.focal_sigma)", result.covariance_with_intrinsics)):
         if C is not None:
             rx, ry, rz, x, y, z = np.sqrt(np.diag(C)) * ([np.rad2deg(1.0)] * 3 + [100.0] * 3)
             lines.append(f"1 sigma, intrinsics {lens}: rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg, x {x:.1f} y {y:.1f} z {z:.1f} cm")
@@ -119,7 +120,7 @@ def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""
         lines.append(_clocks(result))
     if result.initial is not None and result.converged:
         deg, m = se3.error(result.initial, result.T_camera_lidar)
-        lines.append(f"moved {deg:.2f} deg, {100 * m:.1f} cm from the initial extrinsic")
+        lines.append(f"moved {deg:.2f} deg, {100 * m:.1f} cm from the start, --initial {initial}")
     if result.reference_error is not None:
         deg, m = result.reference_error
         lines.append(f"against the source's reference: {deg:.3f} deg, {100 * m:.1f} cm")

@@ -35,6 +35,11 @@ from calib_ros.errors import BadInputError, ConfigError
 AnyStage = TypeVar("AnyStage", bound=Stage)
 
 
+@cache
+def _other_stages() -> dict[str, type[Stage]]:
+    return {name: extensions.load(extensions.STAGES, name) for name in extensions.names(extensions.STAGES)}
+
+
 @dataclass(frozen=True)
 class Config:
     """All parameters, one immutable stage each. Change them with `from_dict`, `from_yaml` or `dataclasses.replace`. Listed with
@@ -59,7 +64,7 @@ class Config:
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     monitor: MonitorConfig = field(default_factory=MonitorConfig)
     # Stages of packages beside the core that are installed: read them by `stage`, change them by `update`.
-    others: tuple[Stage, ...] = field(default_factory=lambda: _defaults())
+    others: tuple[Stage, ...] = field(default_factory=lambda: tuple(kind() for kind in _other_stages().values()))
 
     def __post_init__(self) -> None:
         """ConfigError for values that are in range, but contradict each other."""
@@ -100,15 +105,6 @@ class Config:
 
 NODE_GROUPS = ("capture", "export")  # settings of the node alone begin like a stage with these
 OWN_STAGES: dict[str, type[Stage]] = {name: kind for name, kind in get_type_hints(Config).items() if name != "others"}
-
-
-@cache
-def _other_stages() -> dict[str, type[Stage]]:
-    return {name: extensions.load(extensions.STAGES, name) for name in extensions.names(extensions.STAGES)}
-
-
-def _defaults() -> tuple[Stage, ...]:
-    return tuple(kind() for kind in _other_stages().values())
 
 
 def stages() -> dict[str, type[Any]]:

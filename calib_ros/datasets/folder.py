@@ -82,15 +82,8 @@ class FolderSource:
     def __getitem__(self, index: int) -> Frame:
         name = self.names[index]
         image_ns, cloud_ns = self._stamps[name]
-        return Frame(
-            image=self._read_image(name),
-            cloud=self.scan(index)[1],
-            camera=self.camera,
-            stamp=image_ns,
-            cloud_stamp=cloud_ns,
-            reference=self.reference,
-            name=name,
-        )
+        image, cloud = self._read_image(name), self.scan(index)[1]
+        return Frame(image, cloud, self.camera, image_ns, cloud_ns, reference=self.reference, name=name)
 
     def scan(self, index: int) -> tuple[int, PointCloud]:
         """The scan of a frame with its stamp, ns, which is the image's where the scan has none."""
@@ -112,7 +105,7 @@ class FolderSource:
             "kind": "folder",
             "path": str(self.path),
             "frames": f"{len(self)}, names {self.names[0]} to {self.names[-1]}; left out: {left_out}",
-            "stamps": TIMES if self._has_times else f"none: 10 Hz assumed ({TIMES} gives them)",
+            "stamps": TIMES if self._has_times else f"10 Hz assumed, no {TIMES}",
             "points": f"{len(first)} in the first cloud, with {', '.join(['x, y, z', *fields])}",
             "camera": describe_camera(self.camera) + "".join(f"; not {name}" for name in self._other_cameras),
             "camera_frame": self.camera_frame,

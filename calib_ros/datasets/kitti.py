@@ -243,7 +243,7 @@ def _timed(
             return number * PERIOD_NS, None
         return (of_images.ns(number), None) if of_scans is None else moments(of_images.ns(number), of_scans.ns(number))
 
-    stamps_from = "10 Hz assumed" if of_images is None else "timestamps.txt"
+    stamps_from = "10 Hz assumed, no timestamps.txt of the images" if of_images is None else "timestamps.txt"
     # Point times relative to the image need the stamps of both sensors.
     known = None if of_images is None or of_scans is None else motion
     return replace(layout, stamps=stamps, stamps_from=stamps_from, motion=known)
@@ -259,7 +259,7 @@ def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> 
     def stamps(number: int) -> tuple[int, int | None]:
         return (number * PERIOD_NS if times is None else times.ns(number)), None
 
-    stamps_from = "10 Hz assumed" if times is None else "times.txt"
+    stamps_from = "10 Hz assumed, no times.txt" if times is None else "times.txt"
     return DriveLayout("odometry", images, scans, lambda _: (P, T), stamps, stamps_from, compensated=True)
 
 

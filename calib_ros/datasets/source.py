@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -15,10 +15,11 @@ from calib_ros.datasets.recent import Recent
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.accumulation import Accumulator, Stamped
-from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
+from calib_ros.lidar.ego_motion import MAX_GAP_S, ROAD_SPEED, Motion, estimate_motion, without_motion
 
 FRAMES_ADVICE = "give all, a list like 0,4,8 or a range like 0:100:5, by position from 0, not by name"
 CACHED_CLOUDS, SCANS_PER_S = 4, 20
+TOO_FAST = "{:.0f} m/s from frame {} to {} cannot be: give stamps as recorded (a folder's times.csv), or leave them out"
 RUN_S, ENOUGH = 5.0, 0.8  # s of frames from which motion is estimated, and the share of it that is enough
 CENTRES = (0.5, 0.2, 0.8, 0.0, 1.0)  # around which of the chosen frames, as shares of their number
 
@@ -64,7 +65,8 @@ def describe_camera(camera: Camera) -> str:
 
 class WithMotion:
     """A source whose frames without a twist get it from the scans before and after them, if these are near enough in time. warn:
-    called once with a message if small_gicp is missing; frames then stay as they are. accumulate_s: time over which scans are put
+    called with a message if small_gicp is missing, where frames stay as they are, and at the first speed that no vehicle has.
+    unknown: why the motion of a frame is not known, the last that was read. accumulate_s: time over which scans are put
     together, as ``lidar.accumulate_s``."""
 
     def __init__(
@@ -75,7 +77,7 @@ class WithMotion:
         self.name, self.camera, self.reference = source.name, source.camera, source.reference
         self.camera_frame, self.lidar_frame = source.camera_frame, source.lidar_frame
         self._clouds = Recent(CACHED_CLOUDS + round(accumulate_s * SCANS_PER_S))
-        self._library_missing = False
+        self._library_missing, self._fastest, self.unknown = False, ROAD_SPEED, ""
 
     def __len__(self) -> int:
         return len(self._source)
@@ -88,10 +90,15 @@ class WithMotion:
         if self._library_missing:
             return frame
         try:
-            if needs_ego_motion(frame, self._config):
-                found = [motion.twist for motion in self._motions(index) if motion.twist is not None]
-                frame = replace(frame, twist=np.mean(found, axis=0)) if found else frame
-            return self._accumulated(frame, self._earlier(index), self._accumulate_s, self._config)
+            unknown = without_motion(frame, self._config)
+            motions = [] if unknown else self._motions(index)
+            if found := [motion.twist for motion in motions if motion.twist is not None]:
+                frame = replace(frame, twist=np.mean(found, axis=0))
+            elif frame.twist is None:
+                self.unknown = next((motion.reason for motion in motions), unknown or "there is no scan before or after")
+            # The scans before it, newest first, as far as they are usable.
+            earlier = iter(map(self._cloud, range(index - 1, -1, -1)).__next__, None)
+            return self._accumulated(frame, earlier, self._accumulate_s, self._config)
         except MissingDependencyError as error:
             self._library_missing = True
             if self._warn:
@@ -111,14 +118,10 @@ class WithMotion:
                 gap = (after[0] - before[0]) / NANOSECONDS
                 start = motions[0].twist if motions else None
                 motions.append(estimate_motion(before[1], after[1], gap, self._config, start))
+                if motions[-1].speed > self._fastest and self._warn:
+                    self._fastest = np.inf  # said once
+                    self._warn(TOO_FAST.format(motions[-1].speed, first, second))
         return motions
-
-    def _earlier(self, index: int) -> Iterator[Stamped]:
-        """The scans before that of a frame, newest first, as far as they are usable."""
-        for k in range(index - 1, -1, -1):
-            if (cloud := self._cloud(k)) is None:
-                return
-            yield cloud
 
     def _cloud(self, index: int) -> Stamped | None:
         """The cloud of a frame with its stamp; None if unusable: a damaged neighbour does not make a frame unusable."""

@@ -26,6 +26,7 @@ MIN_GAP_S, MAX_GAP_S = 0.01, 0.35
 VOXEL_M = 0.8  # m; size of the voxels that scans are thinned to before they are aligned
 MIN_MATCHED = 0.65  # share of the points: the same street has 0.73 to 0.98, another place up to 0.59
 MAX_SPEED, MAX_TURN_RATE = 60.0, 2.0  # m/s, rad/s; beyond what vehicles do, an alignment is wrong
+ROAD_SPEED = 40.0  # m/s: no keyframes above, where a millisecond between the clocks is as much as an estimate scatters by
 MATCH_DISTANCES = (4.0, 1.0)  # m; maximum distance of matches in the first and the second alignment
 NEIGHBOURS = 10  # from which the surface around a point is estimated
 MIN_STEP = 1e-3  # rad and m; smaller steps end the alignment
@@ -35,26 +36,30 @@ MIN_CURVATURE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason."""
+    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason. speed: m/s."""
 
     twist: Floats | None
     reason: str = ""
+    speed: float = 0.0
 
 
-def needs_ego_motion(frame: Frame, config: MotionConfig) -> bool:
-    """Whether the velocity of a frame's LiDAR is unknown, and should be estimated from scans."""
-    if config.deskew == "off" or config.from_scans == "never":
-        return False
-    if frame.twist is not None or frame.compensated or frame.cloud_stamp is None:
-        return False
+def without_motion(frame: Frame, config: MotionConfig) -> str:
+    """Why the velocity of a frame's LiDAR is not to be estimated from scans, for people; "" if it is."""
+    if frame.twist is not None or frame.compensated or config.deskew == "off":
+        return "compensated by the source, or left as they are"
+    if config.from_scans == "never":
+        return "motion.from_scans is never"
+    if frame.cloud_stamp is None:
+        return "the clouds have no stamps (a folder's times.csv gives them)"
     # By azimuth only if configured: drivers differ, and a wrong guess moves points farther than the vehicle did.
-    return config.from_scans == "always" or has_times(frame.cloud)
+    timed = config.from_scans == "always" or has_times(frame.cloud)
+    return "" if timed else frame.cloud.time_problem or "points have no times (motion.from_scans: always goes by azimuth)"
 
 
 def unknown_motion_s(frame: Frame, T_camera_lidar: NDArray[np.floating], config: MotionConfig) -> float:
     """For how long, s, an unknown velocity displaces the points in a camera's view: the root mean square of their times after the
     image's stamp. 0 where no velocity is to be estimated, or it is known. T_camera_lidar: (4, 4), to some degrees."""
-    if not needs_ego_motion(frame, config):
+    if without_motion(frame, config):
         return 0.0
     between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s
     times = view_times(frame.cloud, frame.camera, T_camera_lidar, config)
@@ -126,8 +131,8 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats) -> Motion:
     elif curvature < MIN_CURVATURE:
         problem = "nothing in sight stands upright: the scans slide along each other"
     elif speed > MAX_SPEED or rate > MAX_TURN_RATE:
-        problem = f"{speed:.1f} m/s and {rate:.2f} rad/s are beyond {MAX_SPEED:g} and {MAX_TURN_RATE:g}"
-    return Motion(None if problem else twist, problem)
+        return Motion(None, f"{speed:.1f} m/s and {rate:.2f} rad/s are beyond {MAX_SPEED:g} and {MAX_TURN_RATE:g}", speed)
+    return Motion(None, problem) if problem else Motion(twist, "", speed)
 
 
 def prepared(points: Floats) -> tuple[Any, Any]:

@@ -20,11 +20,10 @@ from calib_ros.config import Config, MotionConfig, OnlineConfig, TrackerConfig
 from calib_ros.errors import BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.accumulation import Accumulator, Stamped
-from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion, unknown_motion_s
+from calib_ros.lidar.ego_motion import MAX_GAP_S, ROAD_SPEED, Motion, estimate_motion, unknown_motion_s, without_motion
 from calib_ros.online.pacing import is_due
 from calib_ros.registration.features import FrameFeatures
 
-MAX_SPEED = 40.0  # m/s: no keyframes above, where a millisecond between the clocks is as much as an estimate scatters by
 INTERVAL_S = 1.0  # without a keyframe, after which any image that has changed becomes one
 STATIC_SIMILARITY = 0.995  # images more similar show the same scene and never become a keyframe
 REMEMBERED_S = 3.0  # a vehicle that moved so long ago may still move
@@ -210,8 +209,8 @@ class SpeedGate:
         """True if the frame is slow enough for a keyframe, or its speed is unknown."""
         speed, turn_rate = self.motion_at(frame)
         problem = ""
-        if speed is not None and speed > MAX_SPEED:
-            problem = f"{speed:.1f} m/s are too fast for a keyframe, at most {MAX_SPEED:g} are allowed"
+        if speed is not None and speed > ROAD_SPEED:
+            problem = f"{speed:.1f} m/s are too fast for a keyframe, at most {ROAD_SPEED:g} are allowed"
         elif turn_rate is not None and turn_rate > self.config.max_turn_deg_s:
             problem = f"{turn_rate:.1f} deg/s are above online.max_turn_deg_s = {self.config.max_turn_deg_s:g}"
         if problem:
@@ -277,7 +276,7 @@ class EgoMotion:
         scan_before: gives the scan before the frame's if it is newer than a stamp, where frames between have been dropped.
         """
         stamp = frame.cloud_stamp
-        if self.missing or stamp is None or not needs_ego_motion(frame, self.config):
+        if self.missing or stamp is None or without_motion(frame, self.config):
             return frame
         since = round(stamp - MAX_GAP_S * NANOSECONDS)
         if self._before is not None and self._before[0] < stamp:

@@ -18,7 +18,7 @@ from calib_ros.datasets.rig import RigSource
 from calib_ros.datasets.source import Source, frame_positions, neighbours, spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.lidar.ego_motion import needs_ego_motion
+from calib_ros.lidar.ego_motion import without_motion
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor, ScanEdges
 from calib_ros.registration.motion_guess.guess import motion_guess
@@ -203,7 +203,7 @@ class RigMeasurer:
         return update(self.config, {"image": {"mask": mask}}) if mask else self.config
 
     def _with_motion(self, frame: Frame, camera: str, lidar: str, source: Source) -> Frame:
-        if not needs_ego_motion(frame, self.config_of(camera).motion):
+        if without_motion(frame, self.config_of(camera).motion):
             return frame
         own = np.flatnonzero(self.scans[lidar].stamps == frame.moment_of_cloud + _ahead(source))
         return replace(frame, twist=self.scans[lidar].twist(int(own[0])) if len(own) else None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -201,7 +200,10 @@ def plots(vehicle: Vehicle, variances: Matrix) -> list[dict[str, Any]]:
         # A recording that tells little must not flatten all others.
         reach = np.abs(values[inside, axis]) + np.minimum(bars[inside, axis], 2 * np.median(bars[inside, axis]))
         half = max(float(np.quantile(reach, 0.95)), float(np.abs(means[:, axis]).max()) * 1.2, SMALLEST[axis // 3]) * 1.1
-        at = partial(_height, half)
+
+        def at(value: float, half: float = half) -> float:  # px from the top, cut off at the edges
+            return round(float(np.interp(value, (-half, half), (HEIGHT - BOTTOM, TOP))), 1)
+
         points = [
             {
                 **{"x": x[k], "y": at(value), "low": at(value - bar), "high": at(value + bar), "row": row},
@@ -215,12 +217,6 @@ def plots(vehicle: Vehicle, variances: Matrix) -> list[dict[str, Any]]:
         ticks = [(at(value), f"{value:+g}" if value else "0") for value in (-tick, 0.0, tick)]
         out.append({"axis": name, "unit": unit, "points": points, "means": lines, "changes": divisions, "ticks": ticks})
     return out
-
-
-def _height(half: float, value: float) -> float:
-    """px from the top, cut off at the edges."""
-    share = float(np.clip(value / half, -1, 1))
-    return round(TOP + (HEIGHT - TOP - BOTTOM) * (1 - share) / 2, 1)
 
 
 def write_fleet_page(path: Path, fleet: Fleet, options: FleetOptions, facts: Mapping[str, str]) -> None:

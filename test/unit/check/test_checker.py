@@ -69,7 +69,7 @@ def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, 
     assert found.verdict is CheckVerdict.FAIL
     assert found.low <= (max(deg) or max(m)) <= found.high
     mixed_up = next(own for own in result.causes if own.cause is Cause.INVERSE_TRANSFORM)
-    assert (mixed_up.state, mixed_up.message) == (CauseState.EXCLUDED, "the extrinsic is off")
+    assert (mixed_up.state, mixed_up.message) == (CauseState.EXCLUDED, "turned or shifted, the extrinsic matches")
 
 
 def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypatch):

@@ -128,7 +128,7 @@ def test_calibrate_writes_result_and_overlay(
     assert len({frame["name"] for frame in result["frames"]}) == 6
     assert not any(frame["left_out"] for frame in result["frames"])
     assert f"search: {result['starts']['agreed']} of {result['starts']['climbed']} independent starts" in out
-    assert "motion: points stay where they were measured, the vehicle's velocity is not known" in out  # a second apart
+    assert "motion: points stay where they were measured (1 cm per ms at 10 m/s): the scans are 1 s apart" in out
     assert (result["camera_frame"], result["lidar_frame"]) == ("camera", "velodyne")
     assert result["reference_error"]["rotation_deg"] < 0.3
     assert result["reference_error"]["translation_m"] < 0.08
@@ -491,17 +491,16 @@ def test_a_refusal_is_a_line_with_the_command_to_paste(drive: SyntheticDrive) ->
 def test_summary_gives_nobody_the_start_to_publish() -> None:
     kept, found = (summary(Result(np.eye(4), status, "nothing matches", initial=np.eye(4))) for status in (REFUSED, CONVERGED))
     assert "nothing matches" in kept
-    publishing = "T_camera_lidar, the start", "static_transform_publisher", "moved"
-    assert [text in kept for text in publishing] == [True, False, False]
-    assert [text in found for text in publishing] == [False, True, True]
+    publishing = "T_camera_lidar, the start", "static_transform_publisher", "from the start, --initial nominal"
+    assert [[text in own for text in publishing] for own in (kept, found)] == [[True, False, False], [False, True, True]]
 
 
 def test_summary_reports_deskewing(street: list) -> None:
     still = [replace(frame, twist=None) for frame in street]
     assert motion(street, MotionConfig()).endswith("in all frames, 2.9 to 3.0 m/s")
-    moved = motion(street[:3] + still[:1], MotionConfig(time_offset_s=-0.004))
-    assert moved.endswith("in 3 of 4 frames, 3.0 to 3.0 m/s, time offset -4 ms")
-    assert "m/s); the time offset has no effect" in motion(still, MotionConfig(time_offset_s=0.01))
+    moved = motion(street[:3] + still[:1], MotionConfig(time_offset_s=-0.004), "no scan")
+    assert moved.endswith("in 3 of 4 frames, 3.0 to 3.0 m/s, time offset -4 ms; not in others: no scan")
+    assert "m/s): no scan; the time offset has no effect" in motion(still, MotionConfig(time_offset_s=0.01), "no scan")
     assert "compensated already" in motion([replace(frame, compensated=True) for frame in still], MotionConfig())
     assert "motion.deskew: off" in motion(street, MotionConfig(deskew="off"))
 

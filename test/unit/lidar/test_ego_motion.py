@@ -18,7 +18,7 @@ from calib_ros.datasets.kitti_files import NOMINAL_LEVER_ARM, ScanMotion, image_
 from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError, BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.lidar.ego_motion import estimate_motion, needs_ego_motion, unknown_motion_s
+from calib_ros.lidar.ego_motion import estimate_motion, unknown_motion_s, without_motion
 from calib_ros.online.events import Inputs, Problem
 from calib_ros.online.keyframes import EgoMotion
 from calib_ros.online.pipeline import Pipeline
@@ -66,14 +66,13 @@ def without_library(monkeypatch):
 
 def test_which_frames_want_an_estimate(drive):
     frame = replace(drive[0], twist=None)
-    assert needs_ego_motion(frame, AUTO)
-    assert not needs_ego_motion(drive[0], AUTO)
-    assert not needs_ego_motion(frame, MotionConfig(deskew="off"))
-    assert not needs_ego_motion(frame, MotionConfig(from_scans="never"))
-    assert not needs_ego_motion(replace(frame, compensated=True), ALWAYS)
-    assert not needs_ego_motion(replace(frame, cloud_stamp=None), ALWAYS)
-    assert not needs_ego_motion(untimed(frame), AUTO)
-    assert needs_ego_motion(untimed(frame), ALWAYS)
+    assert not without_motion(frame, AUTO)
+    assert without_motion(drive[0], AUTO)
+    assert all(without_motion(frame, MotionConfig(**off)) for off in ({"deskew": "off"}, {"from_scans": "never"}))
+    assert without_motion(replace(frame, compensated=True), ALWAYS)
+    assert without_motion(replace(frame, cloud_stamp=None), ALWAYS)
+    assert without_motion(untimed(frame), AUTO)
+    assert not without_motion(untimed(frame), ALWAYS)
 
 
 class TestEstimate:
@@ -97,7 +96,7 @@ class TestEstimate:
             motion = estimate_motion(before.cloud, now.cloud, 0.1, AUTO, start)
             assert motion.twist[3:] == pytest.approx(mean[3:], abs=0.02 * SPEED)
             assert motion.twist[:3] == pytest.approx(mean[:3], abs=0.03)
-            assert motion.reason == ""
+            assert (motion.reason, motion.speed) == ("", pytest.approx(SPEED, rel=0.05))
         backwards = estimate_motion(drive[2].cloud, drive[1].cloud, 0.1, MotionConfig(spin="none"))
         assert backwards.twist[3] == pytest.approx(-SPEED, rel=0.05)
 
@@ -123,11 +122,13 @@ class TestEstimate:
 
     # ---- offline
 
-    def test_neighbours_of_a_source(self, drive):
-        source = Bare(drive)
-        moving = WithMotion(source, AUTO)
+    def test_neighbours_of_a_source(self, drive, monkeypatch):
+        monkeypatch.setattr("calib_ros.datasets.source.ROAD_SPEED", 0.5 * SPEED)
+        source, said = Bare(drive), list[str]()
+        moving = WithMotion(source, AUTO, said.append)
         frames = [moving[i] for i in range(len(moving))]
         assert source.reads < 2 * len(drive) + 2
+        assert [f"{SPEED:.0f} m/s from frame 0 to 1 cannot be" in line for line in said] == [True]
         for i, frame in enumerate(frames):
             assert frame.twist[3:] == pytest.approx(drive[i].twist[3:], abs=0.03 * SPEED)
             assert np.array_equal(frame.cloud.xyz, drive[i].cloud.xyz)
@@ -220,8 +221,7 @@ def test_without_the_library(drive, without_library, capsys):
     said: list[str] = []
     moving = WithMotion(Bare(drive), AUTO, said.append)
     assert [moving[i].twist for i in range(3)] == [None] * 3
-    assert len(said) == 1
-    assert "not corrected for the vehicle's motion" in said[0]
+    assert ["not corrected for the vehicle's motion" in line for line in said] == [True]
     assert WithMotion(Bare(drive), AUTO)[1].twist is None
     motion = EgoMotion(AUTO)
     for i in range(2):

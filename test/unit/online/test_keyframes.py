@@ -222,7 +222,7 @@ def test_the_estimated_twist_counts_too(monkeypatch: pytest.MonkeyPatch) -> None
     """Where no odometry tells, the motion estimated from scans does: the limit is below the drive's 3 m/s."""
     pytest.importorskip("small_gicp")
     drive = SyntheticDrive(seed=1, frames=4, rings=32, width=320, height=96, speed=3.0, stride=1)
-    monkeypatch.setattr("calib_ros.online.keyframes.MAX_SPEED", 2.0)
+    monkeypatch.setattr("calib_ros.online.keyframes.ROAD_SPEED", 2.0)
     options = {"online": {"keyframe_spacing_s": 0.0, "similarity_threshold": 1.0}}
     recalibrator = Recalibrator(drive.camera, drive.reference, Config.from_dict(options))
     taken = [recalibrator.ingest(dataclasses.replace(frame, twist=None)) for frame in (drive[i] for i in range(4))]

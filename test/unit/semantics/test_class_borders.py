@@ -277,10 +277,10 @@ def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, 
     assert semantic_share(thesis_of(config), edges_of) == share
     whole = calibrator.extract(frame, seen)
     objective = calibrator.objectives([whole], frame.reference, frame.reference)
-    assert objective.remark.startswith("semantic edges are borders of classes" if edges_of == OF_CLASSES else "")
+    assert objective.remark.startswith("eq. 3.12 ran on gradients and borders of classes" if edges_of == OF_CLASSES else "")
     assert bool(objective.remark) == (edges_of == OF_CLASSES)
     plain = calibrator.extract(frame)
-    assert calibrator.objectives([plain], frame.reference, frame.reference).remark.startswith("no semantic edges")
+    assert calibrator.objectives([plain], frame.reference, frame.reference).remark.startswith("eq. 3.12 ran on gradients alone")
     features = whole.own
     image = calibrator.extract.working_image(frame.image)
     gradient = gradient_edges(prepare(image), thesis_of(config))

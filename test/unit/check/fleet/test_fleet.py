@@ -144,6 +144,7 @@ def test_a_folder_of_recordings_from_the_command_line(drive, street_bag: Path, b
     [
         (["--report", "x.html"], "--report is for one recording"),
         (["--verbose"], "--verbose is for one recording"),
+        (["--overlay", "x.png"], "check has its pictures on a page, by --report HTML"),
         (["--workers", "0"], "--workers 0: give at least 1"),
         (["--out", ""], "--out is given without a name"),
         (["--scheduler", "tcp://host"], "no Dask scheduler answers at 'tcp://host'"),
