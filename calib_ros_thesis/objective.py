@@ -86,8 +86,8 @@ class ThesisObjective:
     def remark(self) -> str:
         """What the semantic edges of 3.4.2 are, where they are not of Segment Anything in all frames."""
         blended = {f.own.blended for f in self.edges.features}
-        ran = "gradients and borders of classes, without" if OF_CLASSES in blended else "gradients alone, without classes or"
-        return "" if blended == {OF_MASKS} else f"eq. 3.12 ran on {ran} masks of Segment Anything: {SET_MASKS}"
+        ran = " and borders of classes, without" if OF_CLASSES in blended else ", without classes (semantics.segmentation) or"
+        return "" if blended == {OF_MASKS} else f"eq. 3.12 ran on gradients{ran} masks of Segment Anything: {SET_MASKS}"
 
     def value(self, T: Matrix) -> float:
         """J at the last smoothing; with edges attached once per level, the smooth score of those attached at T."""

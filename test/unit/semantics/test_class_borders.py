@@ -280,7 +280,7 @@ def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, 
     assert objective.remark.startswith("eq. 3.12 ran on gradients and borders of classes" if edges_of == OF_CLASSES else "")
     assert bool(objective.remark) == (edges_of == OF_CLASSES)
     plain = calibrator.extract(frame)
-    assert calibrator.objectives([plain], frame.reference, frame.reference).remark.startswith("eq. 3.12 ran on gradients alone")
+    assert "ran on gradients, without classes" in calibrator.objectives([plain], frame.reference, frame.reference).remark
     features = whole.own
     image = calibrator.extract.working_image(frame.image)
     gradient = gradient_edges(prepare(image), thesis_of(config))
