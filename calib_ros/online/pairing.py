@@ -57,6 +57,7 @@ class SynchronizerCounts:
     unpaired_images: int = 0
     unpaired_clouds: int = 0
     jumps_back: int = 0
+    cleared: int = 0
 
 
 @dataclass(eq=False)
@@ -154,6 +155,7 @@ class Synchronizer:
         """Drop the waiting messages, keep the counts."""
         self._images, self._clouds = _Stream(self._images.capacity), _Stream(self._clouds.capacity)
         self._newest_is_image = self._lead = None
+        self.counts.cleared += 1
 
     # ---- messages -----------------------------------------------------------------------------------------------------
 
@@ -347,7 +349,7 @@ class PairingHealth:
         before = self._counts[0]
         images, clouds, pairs = now.images - before.images, now.clouds - before.clouds, now.pairs - before.pairs
         fewer = min(images, clouds)
-        if fewer < MIN_MESSAGES or now.jumps_back > before.jumps_back:
+        if fewer < MIN_MESSAGES or now.cleared > before.cleared:
             return ""
         self.share = 1 - pairs / fewer if pairs < (1 - UNPAIRED_SHARE) * fewer else 0.0
         of = "images" if images <= clouds else "clouds"

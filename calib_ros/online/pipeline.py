@@ -38,6 +38,7 @@ from calib_ros.result import Extrinsic, Result
 
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
+FIRST_PAIRS = 10  # without a CameraInfo, which may come just after its image, and late where it is kept for those who join
 LONGEST_ROUND_S = 3.0  # that a pair waits for those of the same scan to be done
 
 
@@ -318,7 +319,8 @@ class Pipeline:
         camera = self.camera
         if camera is None:
             message = "images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"
-            self._tell(Problem(message, "camera"))
+            if self.pairing.synchronizer.counts.pairs > FIRST_PAIRS:
+                self._tell(Problem(message, "camera"))
             return None
         recalibrator = self.recalibrator or self._start(camera, *self._inputs.frame_ids(intake.image, intake.cloud))
         if recalibrator is None:

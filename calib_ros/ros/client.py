@@ -58,9 +58,7 @@ class ExtrinsicClient:
         self._name = node_name.rstrip("/")
         self._get = self._node.create_client(GetExtrinsic, f"{self._name}/get_extrinsic")
         self.overlay: NDArray[np.uint8] | None = None
-        self.overlays = 0
-        self.frames = 0
-        self._stamp = -1
+        self.overlays, self.frames, self._stamp = 0, 0, -1
         if draws:
             self._node.create_subscription(Image, f"{self._name}/overlay", self._on_overlay, 1)
 

@@ -51,14 +51,13 @@ class Health(NodeService):
     def __init__(self, logger: Any) -> None:
         self._logger = logger
         self.log = QuietLog()
-        self.last_error = ("", -1e9)
+        self.errors, self.last_error = 0, ("", -1e9)
         self.extrinsic: Extrinsic | None = None
         self.estimated_at: float | None = None
         self.losses: dict[str, str] = {}
         self._missing: dict[str, float] = {}  # as told last
         self.silence: dict[str, str] = {}
         self.callback_ms: deque[float] = deque(maxlen=2000)
-        self.errors = 0
 
     def error(self, text: str, kind: str) -> None:
         """A problem, in one line. kind: what counts as the same in the log, whatever figures the text gives."""
@@ -99,9 +98,11 @@ class Health(NodeService):
         if accepted:
             self.estimated_at = time.monotonic()
         if result.status in (CONVERGED, TENTATIVE, INSUFFICIENT) and accepted:  # insufficient: some axes not observable yet
+            offset_s, sigma_s = result.time_offset_s or 0.0, result.time_offset_sigma_s or 0.0  # told where it is beyond doubt
             self._logger.info(
                 f"extrinsic from {result.frames_used} keyframes: score {result.score:.3f}, "
                 f"drift {extrinsic.normalised_innovation:.2f}, {result.elapsed_s:.1f} s"
+                + (f", time offset {1000 * offset_s:+.0f} ms" if abs(offset_s) > 3 * sigma_s else "")
                 + (f"; {result.reason}" if result.status != CONVERGED else "")
             )
         elif result.status == INITIAL or (result.status == CONVERGED and not extrinsic.accepted):

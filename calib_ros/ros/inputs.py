@@ -5,6 +5,7 @@ Each message is received and decoded once for all pairs that look at it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -223,12 +224,14 @@ class SensorSubscriptions(NodePart):
             # its period, until it falls silent; of images and clouds, where many get lost.
             lost, topic = own.lost_share(), own.topic
             silent = not lost and own.silent_s > max(SILENCE_S, SILENT_PERIODS * period / NANOSECONDS)
-            share = 0.0 if silent else max(lost, missing)
-            text = f"{topic} is silent" if silent else f"the messages on {topic} get through again"
-            if share >= MISSING_SHARE * (LASTING if topic in self._health.losses else 1):
-                losses[topic] = text = f"{share:.0%} of the messages on {topic} get lost; {loss_advice(own)}"
+            share = math.inf if silent else max(lost, missing)
+            text = own.silence if silent else f"{share:.0%} of the messages on {topic} get lost; {loss_advice(own)}"
+            if not silent and share >= MISSING_SHARE * (LASTING if topic in self._health.losses else 1):
+                losses[topic] = text
+            elif not silent:
+                share, text = 0.0, f"the messages on {topic} get through again"
             if own.tells:
-                self._health.missing(f"losses on {topic}", share if topic in losses else 0.0, text)
+                self._health.missing(f"losses on {topic}", share, text)
         self._health.losses = losses
         if parameters["image_is_rectified"] != self._rectified:
             self._rectified = parameters["image_is_rectified"]

@@ -78,19 +78,15 @@ class AdaptiveSubscription:
         guard: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self.preference = preference
-        self._guard = guard
         self._node, self._callback, self._latched = node, callback, latched
-        self._topic = topic
+        self._topic, self._guard = topic, guard
         self._forms, self._form = forms, forms[0]
-        self.largest = 0
-        self.reliability_offered = False
-        self.silence = ""
-        self._received = self._lost = 0
-        self._received_at = -float("inf")
+        self.largest, self.reliability_offered, self.silence = 0, False, ""
+        self._received = self._lost = self._made = 0
+        self._received_at = time.monotonic()
         self._history: deque[tuple[int, int]] = deque(maxlen=LOSS_CHECKS)  # received and lost so far, at every check
         self._old: list[tuple[Any, float]] = []
         self._recent: deque[tuple[int, int]] = deque(maxlen=64)  # stamp, and number of the subscription
-        self._made = 0
         self._qos = (RELIABLE if preference == "reliable" else BEST_EFFORT, DurabilityPolicy.VOLATILE)
         self._current = self._subscribe()
 
@@ -111,7 +107,7 @@ class AdaptiveSubscription:
 
     @property
     def silent_s(self) -> float:
-        """Seconds since the newest message; inf before the first."""
+        """Seconds since the newest message, before the first since the topic is listened to."""
         return time.monotonic() - self._received_at
 
     def lost_share(self) -> float:
@@ -148,8 +144,9 @@ class AdaptiveSubscription:
             self._current = self._subscribe()
         self.reliability_offered = bool(publishers) and all(p.reliability != BEST_EFFORT for p in publishers)
         problem = self._problem(types, publishers)
-        nothing = "is published, but nothing comes; check its driver" if publishers else ""
-        self.silence = problem or f"{self.topic} {nothing or f'has no publisher; {where_nobody_publishes()}'}"
+        missing = " any more; see that its driver runs" if self._received else f"; {where_nobody_publishes()}"
+        nothing = "is published, but nothing comes; check its driver" if publishers else f"has no publisher{missing}"
+        self.silence = problem or f"{self.topic} {nothing}"
         return problem
 
     def _wanted(self, publishers: list[QoSProfile]) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
