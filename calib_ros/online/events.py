@@ -17,7 +17,7 @@ from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.sensor_health import SensorFault, SensorProblem
 from calib_ros.result import Extrinsic, Result
 
-REPEAT_S = 10.0  # of lines of a kind, whatever figures they give, one is written in so long
+REPEAT_S, LONGEST_S = 10.0, 60.0  # of lines of a kind, whatever their figures, one is written in so long, then in twice as long
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,38 +113,38 @@ class Remarks:
 
 
 class QuietLog:
-    """Counts what comes within REPEAT_S of the last line of its kind; the newest of these is written afterwards. Thread-safe.
+    """Counts what comes soon after the last line of its kind, see REPEAT_S; the newest is written afterwards. Thread-safe.
 
     now: s, by a steady clock.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._now, self._lock = now, threading.Lock()
-        # Of each kind when its last line was written, how many have come since, and what writes the newest of these.
-        self._told: dict[str, tuple[float, int, Callable[[str], object]]] = {}
+        # Of each kind when its last line was written, for how long, how many have come since, and what writes the newest of them.
+        self._told: dict[str, tuple[float, float, int, Callable[[str], object]]] = {}
 
     def add(self, kind: str, text: str, write: Callable[[str], object]) -> None:
         """A line. kind: what counts as the same, whatever the text. write: takes the text when its time has come."""
         with self._lock:
             now = self._now()
-            at, left_out, _ = self._told.get(kind, (-math.inf, 0, write))
-            if now - at >= REPEAT_S:
-                self._told[kind] = now, 0, write
-                write(text + _more(left_out))
+            at, wait, left_out, _ = self._told.get(kind, (-math.inf, 0.5 * REPEAT_S, 0, write))
+            if now - at >= wait:
+                self._told[kind] = now, min(2 * wait, LONGEST_S), 0, write
+                write(text + _more(left_out, wait))
             else:
-                self._told[kind] = at, left_out + 1, lambda more: write(text + more)
+                self._told[kind] = at, wait, left_out + 1, lambda more: write(text + more)
 
     def catch_up(self) -> None:
         """Write what has been left out long enough; to be called about once a second."""
         with self._lock:
             now = self._now()
-            for kind, (at, left_out, write) in list(self._told.items()):
-                if now - at >= REPEAT_S:
+            for kind, (at, wait, left_out, write) in list(self._told.items()):
+                if now - at >= wait:
                     del self._told[kind]
                     if left_out:
-                        self._told[kind] = now, 0, write
-                        write(_more(left_out - 1))
+                        self._told[kind] = now, min(2 * wait, LONGEST_S), 0, write
+                        write(_more(left_out - 1, wait))
 
 
-def _more(count: int) -> str:
-    return f" ({count} more in {REPEAT_S:g} s)" if count else ""
+def _more(count: int, seconds: float) -> str:
+    return f" ({count} more in {seconds:g} s)" if count else ""

@@ -160,19 +160,19 @@ def test_events_tell_what_led_to_it(box: Box) -> None:
     assert len(box.events().splitlines()) == KEPT_EVENTS
 
 
-def test_what_differs_in_its_figures_alone_is_one_line_in_ten_seconds_and_counted() -> None:
+def test_what_differs_in_its_figures_alone_is_one_line_ever_more_rarely_and_counted() -> None:
     now, lines = [0.0], list[str]()
     log = QuietLog(lambda: now[0])
-    for tenth in range(250):
+    for tenth in range(350):
         now[0] = tenth / 10
         log.add("cloud", f"{tenth} points", lines.append)
         if tenth in (3, 4):
             log.add("camera", "no image", lines.append)
         log.catch_up()
-    assert lines == ["0 points", "no image", "100 points (99 more in 10 s)", "no image", "200 points (99 more in 10 s)"]
-    for now[0] in (29.0, 30.0, 60.0):  # what came last is told although nothing comes any more
+    assert lines == ["0 points", "no image", "100 points (99 more in 10 s)", "no image", "300 points (199 more in 20 s)"]
+    for now[0] in (69.0, 70.0, 140.0):  # what came last is told although nothing comes any more
         log.catch_up()
-    assert lines[5:] == ["249 points (48 more in 10 s)"]
+    assert lines[5:] == ["349 points (48 more in 40 s)"]
 
 
 def test_a_blinded_sensor_is_told_when_it_begins_to_be_for_another_reason_and_when_it_sees(
