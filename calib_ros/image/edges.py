@@ -153,11 +153,7 @@ def edge_levels(
 
 
 def blurred_levels(
-    edges: Sequence[Map],
-    focal_length: float,
-    sigmas: Sequence[float] = SIGMAS,
-    local_contrast: bool = False,
-    least: float = 0.0,
+    edges: Sequence[Map], focal_length: float, sigmas: Sequence[float] = SIGMAS, local_contrast: bool = False, least: float = 0.0
 ) -> list[EdgeLevel]:
     """Edge maps (H, W) of any number of channels -> levels, coarse to fine.
 

@@ -186,12 +186,7 @@ class Tracker:
         self._begin(self.initial)
 
     def update(
-        self,
-        estimate: Result,
-        share_new: float = 1.0,
-        seconds: float = 0.0,
-        on_request: bool = False,
-        covers_all: bool = False,
+        self, estimate: Result, share_new: float = 1.0, seconds: float = 0.0, on_request: bool = False, covers_all: bool = False
     ) -> Extrinsic:
         """Accept or reject an estimate; returns the current extrinsic afterwards.
 

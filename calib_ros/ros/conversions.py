@@ -125,11 +125,7 @@ NO_ADVICE = Advice()
 
 
 def extrinsic_message(
-    extrinsic: Extrinsic,
-    stamp: int,
-    validity: Validity = UNKNOWN,
-    consumers: Sequence[Consumer] = (),
-    advice: Advice = NO_ADVICE,
+    extrinsic: Extrinsic, stamp: int, validity: Validity = UNKNOWN, consumers: Sequence[Consumer] = (), advice: Advice = NO_ADVICE
 ) -> ExtrinsicMsg:
     """The current extrinsic -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element.
 

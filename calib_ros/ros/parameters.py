@@ -99,14 +99,10 @@ SETTINGS: dict[str, dataclasses.Field[Any]] = {
         1.0, "~/extrinsic is published at least this often, s; 2.5 periods are its DDS deadline", low=0.05, high=60.0
     ),
     "max_data_age_s": option(
-        5.0,
-        "without a usable pair of image and cloud for this long the extrinsic is no longer usable, s",
-        low=0.5,
-        high=3600.0,
+        5.0, "without a usable pair of image and cloud for this long the extrinsic is no longer usable, s", low=0.5, high=3600.0
     ),
     "consumers": option(
-        (),
-        "users of the extrinsic and the largest errors that each can live with, 'NAME DEG M'; ~/extrinsic says who may use it",
+        (), "users of the extrinsic and the largest errors that each can live with, 'NAME DEG M'; ~/extrinsic says who may use it"
     ),
     "overlay_period_s": option(
         1.0,

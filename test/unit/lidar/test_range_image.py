@@ -12,7 +12,7 @@ from calib_ros.arrays import quantile
 from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.range_image import _rows_from_top, cell_size, range_image
+from calib_ros.lidar.range_image import BRIGHT, _rows_from_top, cell_size, range_image
 from calib_ros.lidar.rings import ring_of_points
 
 WALLS = [Plane((1, 0, 0), 25), Plane((-1, 0, 0), 12), Plane((0, 1, 0), 9), Plane((0, -1, 0), 15)]
@@ -187,14 +187,13 @@ def test_intensity_in_any_unit_becomes_a_share_and_constant_or_invalid_ones_are_
     one_odd = np.where(np.arange(4000) == 5, 200.0, 7)
     for intensity in (None, np.zeros(4000), np.full(4000, 100.0), np.full(4000, np.nan), one_odd):
         assert reflectivity(intensity) is None
-    # Bright outliers and gaps do not darken the rest.
-    counts = STRIPES * 1000
-    counts[:2], counts[2:5] = 65535, np.nan
-    values = reflectivity(counts)
-    assert values[5:].max() == pytest.approx(1, abs=0.01)
-    assert np.isfinite(values).all()
-    assert values.min() >= 0
-    assert values.max() <= 1
+    # Gaps, bright outliers, and many retroreflectors do not darken the rest.
+    for bright, highest in ((2, 1.0), (80, 1 / BRIGHT)):
+        counts = STRIPES * 1000
+        counts[:bright], counts[bright : bright + 3] = 65535, np.nan
+        values = reflectivity(counts)
+        assert values[bright:].max() == pytest.approx(highest, abs=0.01)
+        assert (values.min(), values.max()) == (0, 1)
 
 
 def test_a_dense_scan_of_a_narrow_field_has_the_cells_of_its_density() -> None:
