@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from calib_ros import se3
 from calib_ros.config.options import has_room
 from calib_ros.config.sensors import REFINE
 from calib_ros.errors import defect, raised_at
@@ -99,9 +100,10 @@ class Health(NodeService):
             self.estimated_at = time.monotonic()
         if result.status in (CONVERGED, TENTATIVE, INSUFFICIENT) and accepted:  # insufficient: some axes not observable yet
             offset_s, sigma_s = result.time_offset_s or 0.0, result.time_offset_sigma_s or 0.0  # told where it is beyond doubt
+            deg, m = se3.error((before or extrinsic).result.T_camera_lidar, result.T_camera_lidar)
             self._logger.info(
                 f"extrinsic from {result.frames_used} keyframes: score {result.score:.3f}, "
-                f"drift {extrinsic.normalised_innovation:.2f}, {result.elapsed_s:.1f} s"
+                f"moved {deg:.2f} deg, {100 * m:.1f} cm, drift {extrinsic.normalised_innovation:.2f}, {result.elapsed_s:.1f} s"
                 + (f", time offset {1000 * offset_s:+.0f} ms" if abs(offset_s) > 3 * sigma_s else "")
                 + (f"; {result.reason}" if result.status != CONVERGED else "")
             )
