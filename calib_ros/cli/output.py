@@ -171,6 +171,8 @@ def _details(result: Result) -> list[str]:
     lines = []
     if result.starts is not None:
         lines.append(f"search: {result.starts[0]} of {result.starts[1]} independent starts ended here")
+    if result.evidence is not None:
+        lines.append(f"halves of the edges disagree by {result.evidence.disagreement:.1f}, 1 is as expected")
     scores = dict(zip(result.frame_names, result.frame_scores, strict=False))
     kept = [s for name, s in scores.items() if name not in result.frames_left_out and np.isfinite(s)]
     usual = float(np.median(kept)) if kept else np.nan
