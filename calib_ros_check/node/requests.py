@@ -91,7 +91,7 @@ def check_keyframes(
 ) -> CheckOutcome:
     """Check an extrinsic by the keyframes; of the recalibrator nothing changes.
 
-    progress, vehicle_frames: as of `Checker.check`; None = no frames are tried. CalibrationError without keyframes.
+    progress, vehicle_frames: as of `Checker.check`; None = no clouds in other frames are tried. CalibrationError: no keyframe.
     """
     started, cpu = time.perf_counter(), cpu_time()
     kept, config, current = recalibrator.snapshot()
