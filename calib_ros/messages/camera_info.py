@@ -26,7 +26,7 @@ def decode_camera_info(msg: Any, rectified: bool = False) -> Camera:
     width, height = int(msg.width), int(msg.height)
     roi = getattr(msg, "roi", None)
     if roi is not None and int(roi.width) > 0 and int(roi.height) > 0:
-        K[:2, 2] -= (int(roi.x_offset), int(roi.y_offset))
+        K[:2, 2] -= (float(roi.x_offset), float(roi.y_offset))
         width, height = int(roi.width), int(roi.height)
     # K belongs to the full resolution; 0 and 1 both mean no binning.
     bin_x, bin_y = (max(int(getattr(msg, name, 0)), 1) for name in ("binning_x", "binning_y"))

@@ -80,8 +80,8 @@ class MessageFuzzer:
             return int(self.one(SIZES)) if self.chance(0.7) else max(int(value) + int(self.rng.integers(-3, 4)), 0)
         if isinstance(value, str):
             return self.one(TEXTS)
-        if isinstance(value, list) and value and not isinstance(value[0], float):
-            return self.one(([], value[1:], [*value, value[0]], value[::-1], 50 * value))
+        if isinstance(value, list) and not (value and isinstance(value[0], float)):
+            return value and self.one(([], value[1:], [*value, value[0]], value[::-1], 50 * value))
         numbers = np.array(value)
         if numbers.dtype == np.uint8:
             return self.make.data(self.damaged(numbers.tobytes()))
@@ -112,7 +112,7 @@ class MessageFuzzer:
         known = {**dict(zip("xyz", columns["xyz"].T, strict=True)), **columns}
         known |= {"i": known["intensity"], "reflectivity": known["intensity"], "line": known["ring"]}
         points = np.zeros(len(columns["ring"]), dtype)
-        for name in set(dtype.names or ()) - {"pad"}:
+        for name in [each for each in dtype.names or () if each != "pad"]:
             values, kind = np.array(known.get(name, columns["time"]), float), dtype[name]
             if name in ("t", "timestamp", "time"):
                 unit = self.one((1.0, 1e3, 1e6, 1e9, 0.0, -1.0))
