@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -34,17 +35,16 @@ def clock_finding(
 
     seconds: offset that was found, as a change of motion.time_offset_s.
     """
-    cause = Cause.TIME_OFFSET
+    cause, finding = Cause.TIME_OFFSET, partial(CauseFinding, Cause.TIME_OFFSET)
     mended = f"{stamped(seconds)}; motion.time_offset_s would be {config.time_offset_s + seconds:.4g}"
     ms = f"{1000 * abs(seconds):.0f} ms"
     if result.refusal is RefusalCode.WRONG_TIMES:
-        return CauseFinding(cause, CauseState.FOUND, f"{cause}; by about {ms}: {mended}", {"seconds": seconds})
+        return finding(CauseState.FOUND, f"{cause}; by about {ms}: {mended}", {"seconds": seconds})
     if result.time_offset_s is None or result.time_offset_sigma_s is None:
         if config.time_offset != ESTIMATE:
-            return CauseFinding(cause, CauseState.NOT_JUDGED, "the clocks are taken as stated (motion.time_offset: fixed)")
+            return finding(CauseState.NOT_JUDGED, "the clocks are taken as stated (motion.time_offset: fixed)")
         why = "all frames move alike, or their motion is not known" if len(features) > 1 else "one frame does not tell"
-        message = f"the offset of the clocks is not known: {why}; {KNOW_CLOCKS}"
-        return CauseFinding(cause, CauseState.NOT_JUDGED, message)
+        return finding(CauseState.NOT_JUDGED, f"the offset of the clocks is not known: {why}; {KNOW_CLOCKS}")
     sigma = result.time_offset_sigma_s
     values = {"seconds": seconds, "sigma_s": sigma}
     twists = np.array([f.twist for f in features if f.twist is not None])
@@ -52,10 +52,10 @@ def clock_finding(
     shift = float(np.linalg.norm(twists[:, 3:], axis=1).max()) * abs(seconds)
     if abs(seconds) > SIGNIFICANT_SIGMAS * sigma and (np.rad2deg(turn) > tolerance.deg or shift > tolerance.m):
         moves = f"points are off by up to {np.rad2deg(turn):.1f} deg and {100 * shift:.0f} cm"
-        message = f"{cause}; by {ms} (+- {1000 * REPORTED_SIGMAS * sigma:.0f} ms), so that {moves}: {mended}"
-        return CauseFinding(cause, CauseState.FOUND, message, values)
-    message = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * REPORTED_SIGMAS * sigma:.1f} ms"
-    return CauseFinding(cause, CauseState.EXCLUDED, message, values)
+        interval = f"(+- {1000 * REPORTED_SIGMAS * sigma:.0f} ms)"
+        return finding(CauseState.FOUND, f"{cause}; by {ms} {interval}, so that {moves}: {mended}", values)
+    agree = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * REPORTED_SIGMAS * sigma:.1f} ms"
+    return finding(CauseState.EXCLUDED, agree, values)
 
 
 def findings(causes: Iterable[Cause], state: CauseState, message: str) -> tuple[CauseFinding, ...]:

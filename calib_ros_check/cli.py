@@ -86,8 +86,12 @@ def next_command(args: argparse.Namespace, checked: Checked) -> tuple[str, str]:
     """By which what is wrong is mended, or more is found out, see `again`; empty where none does."""
     result, cause, given = checked.result, checked.result.cause, args.given
     if result.verdict is not CheckVerdict.FAIL:
-        is_open = result.verdict is CheckVerdict.INCONCLUSIVE and args.extrinsic in ("reference", TF)  # all would hold none back
-        return again(given, more_frames(len(checked.frames), checked.in_all) if is_open else "")
+        more = more_frames(len(checked.frames), checked.in_all) if result.verdict is CheckVerdict.INCONCLUSIVE else ""
+        if not more or args.extrinsic in ("reference", TF):
+            return again(given, more)
+        return again(
+            given, f"--initial {shlex.quote(args.extrinsic)} {more}", "calibrate"
+        )  # all would hold none back for a check
     if cause is Cause.NOT_RECTIFIED and checked.frames[0].camera.said_rectified:
         return again(given, "--no-rectified")
     if cause is Cause.ALREADY_RECTIFIED or (cause is not None and not cause.options):

@@ -74,6 +74,11 @@ class Deviation:
         """Whether the scenes tell it."""
         return math.isfinite(self.error)
 
+    @property
+    def is_off(self) -> bool:
+        """Whether the scenes tell on which side an axis is off."""
+        return self.low > 0 or self.high < 0
+
 
 @dataclass(frozen=True)
 class CauseFinding:

@@ -20,11 +20,11 @@ from calib_ros.online.clocks import with_clocks
 from calib_ros.registration.judgement.refusal import joined
 from calib_ros.registration.progress import Callback
 from calib_ros_check.checker import Checker
-from calib_ros_check.outcome import CheckResult, Tolerance
+from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance
 
 REFERENCE, TF = "reference", "tf"
 FRAMES = 10  # of a recording, unless said otherwise
-OWN = "by the frames that it was made from, which cannot refute it: name others by --frames"
+OWN = "by {} of {} frames that it was made from, which cannot refute it: name others by --frames"
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,10 @@ def check_source(
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
     made = {*(() if options.extrinsic in (REFERENCE, TF) else result.load(options.extrinsic).frame_names)}
+    own = sum(frame.name in made for frame in frames) if found.verdict is CheckVerdict.PASS else 0
     found = replace(
         found,
-        reason=joined([OWN if {frame.name for frame in frames} <= made else "", found.reason]),
+        reason=joined([OWN.format(own, len(frames)) if own else "", found.reason]),
         notes=(*getattr(source, "remarks", ()), *notes, *found.notes),
         camera_frame=source.camera_frame,
         lidar_frame=source.lidar_frame,

@@ -194,7 +194,8 @@ def _deviation(name: str, samples: Matrix, seen: float, limit: float, unit: floa
     else:
         spread, flipped = amount(max(high - error, error - low), is_angle), is_angle and abs(error) > FLIPPED_DEG
         way = DIRECTIONS[name][2 if flipped else int(error < 0)]
-        words = f"{way.format(amount(error, is_angle))} (+- {spread})"
+        within = ", within the tolerance" if verdict is CheckVerdict.PASS else ""
+        words = f"{way.format(amount(error, is_angle))} (+- {spread}){within}"
     return Deviation(name, verdict, error, low, high, words)
 
 
@@ -206,16 +207,24 @@ def reason_of(
         return joined([cause.message, _THEN[judgement.verdict].format(limits=tolerance, sizes=judgement.sizes)])
     if judgement.verdict is CheckVerdict.PASS:
         return f"right to within {tolerance}: {judgement.sizes}"
-    # The axes that fail, or else those that are inconclusive; the largest first.
+    # The axes that fail, or else those that are inconclusive; those that are off first, and the largest of them.
     by_verdict = ([own for own in judgement.axes if own.verdict is v] for v in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE))
-    worst = sorted(next(filter(None, by_verdict), []), key=lambda own: -abs(own.error) * (1.0 if own.name[0] == "r" else 5.0))
+    worst = sorted(
+        next(filter(None, by_verdict), []),
+        key=lambda own: (not own.is_off, -abs(own.error) * (1.0 if own.name[0] == "r" else 5.0)),
+    )
     others = [f"or else {own.message}" for own in possible]
     if judgement.verdict is CheckVerdict.FAIL:
         both = (f"{own.name} {own.words}" for own in (judgement.rotation, judgement.translation))
-        first, *axes = [own.words for own in worst] or both
+        first, *axes = [own.words for own in worst if own.is_off] or both
         return joined([f"{first}: estimate anew", *axes, f"more than {tolerance}", *others])
     names = ", ".join(f"{own.name} {own.words}" for own in worst) or judgement.sizes
-    return joined([f"not known to within {tolerance}: {MORE_FRAMES}", names, *others])
+    known = f"not known to within {tolerance}"
+    if any(own.is_off for own in worst or judgement.axes):  # that the extrinsic is wrong is known, only not by how much
+        turn, shift = judgement.rotation, judgement.translation
+        largest = turn if turn.error / tolerance.deg > shift.error / tolerance.m else shift
+        known = f"{largest.words}, perhaps within {tolerance}"
+    return joined([f"{known}: {MORE_FRAMES}", names, *others])
 
 
 def amount(value: float, is_angle: bool) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -81,8 +80,9 @@ def _info(args: argparse.Namespace) -> int:
 def _calibrate(args: argparse.Namespace) -> int:
     from calib_ros.cli.calibrate import advice, calibrate, next_command
     from calib_ros.cli.inputs import configuration, constraint_options, initial_of, open_named_source
-    from calib_ros.cli.output import again, check_json, note, print_or_save, summary
+    from calib_ros.cli.output import check_json, checked_by, note, print_or_save, summary
     from calib_ros.config.sensors import REFINE
+    from calib_ros.datasets.source import frame_positions
     from calib_ros.intrinsics import camera_info_yaml
     from calib_ros.io import check_output, write_atomically
 
@@ -103,8 +103,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     limits = args.search_deg, args.search_m
     result = calibrate(source, args.frames, args.initial, args.yaw_deg, config, *limits, args.overlay)
     told = advice(result, source, config), next_command(result, source, config, args)
-    unsaved, file = "" if args.json else "not saved: --json FILE writes it; ", shlex.quote(args.json or "FILE")
-    then = f"\n{unsaved}{again(args.given, f'--extrinsic {file} --frames OTHERS', 'check')[1]} judges it, by other scenes"
+    then = "\n" + checked_by(args.given, args.json, frame_positions(args.frames, len(source)), len(source))
     print_or_save(result, summary(result, *told, args.initial) + then * (result.converged and args.json != "-"), args.json)
     if args.camera_info is not None and result.converged and result.refined_camera is not None:
         write_atomically(args.camera_info, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from calib_ros import extensions, se3
 from calib_ros.config import MotionConfig
-from calib_ros.datasets.source import Source
+from calib_ros.datasets.source import Source, spread_positions
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.intrinsics import ASPECT, CENTRE, FOCAL, RADIAL, RefinedCamera
@@ -26,6 +26,8 @@ from calib_ros.registration.judgement.refusal import lines_of, stamped
 from calib_ros.result import Result
 
 LINE, MANY_FRAMES, ALIKE = 100, 20, 0.5  # characters; frames of a source that are enough; share of frames that differ
+CHECKED_BY = 10  # frames, as many as a check takes unless said otherwise
+DISAGREEING = 1.774  # of halves of the edges: more than one of ten right extrinsics, by chi^2 of six unknowns
 FLAGS = ("--rectified", "--no-rectified", "--incomplete", "--rotation-only")  # options without a value
 WRITES = ("--json", "--overlay", "--report", "--camera-info")
 TOPICS = ("--image-topic", "--points-topic", "--camera-info-topic")
@@ -87,6 +89,15 @@ def more_frames(used: int, of_all: int) -> str:
     return "--frames all" if of_all <= MANY_FRAMES else f"--frames 0:{of_all}:{-(-of_all // MANY_FRAMES)}"
 
 
+def checked_by(given: Sequence[str], path: str | None, positions: Sequence[int], count: int) -> str:
+    """How frames of the source that are not at these positions can judge what was made of those that are."""
+    rest, unsaved = sorted({*range(count)} - {*positions}), "" if path else "not saved: --json FILE writes it; "
+    if not rest:
+        return f"{unsaved}no frame is left to judge it: {again(given, '--frames ::2')[0]} leaves half of them"
+    others, file = ",".join(str(rest[k]) for k in spread_positions(CHECKED_BY, len(rest))), shlex.quote(path or "FILE")
+    return f"{unsaved}judged by other frames: {again(given, f'--extrinsic {file} --frames {others}', 'check')[1]}"
+
+
 def first_lines(status: str, reason: str, command: tuple[str, str] = ("", "")) -> list[str]:
     """A status with its reason: in a line what is wrong and what to do, by a command if there is room for it; then the command
     whole, and the rest of the reason, a part a line. command: of `again`."""
@@ -100,16 +111,17 @@ def first_lines(status: str, reason: str, command: tuple[str, str] = ("", "")) -
 def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""), initial: str = "nominal") -> str:
     """What `calib-ros calibrate` prints. advice: what to add. command: of `again`. initial: as of --initial."""
     score = f"score {result.score:.3f}, " if np.isfinite(result.score) else ""
-    scenes = result.evidence.scenes if result.evidence else 0.0
+    scenes, halves = (result.evidence.scenes, result.evidence.disagreement) if result.evidence else (0.0, 1.0)
     alike = f" of about {scenes:.1f} different scenes" if 0 < scenes < ALIKE * result.frames_used else ""
     figures = f"{result.frames_used} frames{alike}, {score}{result.elapsed_s:.1f} s"
     if result.converged:
-        lines = [f"{result.status}: {figures}", *lines_of(result.reason)]
+        doubt = "; halves of the edges disagree: add frames of other scenes" if halves > DISAGREEING else ""
+        lines = [f"{result.status}: {figures}{doubt}", *lines_of(result.reason)]
     else:
         lines = [*first_lines(result.status, result.reason, command), figures]
     lines += [f"advice: {advice}"] if advice else []
-    kept = "" if result.converged else ", the start"
-    lines.append(f"T_{result.camera_frame}_{result.lidar_frame}{kept}  {pose(result.T_camera_lidar)}")
+    named = f"T_{result.camera_frame}_{result.lidar_frame}" + ", the start" * (not result.converged)
+    lines += [f"{named}  {pose(result.T_camera_lidar)}"]
     for lens, C in (("as stated", result.covariance), ("off as usual (camera.focal_sigma)", result.covariance_with_intrinsics)):
         if C is not None:
             rx, ry, rz, x, y, z = np.sqrt(np.diag(C)) * ([np.rad2deg(1.0)] * 3 + [100.0] * 3)
@@ -129,9 +141,8 @@ def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""
         return "\n".join(lines)  # nobody is to publish the start
     from calib_ros.export import tf_command  # with what XML brings along
 
-    return "\n".join(
-        [*lines, tf_command({(result.camera_frame, result.lidar_frame): result.T_camera_lidar}, "{:.6f}".format).rstrip()]
-    )
+    lines += [tf_command({(result.camera_frame, result.lidar_frame): result.T_camera_lidar}, "{:.6f}".format).rstrip()]
+    return "\n".join(lines)
 
 
 def refined_words(refined: RefinedCamera) -> str:
@@ -176,15 +187,12 @@ def _details(result: Result) -> list[str]:
     scores = dict(zip(result.frame_names, result.frame_scores, strict=False))
     kept = [s for name, s in scores.items() if name not in result.frames_left_out and np.isfinite(s)]
     usual = float(np.median(kept)) if kept else np.nan
-    if result.frames_left_out:
-        lines.append(f"left out: {', '.join(result.frames_left_out)}")
+    lines += [f"left out: {', '.join(result.frames_left_out)}"] if result.frames_left_out else []
     for name, score in scores.items():
         if name not in result.frames_left_out and not score >= 0.5 * usual:  # NaN too
             text = f"score {score:.3f}" if np.isfinite(score) else "no edge points in sight"
             lines.append(f"frame {name}: {text}, median {usual:.3f}")
-    if result.motion:
-        lines.append(f"motion: {result.motion}")
-    return lines
+    return lines + ([f"motion: {result.motion}"] if result.motion else [])
 
 
 @contextmanager

@@ -149,51 +149,43 @@ def segments(sequence: Extrinsics, false_alarms: float = FALSE_ALARMS, seed: int
 
 
 class _Sums:
-    """Cumulative sums of a sequence, from which the cost of any segment [i, j) follows."""
+    """Cumulative sums of a sequence, from which the cost of any segment [i, j) follows: of inverse covariances, W (n + 1, 6, 6),
+    and of the values weighted by them, v (n + 1, 6)."""
 
     def __init__(self, sequence: Extrinsics) -> None:
         W = np.linalg.inv(sequence.covariances)
         v = np.einsum("nij,nj->ni", W, sequence.values)
         self.n = len(sequence)
-        self._W, self._v, self._square = (
+        self.W, self.v, self._square = (
             np.concatenate([np.zeros((1, *own.shape[1:])), np.cumsum(own, axis=0)])
             for own in (W, v, np.einsum("ni,ni->n", v, sequence.values))
         )
 
     def cost(self, starts: NDArray[np.intp], end: int) -> Matrix:
         """Sum of squared distances to their mean of the segments [start, end) that begin at `starts` (m,)."""
-        v = self._v[end] - self._v[starts]
-        mean = np.linalg.solve(self._W[end] - self._W[starts], v[..., None])[..., 0]
+        v = self.v[end] - self.v[starts]
+        mean = np.linalg.solve(self.W[end] - self.W[starts], v[..., None])[..., 0]
         return np.asarray(np.maximum(self._square[end] - self._square[starts] - np.einsum("ni,ni->n", v, mean), 0.0))
 
     def mean(self, start: int, end: int) -> tuple[Matrix, Matrix]:
         """Mean (6,) of a segment and its covariance (6, 6)."""
-        C = np.linalg.inv(self._W[end] - self._W[start])
-        return C @ (self._v[end] - self._v[start]), C
+        C = np.linalg.inv(self.W[end] - self.W[start])
+        return C @ (self.v[end] - self.v[start]), C
 
     def distance(self, k: int, start: int, end: int) -> float:
         """Squared distance of element k to the mean of the others in its segment."""
         whole = self.cost(np.array([start]), end)[0]
-        W, v = (own[end] - own[start] - own[k + 1] + own[k] for own in (self._W, self._v))
+        W, v = (own[end] - own[start] - own[k + 1] + own[k] for own in (self.W, self.v))
         square = self._square[end] - self._square[start] - self._square[k + 1] + self._square[k]
         return float(whole - (square - v @ np.linalg.solve(W, v)))
 
 
 def _best_starts(sums: _Sums, penalty: float) -> list[int]:
     """Starts of the segments with the least sum of costs and penalties."""
-    best, previous = np.zeros(sums.n + 1), np.zeros(sums.n + 1, np.intp)
-    best[0] = -penalty
-    for end in range(1, sums.n + 1):
-        starts = np.arange(end)
-        total = best[:end] + penalty + sums.cost(starts, end)
-        previous[end] = int(np.argmin(total))
-        best[end] = total[previous[end]]
-    out: list[int] = []
-    end = sums.n
-    while end > 0:
-        end = int(previous[end])
-        out.append(end)
-    return out[::-1]
+    previous, out = _best_partitions(sums.W, sums.v[:, None], penalty)[0], [sums.n]
+    while out[0] > 0:
+        out.insert(0, int(previous[out[0], 0]))
+    return out[:-1]
 
 
 def _outlier(sums: _Sums, starts: list[int], penalty: float, outlier_penalty: float) -> int | None:
@@ -224,8 +216,8 @@ def change_penalty(covariances: Matrix, false_alarms: float, seed: int = 0) -> f
         return float(chdtri(6, false_alarms))
     probability = -np.expm1(-false_alarms * n)
     count = int(np.clip(EXCEEDING / probability, FEWEST, MOST))
-    W = np.linalg.inv(covariances)
-    before, total = np.cumsum(W, axis=0)[:-1], W.sum(axis=0)
+    *_, total = summed = np.cumsum(np.linalg.inv(covariances), axis=0)
+    before = summed[:-1]
     share = before @ np.linalg.inv(total)
     G = np.linalg.inv(before) + np.linalg.inv(total - before)
     half = np.linalg.cholesky((G + np.swapaxes(G, 1, 2)) / 2)
@@ -240,7 +232,8 @@ def change_penalty(covariances: Matrix, false_alarms: float, seed: int = 0) -> f
         own = chosen - first
         alarming.append(sums[:, own[(own >= 0) & (own < sums.shape[1])]])
         first += sums.shape[1]
-    per_alarm = float(_number_of_changes(covariances, np.concatenate(alarming, axis=1), penalty).mean())
+    W, v = (np.concatenate([np.zeros((1, *own.shape[1:])), own]) for own in (summed, np.concatenate(alarming, axis=1)))
+    per_alarm = float(_best_partitions(W, v, penalty)[1].mean())
     return float(np.quantile(largest, 1 - min(probability, false_alarms * n / per_alarm)))
 
 
@@ -254,19 +247,17 @@ def _simulated(covariances: Matrix, count: int, seed: int) -> Iterator[Matrix]:
         yield np.cumsum(noise @ np.swapaxes(roots, 1, 2), axis=0)
 
 
-def _number_of_changes(covariances: Matrix, sums: Matrix, penalty: float) -> Matrix:
-    """Changes (m,) in the best partition of each sequence; the same as `_best_starts`, for many with the same covariances. sums:
-    (n, m, 6), see `_simulated`."""
-    n, m = sums.shape[:2]
-    W = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(np.linalg.inv(covariances), axis=0)])
-    v = np.concatenate([np.zeros((1, m, 6)), sums])
-    best, changes = np.zeros((n + 1, m)), np.zeros((n + 1, m))
+def _best_partitions(W: Matrix, v: Matrix, penalty: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """For sequences with the same covariances, the start (n + 1, m) of the last segment of the best partition up to each end, and
+    the number of changes (m,) in that of the whole. W: (n + 1, 6, 6) and v: (n + 1, m, 6), see `_Sums`."""
+    n, m = len(v) - 1, v.shape[1]
+    best, (starts, changes) = np.zeros((n + 1, m)), np.zeros((2, n + 1, m), np.intp)
     best[0], changes[0] = -penalty, -1
     for end in range(1, n + 1):
         inverse = np.linalg.inv(W[end] - W[:end])
         own = v[end] - v[:end]
         # The squares of the values are the same in every partition, and left out.
         total = best[:end] + penalty - np.einsum("smi,sij,smj->sm", own, inverse, own, optimize=True)
-        start = np.argmin(total, axis=0)
-        best[end], changes[end] = total[start, np.arange(m)], changes[start, np.arange(m)] + 1
-    return changes[n]
+        starts[end] = np.argmin(total, axis=0)
+        best[end], changes[end] = total[starts[end], np.arange(m)], changes[starts[end], np.arange(m)] + 1
+    return starts, changes[n]

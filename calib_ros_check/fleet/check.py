@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import json
 import os
-import resource
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -68,7 +67,7 @@ def run_checks(options: CheckOptions, jobs: Sequence[Recording]) -> list[Answer]
     for job in jobs:
         with contextlib.suppress(OSError):  # no Linux, or forbidden: the peak is then that of all jobs until now
             Path("/proc/self/clear_refs").write_text("5")
-        cpu, read = time.process_time(), _bytes_read()
+        cpu, read = time.process_time(), _own("io", "rchar")
         own = replace(options, camera=job.camera or options.camera, frames=job.frames or options.frames)
         try:
             found = as_row(check_recording(job.path, own)) if own.rig else check_source(job.path, own).result.to_dict()
@@ -82,8 +81,8 @@ def run_checks(options: CheckOptions, jobs: Sequence[Recording]) -> list[Answer]
                 answer = {"error": nowhere, "from": OTHER}
         except Exception as error:
             answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}", "from": OTHER}
-        used = {"cpu_s": round(time.process_time() - cpu, 3), "bytes_read": _bytes_read() - read, "peak_bytes": _peak()}
-        answers.append(answer | used)
+        used = {"bytes_read": _own("io", "rchar") - read, "peak_bytes": 1024 * _own("status", "VmHWM")}
+        answers.append({**answer, "cpu_s": round(time.process_time() - cpu, 3), **used})
     return answers
 
 
@@ -93,21 +92,13 @@ def lost(jobs: Sequence[Recording], how: str) -> list[Answer]:
     return [{"error": f"the check of {job.path} did not end: {how}; {advice}", "from": OTHER} for job in jobs]
 
 
-def _bytes_read() -> int:
-    """By this process since its start, from files and pipes, be they in memory or not."""
+def _own(file: str, name: str) -> int:
+    """What Linux tells of this process; "rchar" is read from files and pipes, be they in memory or not."""
     try:
-        fields = dict(line.split(":") for line in Path("/proc/self/io").read_text().splitlines())
-        return int(fields["rchar"])
+        fields = dict(line.split(":", 1) for line in Path("/proc/self", file).read_text().splitlines())
+        return int(fields[name].split()[0])
     except (OSError, KeyError, ValueError):  # no Linux, or hidden in a container
         return 0
-
-
-def _peak() -> int:
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
-    except (OSError, StopIteration):
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1024 if os.uname().sysname == "Linux" else 1)
 
 
 def check_fleet(

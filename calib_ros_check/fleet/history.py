@@ -259,13 +259,11 @@ def certificate_of(own: Vehicle, tolerance: Tolerance) -> Certificate:
     T = np.array(result["T_checked"])
     if len(own.known) <= 1:
         T_found = None if result["T_estimated"] is None else np.array(result["T_estimated"])
-        # What the check has found, out of its JSON.
-        parts = []
-        for told in (result["rotation"], result["translation"], *result["axes"]):
-            numbers: dict[str, Any] = {name: np.nan if value is None else value for name, value in told.items()}
-            parts.append(Deviation(**numbers | {"verdict": CheckVerdict(told["verdict"])}))
+        told = result["rotation"], result["translation"], *result["axes"]  # what the check has found, out of its JSON
+        known: list[dict[str, Any]] = [{name: np.nan if value is None else value for name, value in one.items()} for one in told]
+        turn, shift, *axes = (Deviation(**one | {"verdict": CheckVerdict(one["verdict"])}) for one in known)
         p_within = np.nan if result["p_within"] is None else result["p_within"]
-        judgement = Judgement(CheckVerdict(result["verdict"]), p_within, parts[0], parts[1], tuple(parts[2:]))
+        judgement = Judgement(CheckVerdict(result["verdict"]), p_within, turn, shift, tuple(axes))
         return Certificate(own, best.verdict, best.message, judgement, T, T_found, best.cause, best)
     # Each segment between changes. What intrinsics and clocks leave open is common to all recordings, and no more certain for
     # their number.

@@ -225,9 +225,8 @@ def as_row(found: RigCheck) -> dict[str, Any]:
     histories are of one extrinsic. BadInputError where no camera was checked."""
     checks = [pair.check for pair in found.pairs if pair.check is not None]
     if not checks:
-        raise BadInputError(
-            f"{found.source}: {'; '.join(p.reason for p in found.pairs) or 'no camera shares a view with a LiDAR'}"
-        )
+        reasons = "; ".join(p.reason for p in found.pairs) or "no camera shares a view with a LiDAR"
+        raise BadInputError(f"{found.source}: {reasons}")
     worst = min(checks, key=lambda check: (FAIL, INCONCLUSIVE, PASS).index(check.verdict))
     return worst.to_dict() | {"verdict": found.verdict.value, "reason": found.reason, "T_estimated": None, "covariance": None}
 

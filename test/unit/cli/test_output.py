@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib_ros.cli.output import print_or_save
+from calib_ros.cli.output import checked_by, print_or_save
 from calib_ros.errors import BadInputError
 from calib_ros.result import Result, load
 
@@ -34,6 +34,16 @@ def test_a_result_is_saved_though_nobody_reads_on(path: str, no_reader: int, tmp
     assert capfd.readouterr().err == ("in words\n" if path == "-" else "")
     if path != "-":
         assert np.array_equal(load(where).T_camera_lidar, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("positions", "count", "others"),
+    [(range(4), 8, "4,5,6,7"), (range(0, 8, 2), 8, "1,3,5,7"), (range(0, 40, 10), 40, "2,6,11,14,18,22,26,31,34,38")],
+)
+def test_what_was_estimated_is_to_be_checked_by_other_frames(positions: range, count: int, others: str) -> None:
+    told = checked_by(["calibrate", "drive", "--frames", "some", "--initial", "start.yaml"], "result.json", positions, count)
+    assert told == f"judged by other frames: calib-ros check drive --extrinsic result.json --frames {others}"
+    assert "--frames ::2" in checked_by(["calibrate", "drive"], None, range(count), count)
 
 
 def test_a_result_that_cannot_be_saved_is_still_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -353,14 +353,9 @@ def test_missing_types_and_pairs_are_named(tmp_path):
         BagSource(tmp_path / "bag")
     with Recorder(tmp_path / "planar") as record:
         record.image(START)
-        fields = dict.fromkeys(
-            ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max"), 0.0
-        )
-        none = np.zeros(0, np.float32)
-        scan = record.ros.make(
-            "sensor_msgs/msg/LaserScan", header=record.ros.header(START, "s"), ranges=none, intensities=none, **fields
-        )
-        record.write("/scan", scan, START)
+        names = ["angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max"]
+        values = dict.fromkeys(names, 0.0) | dict.fromkeys(("ranges", "intensities"), np.zeros(0, np.float32))
+        record.write("/scan", record.ros.make("sensor_msgs/msg/LaserScan", header=record.ros.header(START, "s"), **values), START)
     with pytest.raises(BadInputError, match="LaserScan: a scan of one plane"):
         BagSource(tmp_path / "planar")
     with pytest.raises(BadInputError, match="nothing at all"):
