@@ -35,7 +35,7 @@ from calib_ros_check.rig.shown import EdgeShown, RigShown, SensorShown
 from calib_ros_check.tolerance import TITLES, Judgement, amount, signed
 
 PICTURES = 3
-MAX_WIDTH = 700  # px of a picture on the page
+MAX_WIDTH = 1200  # px of a picture; on the page fewer, unless one zooms in
 QUALITY = 85  # of JPEG
 STYLE = """\
 .verdict { display: inline-block; padding: .25rem .9rem; border-radius: 6px; color: #fff; font-weight: 700; font-size: 1.2rem; }

@@ -286,9 +286,9 @@ def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
     found = json.loads(files[0].read_text())
     assert found["verdict"] == "pass"
     Result(np.array(found["T_estimated"]), CONVERGED, frame_names=tuple(found["frames"]), frame_scores=(1.0, 1.0)).save(files[0])
-    assert main.main(["check", SOURCE, "--frames", "0,2", "--extrinsic", str(files[0]), "--verbose"]) == 0
+    assert main.main(["check", SOURCE, "--frames", "1,2", "--extrinsic", str(files[0]), "--verbose"]) == 0
     reason, *_, stages = capsys.readouterr().out.splitlines()
-    assert reason.startswith("pass: by the frames that it was made from, which cannot refute it")
+    assert reason.startswith("pass: by 1 of 2 frames that it was made from, which cannot refute it")
     assert [own.split()[0] for own in stages.split(": ")[1].split(", ")] == ["reading", "features", "search", "causes"]
     page = files[1].read_text()
     assert "data:image/jpeg;base64," in page
