@@ -25,6 +25,7 @@ OFF = "turned or shifted, the extrinsic matches"
 SIGNIFICANT_SIGMAS = 3.0  # of an offset of the clocks: a right extrinsic must hardly ever fail by one
 REPORTED_SIGMAS = 2.0  # of the interval in a message
 PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
+UNKNOWN_MOTION = "no frame's motion is known; it does not matter to those of a standing vehicle"
 KNOW_CLOCKS = "drive at changing speeds and through turns, or state motion.time_offset_s with motion.time_offset: fixed"
 
 
@@ -43,8 +44,9 @@ def clock_finding(
     if result.time_offset_s is None or result.time_offset_sigma_s is None:
         if config.time_offset != ESTIMATE:
             return finding(CauseState.NOT_JUDGED, "the clocks are taken as stated (motion.time_offset: fixed)")
-        why = "all frames move alike, or their motion is not known" if len(features) > 1 else "one frame does not tell"
-        return finding(CauseState.NOT_JUDGED, f"the offset of the clocks is not known: {why}; {KNOW_CLOCKS}")
+        why = ("all frames move alike" if len(features) > 1 else "one frame does not tell") + f"; {KNOW_CLOCKS}"
+        why = why if any(f.twist is not None for f in features) else UNKNOWN_MOTION
+        return finding(CauseState.NOT_JUDGED, f"the offset of the clocks is not known: {why}")
     sigma = result.time_offset_sigma_s
     values = {"seconds": seconds, "sigma_s": sigma}
     twists = np.array([f.twist for f in features if f.twist is not None])

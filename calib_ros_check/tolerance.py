@@ -207,23 +207,21 @@ def reason_of(
         return joined([cause.message, _THEN[judgement.verdict].format(limits=tolerance, sizes=judgement.sizes)])
     if judgement.verdict is CheckVerdict.PASS:
         return f"right to within {tolerance}: {judgement.sizes}"
-    # The axes that fail, or else those that are inconclusive; those that are off first, and the largest of them.
-    by_verdict = ([own for own in judgement.axes if own.verdict is v] for v in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE))
+    sizes, others = (judgement.rotation, judgement.translation), [f"or else {own.message}" for own in possible]
+    # The axes that fail, or are inconclusive, or else what does so in all; those that are off first, and the largest of them.
     worst = sorted(
-        next(filter(None, by_verdict), []),
+        (own for own in judgement.axes if own.verdict is judgement.verdict),
         key=lambda own: (not own.is_off, -abs(own.error) * (1.0 if own.name[0] == "r" else 5.0)),
     )
-    others = [f"or else {own.message}" for own in possible]
     if judgement.verdict is CheckVerdict.FAIL:
-        both = (f"{own.name} {own.words}" for own in (judgement.rotation, judgement.translation))
-        first, *axes = [own.words for own in worst if own.is_off] or both
-        return joined([f"{first}: estimate anew", *axes, f"more than {tolerance}", *others])
+        in_all = sorted(sizes, key=lambda own: own.verdict is not CheckVerdict.FAIL)
+        first, *more = [own.words for own in worst] or [f"{own.name} {own.words}" for own in in_all]
+        return joined([f"{first}: estimate anew", *more, f"more than {tolerance}", *others])
     names = ", ".join(f"{own.name} {own.words}" for own in worst) or judgement.sizes
     known = f"not known to within {tolerance}"
     if any(own.is_off for own in worst or judgement.axes):  # that the extrinsic is wrong is known, only not by how much
-        turn, shift = judgement.rotation, judgement.translation
-        largest = turn if turn.error / tolerance.deg > shift.error / tolerance.m else shift
-        known = f"{largest.words}, perhaps within {tolerance}"
+        largest = max(sizes, key=lambda own: own.error / (tolerance.deg if own is judgement.rotation else tolerance.m))
+        known = f"off by about {amount(largest.error, largest is sizes[0])}, not surely by more than {tolerance}"
     return joined([f"{known}: {MORE_FRAMES}", names, *others])
 
 

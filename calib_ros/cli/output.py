@@ -93,7 +93,7 @@ def checked_by(given: Sequence[str], path: str | None, positions: Sequence[int],
     """How frames of the source that are not at these positions can judge what was made of those that are."""
     rest, unsaved = sorted({*range(count)} - {*positions}), "" if path else "not saved: --json FILE writes it; "
     if not rest:
-        return f"{unsaved}no frame is left to judge it: {again(given, '--frames ::2')[0]} leaves half of them"
+        return f"{unsaved}judged by another drive, or by half of the frames, left out by --frames ::2: calib-ros check"
     others, file = ",".join(str(rest[k]) for k in spread_positions(CHECKED_BY, len(rest))), shlex.quote(path or "FILE")
     return f"{unsaved}judged by other frames: {again(given, f'--extrinsic {file} --frames {others}', 'check')[1]}"
 
@@ -122,10 +122,12 @@ def summary(result: Result, advice: str = "", command: tuple[str, str] = ("", ""
     lines += [f"advice: {advice}"] if advice else []
     named = f"T_{result.camera_frame}_{result.lidar_frame}" + ", the start" * (not result.converged)
     lines += [f"{named}  {pose(result.T_camera_lidar)}"]
-    for lens, C in (("as stated", result.covariance), ("off as usual (camera.focal_sigma)", result.covariance_with_intrinsics)):
+    for lens, C in (("exact", result.covariance), ("as usual (camera.focal_sigma)", result.covariance_with_intrinsics)):
         if C is not None:
             rx, ry, rz, x, y, z = np.sqrt(np.diag(C)) * ([np.rad2deg(1.0)] * 3 + [100.0] * 3)
-            lines.append(f"1 sigma, intrinsics {lens}: rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg, x {x:.1f} y {y:.1f} z {z:.1f} cm")
+            lines.append(
+                f"1 sigma if the intrinsics are {lens}: rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg, x {x:.1f} y {y:.1f} z {z:.1f} cm"
+            )
     if result.refined_camera is not None:
         lines.append(refined_words(result.refined_camera))
     if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
@@ -179,9 +181,7 @@ def _clocks(result: Result) -> str:
 
 def _details(result: Result) -> list[str]:
     """Agreement of the search, outlier frames, motion."""
-    lines = []
-    if result.starts is not None:
-        lines.append(f"search: {result.starts[0]} of {result.starts[1]} independent starts ended here")
+    lines = ["search: {} of {} independent starts ended here".format(*result.starts)] if result.starts else []
     if result.evidence is not None:
         lines.append(f"halves of the edges disagree by {result.evidence.disagreement:.1f}, 1 is as expected")
     scores = dict(zip(result.frame_names, result.frame_scores, strict=False))

@@ -50,7 +50,7 @@ def without_motion(frame: Frame, config: MotionConfig) -> str:
     if config.from_scans == "never":
         return "motion.from_scans is never"
     if frame.cloud_stamp is None:
-        return "the clouds have no stamps (a folder's times.csv gives them)"
+        return "the clouds have no stamps (recorded ones belong in times.csv)"
     # By azimuth only if configured: drivers differ, and a wrong guess moves points farther than the vehicle did.
     timed = config.from_scans == "always" or has_times(frame.cloud)
     return "" if timed else frame.cloud.time_problem or "points have no times (motion.from_scans: always goes by azimuth)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from calib_ros.config import Config, MotionConfig, SearchConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.registration.judgement.hypotheses import fisheyes, other_lenses, rectified_otherwise, resized, turned_over
 from calib_ros.result import CONVERGED, Cause, Result
-from calib_ros_check.causes import KNOW_CLOCKS, clock_finding
+from calib_ros_check.causes import KNOW_CLOCKS, UNKNOWN_MOTION, clock_finding
 from calib_ros_check.checker import Checker, CheckInputs
 from calib_ros_check.outcome import CauseState, CheckVerdict, Tolerance
 
@@ -95,12 +96,13 @@ def test_raw_images_that_are_taken_for_rectified_are_to_be_taken_as_raw():
 @pytest.mark.parametrize(("count", "why"), [(1, "one frame does not tell"), (3, "all frames move alike")])
 def test_what_is_not_known_of_the_clocks_comes_with_what_to_do(count, why):
     motion, result = MotionConfig(), Result(np.eye(4), CONVERGED)
-    told = clock_finding([None] * count, result, 0.0, Tolerance(), motion)
-    assert told.state is CauseState.NOT_JUDGED
-    assert why in told.message
-    assert told.message.endswith(f"; {KNOW_CLOCKS}")
-    stated = clock_finding([None] * count, result, 0.0, Tolerance(), replace(motion, time_offset="fixed"))
-    assert stated.state is CauseState.NOT_JUDGED
+    told, unknown = (
+        clock_finding([SimpleNamespace(twist=own)] * count, result, 0.0, Tolerance(), motion) for own in (np.zeros(6), None)
+    )
+    assert told.message.endswith(f"{why}; {KNOW_CLOCKS}")
+    assert unknown.message.endswith(UNKNOWN_MOTION)
+    stated = clock_finding([], result, 0.0, Tolerance(), replace(motion, time_offset="fixed"))
+    assert told.state is unknown.state is stated.state is CauseState.NOT_JUDGED
     assert "taken as stated" in stated.message
 
 

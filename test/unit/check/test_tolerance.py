@@ -75,7 +75,7 @@ def test_a_cause_is_a_cure_only_where_the_extrinsic_is_right_with_it_mended(m, k
 def test_an_error_that_is_seen_is_told_also_where_it_may_be_within_the_tolerance():
     near, C = Tolerance(0.5, 0.1), np.diag([np.deg2rad(0.05) ** 2] * 3 + [0.02**2] * 3)
     off = judge(se3.perturb(TRUTH, [0, 0, 0], [0.06, 0.09, 0]), TRUTH, C, near)
-    assert reason_of(off, near, None).startswith(f"{off.translation.words}, perhaps within 0.5 deg / 10 cm: use more frames")
+    assert reason_of(off, near, None).startswith("off by about 10.0 cm, not surely by more than 0.5 deg / 10 cm: use more frames")
     assert [axis.words.endswith("LiDAR (+- 3.9 cm), within the tolerance") for axis in off.axes[3:]] == [True, False, False]
 
 
