@@ -159,6 +159,7 @@ def test_a_cloud_in_another_frame_of_the_vehicle_is_named(drive, checker):
     assert len(causes) == len(result.causes)
 
 
+@pytest.mark.slow
 def test_a_mount_that_is_far_off_is_no_cloud_in_the_body_frame(drive, checker):
     """Cameras that look ahead, next to the scanner, have about the extrinsic that such a cloud would have."""
     frames, truth = drive

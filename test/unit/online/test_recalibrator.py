@@ -133,6 +133,7 @@ def test_estimate_waits_for_min_keyframes_and_the_buffer_keeps_the_newest(drive,
 # --- what goes wrong ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_where_three_estimates_in_a_row_match_nothing_what_was_mixed_up_is_told(drive, truth, monkeypatch):
     upside_down = [replace(frame, image=np.ascontiguousarray(frame.image[::-1, ::-1])) for frame in drive]
     recalibrator, asked = taken_in(upside_down, truth), []
