@@ -41,9 +41,9 @@ DIRECTIONS = {
     "rx": ("camera looks {} too far down", "camera looks {} too far up", "camera looks backwards, turned over by {}"),
     "ry": ("camera looks {} too far left", "camera looks {} too far right", "camera looks backwards, turned by {}"),
     "rz": ("camera is rolled {} too far anticlockwise", "camera is rolled {} too far clockwise", "camera is upside down, by {}"),
-    "tx": ("camera is {} too far left of the LiDAR", "camera is {} too far right of the LiDAR"),
-    "ty": ("camera is {} too far above the LiDAR", "camera is {} too far below the LiDAR"),
-    "tz": ("camera is {} too far behind the LiDAR", "camera is {} too far in front of the LiDAR"),
+    "tx": ("camera is {} too far left", "camera is {} too far right"),
+    "ty": ("camera is {} too high", "camera is {} too low"),
+    "tz": ("camera is {} too far back", "camera is {} too far ahead"),
 }
 # The extrinsic with a cause that was found mended, as far as a check can do that.
 _THEN = {
@@ -218,7 +218,7 @@ def reason_of(
         first, *more = [own.words for own in worst] or [f"{own.name} {own.words}" for own in in_all]
         return joined([f"{first}: estimate anew", *more, f"more than {tolerance}", *others])
     names = ", ".join(f"{own.name} {own.words}" for own in worst) or judgement.sizes
-    known = f"not known to within {tolerance}"
+    known = f"not known to within {tolerance}" + " in all" * (not worst)  # each axis may be, and their length not
     if any(own.is_off for own in worst or judgement.axes):  # that the extrinsic is wrong is known, only not by how much
         largest = max(sizes, key=lambda own: own.error / (tolerance.deg if own is judgement.rotation else tolerance.m))
         known = f"off by about {amount(largest.error, largest is sizes[0])}, not surely by more than {tolerance}"

@@ -76,7 +76,7 @@ def test_an_error_that_is_seen_is_told_also_where_it_may_be_within_the_tolerance
     near, C = Tolerance(0.5, 0.1), np.diag([np.deg2rad(0.05) ** 2] * 3 + [0.02**2] * 3)
     off = judge(se3.perturb(TRUTH, [0, 0, 0], [0.06, 0.09, 0]), TRUTH, C, near)
     assert reason_of(off, near, None).startswith("off by about 10.0 cm, not surely by more than 0.5 deg / 10 cm: use more frames")
-    assert [axis.words.endswith("LiDAR (+- 3.9 cm), within the tolerance") for axis in off.axes[3:]] == [True, False, False]
+    assert [axis.words.endswith("(+- 3.9 cm), within the tolerance") for axis in off.axes[3:]] == [True, False, False]
 
 
 def test_samples_of_few_degrees_of_freedom_have_students_tails():
@@ -130,8 +130,8 @@ def test_the_error_is_that_of_eq_2_19_and_its_covariance_follows_a_twist_of_the_
         ([0, 0, -2], [0, 0, 0], "camera is rolled * too far clockwise"),
         ([0, -179, 0], [0, 0, 0], "camera looks backwards, turned by 179 deg"),
         ([0, 0, 178], [0, 0, 0], "camera is upside down, by 178 deg"),
-        ([0, 0, 0], [0.3, 0, 0], "camera is * too far left of the LiDAR"),
-        ([0, 0, 0], [0, -0.3, 0], "camera is * too far below the LiDAR"),
+        ([0, 0, 0], [0.3, 0, 0], "camera is * too far left"),
+        ([0, 0, 0], [0, -0.3, 0], "camera is * too low"),
     ],
 )
 def test_the_direction_is_told_in_words(deg, m, words):
