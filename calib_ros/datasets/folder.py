@@ -105,7 +105,7 @@ class FolderSource:
             "kind": "folder",
             "path": str(self.path),
             "frames": f"{len(self)}, names {self.names[0]} to {self.names[-1]}; left out: {left_out}",
-            "stamps": TIMES if self._has_times else f"10 Hz assumed, no {TIMES}",
+            "stamps": TIMES if self._has_times else f"none, no {TIMES}: the vehicle's motion is not corrected",
             "points": f"{len(first)} in the first cloud, with {', '.join(['x, y, z', *fields])}",
             "camera": describe_camera(self.camera) + "".join(f"; not {name}" for name in self._other_cameras),
             "camera_frame": self.camera_frame,
