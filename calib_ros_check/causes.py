@@ -25,7 +25,7 @@ OFF = "turned or shifted, the extrinsic matches"
 SIGNIFICANT_SIGMAS = 3.0  # of an offset of the clocks: a right extrinsic must hardly ever fail by one
 REPORTED_SIGMAS = 2.0  # of the interval in a message
 PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
-UNKNOWN_MOTION = "no frame's motion is known; it does not matter to those of a standing vehicle"
+UNKNOWN_MOTION = "the vehicle's motion is unknown; use frames in which it stands, or give stamps and point times, or odometry"
 KNOW_CLOCKS = "drive at changing speeds and through turns, or state motion.time_offset_s with motion.time_offset: fixed"
 
 

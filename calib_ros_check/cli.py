@@ -17,7 +17,7 @@ from calib_ros.datasets.folder import is_folder_rig
 from calib_ros.datasets.source import selected
 from calib_ros.errors import BadInputError
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros.result import VERSION, Cause, load
+from calib_ros.result import VERSION, Cause
 from calib_ros.rig.description import read_rig
 from calib_ros_check.fleet.check import check_fleet
 from calib_ros_check.fleet.fleet import Fleet, FleetOptions
@@ -86,11 +86,11 @@ def next_command(args: argparse.Namespace, checked: Checked) -> tuple[str, str]:
     """By which what is wrong is mended, or more is found out, see `again`; empty where none does."""
     result, cause, given = checked.result, checked.result.cause, args.given
     if result.verdict is not CheckVerdict.FAIL:
-        made = () if args.extrinsic in ("reference", TF) else load(args.extrinsic).frame_names
-        used = checked.in_all if result.verdict is CheckVerdict.PASS else max(len(checked.frames), len(made))
-        if not (more := more_frames(used, checked.in_all)) or args.extrinsic in ("reference", TF):
-            return again(given, more)
-        return again(given, f"--initial {shlex.quote(args.extrinsic)} {more}", "calibrate")  # a check would hold none back
+        more = more_frames(max(len(checked.frames), checked.made), checked.in_all) * (result.verdict is CheckVerdict.INCONCLUSIVE)
+        # An estimate by all frames tells more, where a check by those it was made from would not.
+        return again(
+            given, *((f"--initial {shlex.quote(args.extrinsic)} {more}", "calibrate") if more and checked.made else (more,))
+        )
     if cause is Cause.NOT_RECTIFIED and checked.frames[0].camera.said_rectified:
         return again(given, "--no-rectified")
     if cause is Cause.ALREADY_RECTIFIED or (cause is not None and not cause.options):

@@ -53,13 +53,14 @@ class CheckOptions:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A check with what it was made of. source: name of the recording, of `in_all` frames. config: by which it was checked."""
+    """A check with what it was made of. source: name of the recording, of `in_all` frames. made: how many the extrinsic is of."""
 
     result: CheckResult
     frames: Sequence[Frame]
     source: str
     config: Config
     in_all: int
+    made: int = 0
 
 
 def check_source(
@@ -92,7 +93,7 @@ def check_source(
         camera_frame=source.camera_frame,
         lidar_frame=source.lidar_frame,
     )
-    return Checked(found, frames, source.name, options.config, len(source))
+    return Checked(found, frames, source.name, options.config, len(source), len(made))
 
 
 def positions_of(source: Source, options: CheckOptions) -> list[int]:

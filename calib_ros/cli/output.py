@@ -90,10 +90,10 @@ def more_frames(used: int, of_all: int) -> str:
 
 
 def checked_by(given: Sequence[str], path: str | None, positions: Sequence[int], count: int) -> str:
-    """How frames of the source that are not at these positions can judge what was made of those that are."""
+    """How the others of `count` frames can judge what was made of those at `positions`. given: as of `again`; path: of --json."""
     rest, unsaved = sorted({*range(count)} - {*positions}), "" if path else "not saved: --json FILE writes it; "
     if not rest:
-        return f"{unsaved}judged by another drive, or by half of the frames, left out by --frames ::2: calib-ros check"
+        return f"{unsaved}judge it by another drive, or by frames that are left out, as by --frames ::2: calib-ros check"
     others, file = ",".join(str(rest[k]) for k in spread_positions(CHECKED_BY, len(rest))), shlex.quote(path or "FILE")
     return f"{unsaved}judged by other frames: {again(given, f'--extrinsic {file} --frames {others}', 'check')[1]}"
 
