@@ -21,7 +21,9 @@ from calib_ros import se3
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import stamp_ns
 from calib_ros.online import events
+from calib_ros.ros import inputs
 from calib_ros.ros.conversions import image_message, time_message
+from calib_ros.ros.diagnostics import SILENCE_S
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 PERIOD = NANOSECONDS // 10
@@ -53,6 +55,7 @@ def test_scans_stamped_at_their_end_pair_with_the_images_in_their_middle(street,
 
 def test_a_stream_with_lost_messages_is_named_until_it_ends(street, monkeypatch, capfd):
     monkeypatch.setattr(events, "REPEAT_S", 0.0)  # no line is left out
+    monkeypatch.setattr(inputs, "SILENCE_S", SILENCE_S)
     lost = np.random.default_rng(0).random(600) < 0.5
     with Peer() as peer:
         driver = peer.peer.create_publisher(Image, "image", BEST_EFFORT)

@@ -6,9 +6,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import threading
+import time
 from dataclasses import replace
 from functools import partial
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -248,29 +248,25 @@ def test_an_extrinsic_is_usable_only_while_data_come(peer, street):
 
 
 def test_usable_outlives_a_lack_of_cpu_time_for_a_while(peer, street, monkeypatch):
-    """Pairs come, but nobody gets to look at them."""
-    looked, decode = threading.Event(), peer.pipeline._inputs.decode
+    """A pair has come just now, but nobody gets to look at it."""
+    looked, decode, most = threading.Event(), peer.pipeline._inputs.decode, 3600.0
     inputs = dataclasses.replace(peer.pipeline._inputs, decode=lambda *pair: (looked.wait(), decode(*pair))[1])
     monkeypatch.setattr(peer.pipeline, "_inputs", inputs)
-    peer.change(max_data_age_s=AGE_S)
-    later = (
-        dataclasses.replace(frame, stamp=street[-1].stamp + 2 * k * NANOSECONDS, cloud_stamp=None)
-        for k, frame in enumerate(cycle(street), 1)
-    )
 
-    def said(usable: bool) -> Extrinsic:
-        def found() -> Extrinsic | None:
-            peer.publish(next(later), settle=False)
-            msg = peer.extrinsics[-1]
-            return msg if msg.usable == usable and "starved" in msg.reason else None
+    def said(usable: bool, age_s: float) -> bool:
+        """What is said while the newest pair that was looked at is so old."""
+        peer.pipeline._received = time.monotonic() - age_s
+        msg = peer.until(lambda: peer.extrinsics[-1] if seconds(peer.extrinsics[-1].data_age) >= age_s else None, "a message")
+        return msg.usable == usable and "starved" in msg.reason
 
-        return peer.until(found, f"starved, usable {usable}")
-
-    assert seconds(said(True).data_age) > AGE_S
-    assert seconds(said(False).data_age) > 3 * AGE_S
-    looked.set()
+    try:
+        peer.publish(dataclasses.replace(street[-1], stamp=street[-1].stamp + 2 * NANOSECONDS, cloud_stamp=None), settle=False)
+        peer.until(lambda: peer.pipeline.taking_in, "the pair")
+        assert said(True, 1.5 * most)
+        assert said(False, 3.5 * most)
+    finally:
+        looked.set()
     peer.settle()
-    peer.change(max_data_age_s=3600.0)
     peer.until(lambda: peer.extrinsics[-1].usable, "that there is time again")
 
 

@@ -111,8 +111,7 @@ def test_a_looping_bag_with_its_clock(street_bag, drive):
         _, err = player.communicate(timeout=LIMIT_S)
         assert player.returncode == 0, err
         assert "Traceback" not in err
-        assert int(later["keyframes so far"]) > int(first["keyframes so far"])
-        assert int(later["pairs"]) >= 0.8 * int(later["images"])
+        assert all(int(later[what]) > int(first[what]) for what in ("pairs", "keyframes so far"))
         assert "jumped back" in end(node)
 
 
