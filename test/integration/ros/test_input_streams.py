@@ -55,7 +55,6 @@ def test_scans_stamped_at_their_end_pair_with_the_images_in_their_middle(street,
 
 def test_a_stream_with_lost_messages_is_named_until_it_ends(street, monkeypatch, capfd):
     monkeypatch.setattr(events, "REPEAT_S", 0.0)  # no line is left out
-    monkeypatch.setattr(inputs, "SILENCE_S", SILENCE_S)
     lost = np.random.default_rng(0).random(600) < 0.5
     with Peer() as peer:
         driver = peer.peer.create_publisher(Image, "image", BEST_EFFORT)
@@ -71,6 +70,7 @@ def test_a_stream_with_lost_messages_is_named_until_it_ends(street, monkeypatch,
         assert not peer.warns("on /points")
         assert [peer.peer.count_subscribers(f"/{name}") for name in ("odom", "imu", "twist")] == [0, 0, 0]  # no motion_source
         assert "on /image get lost" in peer.last_error()
+        monkeypatch.setattr(inputs, "SILENCE_S", SILENCE_S)
         peer.until(lambda: not peer.calibration.health.losses, "that the driver has ended")
     told = [line for line in capfd.readouterr().err.splitlines() if "/image" in line]
     assert 2 <= len(told) <= 5, told
