@@ -51,7 +51,8 @@ class FolderSource:
         self.name = self.path.resolve().name
         self._images = named_files(self.path / IMAGES, IMAGE_SUFFIXES)
         self._calibration = calibration or camera_file(self.path)
-        read = read_camera(self._calibration, camera, self._first_size)
+        first = self._images[min(self._images, key=_natural)] if self._images else None
+        read = read_camera(self._calibration, camera, lambda: read_picture(first, "image").shape[1::-1] if first else (0, 0))
         self.camera, self.reference, self.camera_frame, self._other_cameras = read
         folder = clouds or self.path / CLOUDS
         self._clouds = named_files(folder, CLOUD_SUFFIXES)
@@ -112,11 +113,6 @@ class FolderSource:
             "lidar_frame": self.lidar_frame,
             "reference": "none" if self.reference is None else f"T_camera_lidar of {self._calibration.name}",
         }
-
-    def _first_size(self) -> tuple[int, int]:
-        """Width and height, px, of the first image; 0 without one."""
-        picture = read_picture(self._images[min(self._images, key=_natural)], "image") if self._images else np.zeros((0, 0))
-        return picture.shape[1], picture.shape[0]
 
     def _read_image(self, name: str) -> NDArray[np.uint8]:
         path, picture = self._images[name], read_picture(self._images[name], "image")

@@ -65,18 +65,15 @@ def fit_ground(
         if count.max() > most:
             most = int(count.max())
             best = Plane(normals[k + int(count.argmax())], float(offsets[k + int(count.argmax())]))
-    return None if best is None or most / len(few) < min_share else _refitted(best, xyz, threshold)
-
-
-def _refitted(plane: Plane, xyz: NDArray[np.float32], threshold: float) -> Plane:
-    """Least-squares plane of the inliers, if it has more of them."""
-    inliers = np.abs(plane.distance(xyz)) < threshold
+    if best is None or most / len(few) < min_share:
+        return None
+    inliers = np.abs(best.distance(xyz)) < threshold
     center = xyz[inliers].mean(axis=0, dtype=np.float64)
     offset_points = xyz[inliers] - center
     normal = np.linalg.eigh(offset_points.T @ offset_points)[1][:, 0]
     normal = normal * (-1.0 if normal[2] < 0 else 1.0)
-    better = Plane(normal, float(normal @ center))
-    return better if np.count_nonzero(np.abs(better.distance(xyz)) < threshold) > np.count_nonzero(inliers) else plane
+    fitted = Plane(normal, float(normal @ center))
+    return fitted if np.count_nonzero(np.abs(fitted.distance(xyz)) < threshold) > np.count_nonzero(inliers) else best
 
 
 def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float = 0.0) -> NDArray[np.int32]:

@@ -248,12 +248,9 @@ def distinct_poses(poses: Sequence[ScannerPose]) -> list[ScannerPose]:
 
 def axis_rotations() -> list[Matrix]:
     """The 23 rotations (3, 3) that exchange axes, turns about z first."""
-    out = []
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        R = np.zeros((3, 3))
-        R[np.arange(3), order] = signs
-        if np.linalg.det(R) > 0 and not np.allclose(R, np.eye(3)):
-            out.append(R)
+    signed = product(permutations(np.eye(3)), product((1.0, -1.0), repeat=3))
+    turns = (np.array(rows) * np.array(signs)[:, None] for rows, signs in signed)
+    out = [R for R in turns if np.linalg.det(R) > 0 and not np.allclose(R, np.eye(3))]
     return sorted(out, key=lambda R: (R[2, 2] < 0.5, round(float(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))), 6)))
 
 

@@ -158,16 +158,16 @@ class Judge:
                     own = None if one in done else self._confirmed(one, asked)
                     done.add(one)
                     odds = rare_odds(count) if own is None or not is_only_off(own, deg, m) else EVEN
-                    if own is not None and self._beyond_chance(own, count) and convinces(log_odds(own, given), odds):
-                        return own if asked.box is None or own.hypothesis.of_lens else self._simpler(own, tried, asked)
+                    if own is None or not self._beyond_chance(own, count) or not convinces(log_odds(own, given), odds):
+                        continue
+                    if asked.box is None or own.hypothesis.of_lens:
+                        return own
+                    # Or a simpler one that predicts about the same optimum as well: a rough start ranks none.
+                    simpler = (c for c in tried if c.hypothesis.rank < own.hypothesis.rank and not c.hypothesis.of_lens)
+                    rivals = [c for c in simpler if _distance(c.hypothesis.T, own.T) <= own.surprise + SLACK]
+                    others = (self._confirmed(c, asked) for c in rivals[:CONFIRMED])
+                    return simplest(own, [own, *(c for c in others if c is not None)])
         return None
-
-    def _simpler(self, found: Candidate, tried: Sequence[Candidate], asked: Question) -> Candidate:
-        """What was found, or a simpler hypothesis that predicts about the same optimum as well: a rough start ranks none."""
-        simpler = [own for own in tried if own.hypothesis.rank < found.hypothesis.rank and not own.hypothesis.of_lens]
-        rivals = [own for own in simpler if _distance(own.hypothesis.T, found.T) <= found.surprise + SLACK]
-        others = [self._confirmed(own, asked) for own in rivals[:CONFIRMED]]
-        return simplest(found, [found, *(own for own in others if own is not None)])
 
     def tried(self, asked: Question, guesses: Sequence[Hypothesis]) -> list[Candidate]:
         """The hypotheses that leave enough points in view, and say more than that the extrinsic is off, the best match first."""

@@ -29,6 +29,7 @@ from calib_ros.registration.judgement.refusal import GROSSLY, OPEN_PROBABILITY, 
 from calib_ros.registration.objective import SYSTEMATIC_ERROR
 from calib_ros.registration.score.chance import EvenPoints
 from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.score.sampler import MIN_DEPTH, slope_step
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, unlimited
 from calib_ros.registration.search.optimizers import NEAR_LEVELS, POINTS, REACH, JointView, ascend_jointly, linearised
 
@@ -331,18 +332,27 @@ def estimate_lens(
     n, part, free = len(unknowns), score.subset(POINTS, np.random.default_rng(0)), unlimited(T)
     see, as_it_is = _seeing(part, unknowns), np.zeros(n)
     T_given, _, lower = ascend_jointly(see, T, as_it_is, NEAR_LEVELS, free, free=np.zeros(n, bool))
-    starts = [(T, as_it_is, LEVELS), (T_given, as_it_is, NEAR_LEVELS)]
     # Few frames have several tops; and pictures that are rectified already are far from what is stated.
     radial, stated = np.array([own.name == RADIAL for own in unknowns], float), unknowns[-1].stated
     begun = (GROSS, -GROSS, -stated) if abs(stated) > GROSS else (GROSS, -GROSS)
-    starts += [(T, value * radial, LEVELS) for value in begun if radial.any()]
+    starts, aside = [(T, as_it_is), *((T, value * radial) for value in begun if radial.any())], []
     if turned is not None:
         across = se3.rotation_vector(T[:3, :3] @ turned[:3, :3].T)[:2] * score.camera.K[0, 0] / score.camera.width
         looks = {CENTRE[0]: across[1], CENTRE[1]: -across[0]}
-        change = np.array([looks.get(own.name, 0.0) for own in unknowns])
-        starts.append((se3.from_parts(turned[:3, :3], T[:3, 3]), change, LEVELS))
-    ends = [ascend_jointly(see, *start, free) for start in starts]
-    T, change, higher = max(ends, key=lambda end: end[2])
+        by = np.array([looks.get(own.name, 0.0) for own in unknowns])
+        aside = [ascend_jointly(see, se3.from_parts(turned[:3, :3], T[:3, 3]), by, LEVELS, free)]
+    for level in LEVELS:
+        starts += [(T_given, as_it_is)] if level == NEAR_LEVELS[0] else []
+        ends = sorted((ascend_jointly(see, *start, (level,), free) for start in starts), key=lambda end: -end[2])
+        starts, kept, finer = [], list[Matrix](), part.atlas.levels[min(level + 1, part.n_levels - 1)]
+        for *end, _ in ends:
+            # By the root of their mean square; ends that show points nearer than a slope reaches have the same top.
+            (x, y, z), K = see(*end)[0].points, finer.K
+            pixels = np.stack([K[0, 0] * x, K[1, 1] * y]) / np.maximum(z, MIN_DEPTH) * part.weights**0.5
+            if all(np.linalg.norm(pixels - other) > slope_step(finer) for other in kept):
+                starts.append((end[0], end[1]))
+                kept.append(pixels)
+    T, change, higher = max(*ends[:1], *aside, key=lambda end: end[2]) if aside else ends[0]
     there, own = see(T, change)[0], unlimited(np.eye(4))
     # Halves may disagree because of the wrong lens.
     noise = noise_of(there, np.eye(4), own) * min(inflated, inflation(disagreement(there, np.eye(4), own)))
@@ -353,30 +363,32 @@ def estimate_lens(
         moves = moves + np.outer(missing, weighed) / (float(change @ weighed) + 1)
     freedom = max(REGIONS * scenes_of(score) - 6 - n, 1.0)
     centre, gain = as_it_is if centre is None else centre, max(higher - lower, 0.0) / noise
-    at, by, value = ends[-1]
-    instead = None if turned is None else (by, at, (higher - value) / noise)
-    return LensEstimate(tuple(unknowns), change, T, information, moves, freedom, centre, gain, instead)
+    instead = [(by, at, (higher - value) / noise) for at, by, value in aside]
+    return LensEstimate(tuple(unknowns), change, T, information, moves, freedom, centre, gain, *instead)
 
 
 def _seeing(score: PointScore, unknowns: Sequence[LensUnknown]) -> Callable[[Transform, Matrix], JointView]:
     """What sees the points of a score from an extrinsic (4, 4) with a change (n,) of the lens, in the camera's axes."""
     fields, n = np.concatenate([own.field for own in unknowns], axis=2), len(unknowns)
-    points, K, camera = score.points.astype(np.float64), score.camera.K, score.camera
-    scale = (NODES[0] - 1) / (camera.width - 1), (NODES[1] - 1) / (camera.height - 1)
+    points, K, camera = score.points, score.camera.K, score.camera
+    per_px = (np.array(NODES) - 1) / (np.array([camera.width, camera.height]) - 1)
+    scale, first_node = ((per_px * part)[:, None].astype(np.float32) for part in (np.diag(K)[:2], K[:2, 2]))
 
     def see(T: Transform, change: Matrix) -> JointView:
-        P = T[:3, :3] @ points + T[:3, 3:]
-        z = np.maximum(P[2], 1e-3)
-        node = [((K[i, i] * P[i] / z + K[i, 2]) * scale[i]).clip(-1, 2 * NODES[i]).astype(np.float32)[None] for i in (0, 1)]
-        shifts = np.empty((2 * n, P.shape[1]))
+        motion = T.astype(np.float32)
+        P = motion[:3, :3] @ points + motion[:3, 3:]
+        z = np.maximum(P[2], np.float32(1e-3))
+        node = (P[:2] / z * scale + first_node).clip(-1, 2 * NODES[0])
+        shifts = np.empty((2 * n, P.shape[1]), np.float32)
         for first in range(0, P.shape[1], AT_ONCE):
             own = slice(first, first + AT_ONCE)
-            at = [np.ascontiguousarray(part[:, own]) for part in node]
+            at = np.ascontiguousarray(node[:, None, own])
             shifts[:, own] = cv2.remap(fields, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].T
-        shifts = shifts.reshape(n, 2, -1) * z
-        P[:2] += np.einsum("k,kin->in", change, shifts)
+        shifts *= z
+        across, down = shifts[::2], shifts[1::2]
+        P[:2] += np.tensordot(change.astype(np.float32), shifts.reshape(n, 2, -1), 1)
         # Slopes by a shift of the point across and down, of which each unknown makes so many m.
-        return score.with_points(P.astype(np.float32)), np.eye(4), lambda J: J[3] * shifts[:, 0] + J[4] * shifts[:, 1]
+        return score.with_points(P), np.eye(4), lambda J: J[3] * across + J[4] * down
 
     return see
 

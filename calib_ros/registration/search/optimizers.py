@@ -97,20 +97,20 @@ def refined(
 
 # A score at values of n further unknowns, the extrinsic (4, 4) it is seen from, and the slopes (n, points) by the unknowns from
 # those (6, points) by a left twist.
-JointView = tuple[PointScore, Transform, Callable[[Matrix], Matrix]]
+JointView = tuple[PointScore, Transform, Callable[[NDArray[np.float32]], Matrix | NDArray[np.float32]]]
 
 
 def linearised(view: JointView, n: int, level: int) -> tuple[Matrix, Matrix]:
     """Gradient (6 + n,) of the score by a left twist and by the unknowns, and a positive matrix that scales the step."""
     J = joint_jacobian(view, n, level)
     weighted = J * view[0].weights
-    return weighted.sum(axis=1), weighted @ J.T
+    return weighted.sum(axis=1, dtype=np.float64), (weighted @ J.T).astype(np.float64)
 
 
-def joint_jacobian(view: JointView, n: int, level: int) -> Matrix:
+def joint_jacobian(view: JointView, n: int, level: int) -> NDArray[np.float32]:
     """Slopes (6 + n, points) of the points' values, by a left twist and by the unknowns."""
     score, T, slopes = view
-    J = np.empty((6 + n, score.points.shape[1]))
+    J = np.empty((6 + n, score.points.shape[1]), np.float32)
     J[:6] = score.jacobian(T, level)
     J[6:] = slopes(J[:6])
     return J
@@ -131,14 +131,10 @@ def ascend_jointly(
     free: (n,) which of x may change; None = all. Returns T, x and the score, the cost of the prior not subtracted.
     """
     n, of_x = len(x), np.ones(len(x), bool) if free is None else free
-
-    def penalised(value: float, T: Transform) -> float:
-        return value - (prior.cost(T)[0] if prior else 0.0)
-
     for level in levels:
         here = see(T, x)
         best = here[0].at(level).value(here[1])
-        objective = penalised(best, T)
+        objective = best - (prior.cost(T)[0] if prior else 0.0)
         damping, H, last, step = 1e-2, np.zeros((6 + n, 6 + n)), np.zeros(6 + n), np.zeros(6 + n)
         for k in range(JOINT_ITERATIONS):
             ascent, scale = linearised(here, n, level)
@@ -155,7 +151,7 @@ def ascend_jointly(
                 candidate, later = limits.clip(se3.exp(step[:6]) @ T), x + step[6:]
                 moved = see(candidate, later)
                 value = moved[0].at(level).value(moved[1])
-                higher = penalised(value, candidate)
+                higher = value - (prior.cost(candidate)[0] if prior else 0.0)
                 if higher > objective + GAIN:
                     break
                 damping = max(damping * 6, 1e-3)
