@@ -27,7 +27,6 @@ from calib_ros.extensions import commands
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TOOL = module_at(ROOT / "tools/notebooks.py")
-QUICK = {"api", "tutorial"}  # pages that `make test` runs
 # What a block that is not run may say, what each of its commands then looks like, and how many such blocks there may be.
 NOT_RUN = {
     "needs a ROS install": (
@@ -92,7 +91,7 @@ def assert_printed(shown: str, printed: str, where: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "page", [pytest.param(p, id=p.stem, marks=[] if p.stem in QUICK else pytest.mark.slow) for p in PAGES if runnable(p)]
+    "page", [pytest.param(p, id=p.stem, marks=[] if p.stem == "api" else pytest.mark.slow) for p in PAGES if runnable(p)]
 )
 def test_the_examples_of_a_page_run_in_their_order(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -67,7 +67,7 @@ def levenberg_marquardt(
             damping = max(damping * 6, 1e-3)
         else:
             break
-        moved, last = se3.log(candidate @ se3.inverse(T)), ascent
+        moved, last = se3.log(candidate @ se3.inverse(T)) if near else moved, ascent
         T, best, objective, slope = candidate, value, value - new_cost, new_slope
         damping /= 4
         if np.abs(step[:3]).max() < 0.02 * tolerance_deg and np.abs(step[3:]).max() < 0.3 * tolerance_deg:

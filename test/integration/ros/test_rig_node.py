@@ -118,9 +118,8 @@ def test_tf_is_one_tree_from_the_reference(rig, driven) -> None:
     got = []
     driven.peer.peer.create_subscription(TFMessage, "/tf_static", got.append, LATCHED)
     driven.peer.until(lambda: got, "/tf_static")
-    assert [(t.header.frame_id, t.child_frame_id) for t in got[-1].transforms] == [
-        (TOP, rig.frame_id(name)) for name in (LEFT, RIGHT)
-    ]
+    tree = [(t.header.frame_id, t.child_frame_id) for t in got[-1].transforms]
+    assert tree == [(TOP, rig.frame_id(name)) for name in (LEFT, RIGHT)]
 
 
 def doubted(peer: RigPeer, since: int, *names: str) -> list[str]:
@@ -220,7 +219,7 @@ def test_a_knocked_camera_is_named_with_its_size_and_found_again(rig, driven) ->
 def two(tmp_path_factory, ros_in_this_process) -> Iterator[Any]:
     """A peer whose node has a camera with one of two LiDARs, and what was driven; the other one has no camera."""
     rig = SyntheticRig("two_lidars_three_cameras", **SETTINGS | {"frames": 5})
-    items, file = measured(rig, ("front",), TWO_S, 2, 10.0), tmp_path_factory.mktemp("two") / "rig.yaml"
+    items, file = measured(rig, ("front",), TWO_S, 2, 5.0), tmp_path_factory.mktemp("two") / "rig.yaml"
     describe(rig, ("front",), file, 2, pairs=[["front", "lidar_left"], ["lidar_right", "lidar_left"]])
     with RigPeer(rig, ("front",), file, 2) as peer:
         peer.drive(items)

@@ -118,6 +118,7 @@ def test_a_full_disk_ends_the_run_and_nothing_is_lost(tmp_path: Path) -> None:
     assert ran(tmp_path, answers, groups(9)) == expected(9)
 
 
+@pytest.mark.slow
 def test_a_killed_evaluation_ends_its_workers_and_resumes(tmp_path: Path, dask: None) -> None:
     process = subprocess.Popen(command(tmp_path, 30, 2, 0.5), env=environment())
     until(lambda: lines(tmp_path) > 10 and len(busy(tmp_path)) == 2, "work")
@@ -127,8 +128,7 @@ def test_a_killed_evaluation_ends_its_workers_and_resumes(tmp_path: Path, dask: 
     before, first = set(kept(tmp_path)), performed(tmp_path)
     assert 9 < len(before) < 90
     subprocess.run(command(tmp_path, 30, 2, 0.05), env=environment(), check=True)
-    assert kept(tmp_path) == expected(30)
-    assert lines(tmp_path) == 91
+    assert (kept(tmp_path), lines(tmp_path)) == (expected(30), 91)
     assert sorted(performed(tmp_path)[len(first) :]) == sorted(set(expected(30)) - before)
 
 
@@ -156,6 +156,7 @@ def lost(jobs: Sequence[EvaluationJob], how: str) -> list[Answer]:
     return [{"lost": how} for _ in jobs]
 
 
+@pytest.mark.slow
 def test_a_group_whose_worker_died_is_done_again_and_at_last_named(tmp_path: Path, dask: None) -> None:
     (tmp_path / "once").mkdir()
     assert ran(tmp_path / "once", partial(fall, tmp_path / "once", 1), workers=2) == expected(8)
@@ -217,6 +218,7 @@ def scheduler(workers: int, threads: int = 1) -> Iterator[str]:
         yield local.scheduler_address
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_results_even_if_a_worker_is_lost(tmp_path: Path) -> None:
     victims: list[int] = []
 
@@ -267,7 +269,7 @@ def test_worker_without_calib_ros_is_reported(tmp_path: Path) -> None:
         worker.kill()
 
 
-@pytest.mark.parametrize("victim", ["worker", "scheduler"])
+@pytest.mark.parametrize("victim", ["worker", pytest.param("scheduler", marks=pytest.mark.slow)])
 def test_a_cluster_that_is_lost_on_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, victim: str) -> None:
     """Killed without a nanny that would start it again, when the first answers are there."""
     pytest.importorskip("distributed")
