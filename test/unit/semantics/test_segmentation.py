@@ -159,9 +159,9 @@ def test_exhausted_budget_is_a_failure_with_advice(tmp_path, frame):
     (line,) = seen.problems
     assert "budget of 0.2 s (semantics.budget_s)" in line
     assert "take a smaller network, more semantics.threads, or a larger budget" in line
-    assert seen.classes is None
-    assert dict(seen.seconds)["image_classes"] > 0.2
-    assert models(lit(frame, 5)).classes is not None  # which takes no time
+    assert (seen.classes, dict(seen.seconds)["image_classes"] > 0.2) == (None, True)
+    models.config = replace(models.config, budget_s=60.0)
+    assert models(lit(frame, 5)).classes is not None  # which takes no time, but on a busy machine
 
 
 def test_cancelled_run_is_not_a_failure(tmp_path, frame):
