@@ -352,7 +352,7 @@ def estimate_lens(
             if all(np.linalg.norm(pixels - other) > slope_step(finer) for other in kept):
                 starts.append((end[0], end[1]))
                 kept.append(pixels)
-    T, change, higher = max(*ends[:1], *aside, key=lambda end: end[2]) if aside else ends[0]
+    T, change, higher = max([ends[0], *aside], key=lambda end: end[2])
     there, own = see(T, change)[0], unlimited(np.eye(4))
     # Halves may disagree because of the wrong lens.
     noise = noise_of(there, np.eye(4), own) * min(inflated, inflation(disagreement(there, np.eye(4), own)))
