@@ -27,6 +27,7 @@ from calib_ros.registration.classes import ALL, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.covariance import inflation
 from calib_ros.registration.estimate import (
+    RATIO_CONSISTENT,
     Estimate,
     evidence_of,
     insufficient,
@@ -265,7 +266,9 @@ class Calibrator:
             pose = observable_pose(
                 objective, alignment.T, start, box, inflated, optimised.search.nearby if optimised.search else ()
             )
-            lens = self._lens(objective, alignment.T, inflated)
+            told = evidence.p_value <= RATIO_CONSISTENT * self.config.refine.max_p_value  # where nothing matches, no lens does
+            asked = told or self.config.camera.intrinsics == REFINE
+            lens = self._lens(objective, alignment.T, inflated) if asked else None
             found = Estimate(initial, start, optimised, alignment, evidence, *pose, lens)
             # Accept, with what intrinsics and clocks leave open, or say why not.
             stated, searched = self.extract.source_camera, box is not None and not box.is_empty

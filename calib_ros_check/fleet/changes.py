@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from calib_ros import se3
@@ -64,7 +63,8 @@ def extrinsics(transforms: ArrayLike, covariances: ArrayLike) -> Extrinsics:
     R, t = T[:, :3, :3], T[:, :3, 3]
     turns = np.arccos(np.clip((np.einsum("nij,mij->nm", R, R) - 1) / 2, -1, 1))
     common = int(np.argmin(np.median(turns, axis=1)))
-    values = np.concatenate([Rotation.from_matrix(R @ R[common].T).as_rotvec(), t - t[common]], axis=1)
+    turned = np.array([se3.rotation_vector(own @ R[common].T) for own in R])
+    values = np.concatenate([turned, t - t[common]], axis=1)
     A = np.array([se3.parts_jacobian(own) for own in T])
     return Extrinsics(values, A @ C @ np.swapaxes(A, 1, 2) + FLOOR * np.eye(6))
 

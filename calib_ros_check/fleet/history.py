@@ -10,7 +10,6 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc, erfcinv
 
 from calib_ros import se3
@@ -268,12 +267,12 @@ def certificate_of(own: Vehicle, tolerance: Tolerance) -> Certificate:
     # Each segment between changes. What intrinsics and clocks leave open is common to all recordings, and no more certain for
     # their number.
     first, base = np.array(own.known[0].result["T_estimated"]), own.sequence.values[0]
-    R, t = Rotation.from_rotvec(base[:3]).as_matrix().T @ first[:3, :3], first[:3, 3] - base[3:]
+    R, t = se3.rotation_from_vector(base[:3]).T @ first[:3, :3], first[:3, 3] - base[3:]
     open_parts = [row.result["shared_covariance"] for row in own.known]
     shared = np.mean([np.zeros((6, 6)) if C is None else np.array(C) for C in open_parts], axis=0)
     judged = []
     for mean, C in zip(own.segments.means, own.segments.covariances, strict=True):
-        T_found = se3.from_parts(Rotation.from_rotvec(mean[:3]).as_matrix() @ R, t + mean[3:])
+        T_found = se3.from_parts(se3.rotation_from_vector(mean[:3]) @ R, t + mean[3:])
         back = np.linalg.inv(se3.parts_jacobian(T_found))
         judged.append((judge(T, T_found, back @ C @ back.T + shared, tolerance), T_found))
     judgement, T_found = max(judged, key=lambda pair: (WORST_FIRST[pair[0].verdict], pair[0].rotation.error))
