@@ -30,12 +30,11 @@ from calib_ros.registration.search.constraints import (
     unlimited,
 )
 from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
-from calib_ros.registration.search.search import MIDDLE_POINTS, SearchResult
+from calib_ros.registration.search.search import MIDDLE_POINTS, SIMPLEX_EVALUATIONS, SearchResult
 from calib_ros.registration.search.search import search as global_search
 
 # Levels count from the coarsest, 0.
 FIRST_STEP_DEG = 3.2  # of simplexes and gradient steps on the coarsest level of a smooth score; half of it on the next, and so on
-EVALUATIONS = 480  # of the score per level, by those
 NEAR = (1, 2)  # levels to begin with, near the optimum
 AFTER_SEARCH = 3  # the level to go on with after a search
 LAST_OF_FEW = 3  # up to this level some of the points are enough; the finer ones decide
@@ -255,11 +254,11 @@ def optimise_smooth(
     tolerance_deg: float = TOLERANCE_DEG,
 ) -> Transform:
     """The optimum from T (4, 4) by ``refine.optimizer``, which is Levenberg-Marquardt where nothing is asked for."""
-    limits, optimizer = constraints.limits, config.refine.optimizer
+    evaluations, limits, optimizer = 4 * SIMPLEX_EVALUATIONS, constraints.limits, config.refine.optimizer
     if optimizer == "nelder_mead":
-        return nelder_mead(score, T, step_deg, EVALUATIONS, constraints.cost, limits)[0]
+        return nelder_mead(score, T, step_deg, evaluations, constraints.cost, limits)[0]
     if optimizer == "barzilai_borwein":
-        return barzilai_borwein(score, T, step_deg, evaluations=EVALUATIONS, limits=limits, penalty=constraints.cost)[0]
+        return barzilai_borwein(score, T, step_deg, evaluations=evaluations, limits=limits, penalty=constraints.cost)[0]
     return levenberg_marquardt(score, T, ITERATIONS, constraints.prior, limits, tolerance_deg, near=True)[0]
 
 

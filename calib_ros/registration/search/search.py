@@ -1,7 +1,7 @@
 """Global search in a box around the prior: evenly spread starts in all six degrees of freedom, successive halving, in rounds.
 
-A round: starts of every seeding strategy -> their optima on the coarse levels -> the best polished by more points -> the best of
-these refined by all points -> the neighbourhood of the best one. Rounds go on until independent starts agree on the best
+A round: starts of every seeding strategy -> their optima on the coarse levels -> the best polished by simplex -> the best of
+these refined with all points -> the neighbourhood of the best one. Rounds go on until independent starts agree on the best
 optimum and this stands out from what the same search finds in a decoy, the mirrored edge maps of the same frames.
 """
 
@@ -19,7 +19,7 @@ from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.chance import UNDOUBTED_Z, EvenPoints, null_distribution, p_value
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior, SearchBox
-from calib_ros.registration.search.optimizers import levenberg_marquardt
+from calib_ros.registration.search.optimizers import levenberg_marquardt, nelder_mead
 from calib_ros.registration.search.parallel import SERIAL, Workers
 
 # What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
@@ -42,10 +42,12 @@ BOX_STRENGTH = 2.0  # penalty per squared half width beyond 110 % of the box
 REFINED = np.array([np.deg2rad(1.5)] * 3 + [0.15] * 3)  # rad, m; how far an axis is refined that is not searched
 
 # Optima.
-COARSE_POINTS, MIDDLE_POINTS = 5000, 15000  # edge points on the coarse and the middle levels: few miss a narrow optimum
-POLISHED, FINALISTS = 2, 2  # optima of a round that are polished, and those compared on the finest level by all points
+COARSE_POINTS, MIDDLE_POINTS = 5000, 15000  # edge points on the coarse levels and for the simplex: few miss a narrow optimum
+POLISHED, FINALISTS = 2, 2  # optima of a round that the simplex polishes, and those compared on the finest level by all points
+SIMPLEX_EVALUATIONS = 120  # of the score: by then a simplex of SIMPLEX_DEG has shrunk to the optimum
 SAME_OPTIMUM_DEG = 0.5  # optima nearer than this (10 cm count as 0.5 deg) count as one
-MIDDLE_LEVELS, FINE_LEVELS = (2, 3), (3, 4)
+SIMPLEX_DEG = {2: 0.8, 3: 0.4}  # first simplex on the middle levels
+FINE_LEVELS = (3, 4)
 NEARBY = np.array([np.deg2rad(1.5)] * 3 + [0.4] * 3)  # rad, m; neighbouring optima lay 0.8 deg / 0.36 m from the truth
 NEARBY_STARTS, NEARBY_OPTIMISED = 256, 8
 MIN_IMPROVEMENT = 0.02  # share of the score: by less, neighbours differ by chance; the better one was as often wrong
@@ -218,8 +220,11 @@ class Rounds:
             self._optimise(starts, strategy[2], own.part(0.25, 1))
 
         def polish(optimum: Optimum) -> None:
+            """On the middle levels, by simplex: it is robust where the slope misleads."""
             optimum.coarse_T = optimum.T
-            optimum.T, optimum.value = self._ascend(self.middle, MIDDLE_LEVELS, optimum.T)
+            for level, step in SIMPLEX_DEG.items():
+                score = self.middle.at(level)
+                optimum.T, optimum.value = nelder_mead(score, optimum.T, step, SIMPLEX_EVALUATIONS, self.penalty, self.limits)
 
         waiting = sorted((o for o in self._all if o.coarse_T is None), key=lambda o: -o.value)[:POLISHED]
         for k, _ in enumerate(self.workers.map(polish, waiting)):
@@ -231,7 +236,7 @@ class Rounds:
     def best(self) -> tuple[Matrix, int]:
         """The best extrinsic (4, 4) so far, and how many starts ended there."""
         unfinished = [o for o in self._polished[:FINALISTS] if o.final is None]
-        for k, final in enumerate(self.workers.map(lambda o: self._ascend(self.score, FINE_LEVELS, o.T), unfinished)):
+        for k, final in enumerate(self.workers.map(lambda o: self._finish(o.T), unfinished)):
             unfinished[k].final = final
         # Starts of later rounds may have ended there, too.
         finalists = [(*o.final, o.count) for o in self._polished if o.final is not None]
@@ -304,11 +309,11 @@ class Rounds:
             progress(0.5 + 0.5 * (k + 1) / len(kept))
         self.optimised += len(kept)
 
-    def _ascend(self, score: PointScore, levels: Sequence[int], T: Transform) -> tuple[Matrix, float]:
-        """The optimum near T (4, 4) on one level after the other, and its penalised score."""
+    def _finish(self, T: Transform) -> tuple[Matrix, float]:
+        """On the fine levels with all points: the extrinsic, and its penalised score."""
         value = 0.0
-        for level in levels:
-            T, value = levenberg_marquardt(score.at(level), T, 20, self.user_prior, self.limits, 0.01, near=True)
+        for level in FINE_LEVELS:
+            T, value = levenberg_marquardt(self.score.at(level), T, 20, self.user_prior, self.limits, tolerance_deg=0.01)
         return T, value - self.penalty(T)
 
     def _search_nearby(self, top: Transform, value: float) -> tuple[Matrix, list[Matrix]]:
@@ -320,7 +325,7 @@ class Rounds:
 
         def optimum_from(k: int) -> tuple[Matrix, float]:
             start = self.limits.clip(candidates[k])
-            return self._ascend(self.score, FINE_LEVELS, self._coarse_optimum(self.coarse, 2, start, tolerance_deg=0.02))
+            return self._finish(self._coarse_optimum(self.coarse, 2, start, tolerance_deg=0.02))
 
         for end, reached in self.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
             ends.append(end)
