@@ -251,8 +251,7 @@ class Calibrator:
         ones may lead away from it.
         """
         started, watch = time.perf_counter(), Progress(progress)
-        origin = initial if anchor is None else anchor
-        make = partial(self.objectives, T_prior=initial, anchor=origin, box=box)
+        make = partial(self.objectives, T_prior=initial, anchor=initial if anchor is None else anchor, box=box)
         try:
             # Optimise: the extrinsic, and the clocks' offset where the frames show it.
             optimised = JointSearch(make, initial, box, self.config, watch, near).optimum(features)
@@ -263,11 +262,10 @@ class Calibrator:
             # Covariance.
             evidence = evidence_of(self.config, objective, alignment, optimised.search)
             inflated = inflation(evidence.disagreement)
-            pose = observable_pose(
-                objective, alignment.T, start, box, inflated, optimised.search.nearby if optimised.search else ()
-            )
-            told = evidence.p_value <= RATIO_CONSISTENT * self.config.refine.max_p_value  # where nothing matches, no lens does
-            asked = told or self.config.camera.intrinsics == REFINE
+            others = optimised.search.nearby if optimised.search else ()
+            pose = observable_pose(objective, alignment.T, start, box, inflated, others)
+            matches = evidence.p_value <= RATIO_CONSISTENT * self.config.refine.max_p_value  # else nothing is told of the lens
+            asked = matches or self.config.camera.intrinsics == REFINE
             lens = self._lens(objective, alignment.T, inflated) if asked else None
             found = Estimate(initial, start, optimised, alignment, evidence, *pose, lens)
             # Accept, with what intrinsics and clocks leave open, or say why not.
@@ -337,13 +335,12 @@ class Calibrator:
         undoubted = result.cause is not None and (result.evidence is None or result.evidence.z_score >= UNDOUBTED_Z)
         if result.refusal not in NO_MATCH or undoubted or not features or result.initial is None:
             return result  # of clocks there is doubt where their best offset hardly matches
-        optima = [] if result.optimum is None else [result.optimum]
         refine = self.config.refine
         as_taken = self.pictures_of(frames) if frames else None
         box = None if box is None or box.is_empty else box
         stated = stated and bool(result.initial[:3, 3].any())  # a camera at the LiDAR's very place is a guess
         asked = Question(features, result.initial, box, as_taken, stated=stated, progress=Progress(progress, "causes"))
-        given = self.judge.as_given(features, result.initial, optima)
+        given = self.judge.as_given(features, result.initial, [] if result.optimum is None else [result.optimum])
         found = self.judge.explain(asked, given, refine.tolerance_deg, refine.tolerance_m)
         if found is None or is_only_off(found, refine.tolerance_deg, refine.tolerance_m):
             return result
