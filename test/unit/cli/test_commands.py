@@ -509,8 +509,7 @@ def loaded(modules: set[str], *arguments: str) -> str:
     """Which of these modules a command has imported when it is done."""
     code = (
         "import sys; from calib_ros.cli.main import main\n"
-        f"try: main({list(arguments)})\n"
-        "except SystemExit: pass\n"
+        f"try: main({list(arguments)})\nexcept SystemExit: pass\n"
         f"print('LOADED', sorted({modules} & set(sys.modules)))"
     )
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()[-1]
@@ -523,7 +522,9 @@ def test_commands_do_not_wait_for_heavy_libraries(street: list, tmp_path: Path) 
     files = str(tmp_path), "--initial", "reference", "--search-deg", "1", "--json", str(tmp_path / "found.json")
     assert loaded(heavy | {"scipy.special"}, "calibrate", *files) == "LOADED []"
     assert json.loads((tmp_path / "found.json").read_text())["score"] is not None  # it has searched
-    assert loaded(heavy, "check", str(tmp_path), "--extrinsic", str(tmp_path / "found.json")) == "LOADED []"
+    files = str(tmp_path), "--extrinsic", str(tmp_path / "found.json"), "--json", str(tmp_path / "checked.json")
+    assert loaded(heavy, "check", *files) == "LOADED []"
+    assert json.loads((tmp_path / "checked.json").read_text())["frames_used"] == 2
 
 
 def test_a_missing_library_is_named_with_the_command_that_installs_it(
@@ -533,5 +534,4 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rosbags", None)
     code, _, err = run(capsys, "convert", SOURCE, str(tmp_path / "bag"))
-    assert code == 2
-    assert err == "calib-ros: 'convert' needs rosbags: python3 -m pip install rosbags\n"
+    assert (code, err) == (2, "calib-ros: 'convert' needs rosbags: python3 -m pip install rosbags\n")
